@@ -1,0 +1,54 @@
+"""What the engine asks of a controller, and the checks that all of them share."""
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.errors import ConfigurationError
+
+
+@runtime_checkable
+class Controller(Protocol):
+    """A force law with its gains. Implementations are frozen dataclasses; the law itself holds no state.
+
+    ``limited`` says whether the actuator keeps the scenario's force limit: an unlimited law is the paper's reading of its
+    rivals, and gets actuators without a range.
+    """
+
+    @property
+    def law(self) -> laws.Law: ...
+    @property
+    def limited(self) -> bool: ...
+    @property
+    def linear_gains(self) -> tuple[float, float] | None:
+        """Largest position and velocity gain [1/s^2, 1/s] per unit mass, for the step-size check; None if unbounded."""
+        ...
+
+    def params(self, agent: int, limit: float) -> Sequence[float]:
+        """Numbers handed to the law as ``params``; ``limit`` [N] is the actuator's, infinite when unlimited."""
+        ...
+
+    def initial_state(self, agent: int) -> np.ndarray:
+        """(S,) controller state at t = 0, weights for example."""
+        ...
+
+
+def require_gains(owner: object, names: Sequence[str], allow_zero: bool = False) -> None:
+    """Raise ConfigurationError unless each named attribute is finite and positive (or zero where allowed)."""
+    for name in names:
+        value = getattr(owner, name)
+        if not np.isfinite(value) or value < 0 or (value == 0 and not allow_zero):
+            kind = "non-negative" if allow_zero else "positive"
+            raise ConfigurationError(f"{type(owner).__name__}.{name} must be {kind} and finite, got {value}")
+
+
+def largest_stable_substep(position_gain: float, velocity_gain: float) -> float:
+    """Largest h [s] for which v += h(-k_p e - k_v v), p += h v is stable: 2 h k_v + h^2 k_p < 4 (Jury's test).
+
+    For the paper's 100 and 100 it is 19.8 ms, so a control law held over a mission step of 50 ms would diverge.
+    """
+    if position_gain == 0.0:
+        return 2.0 / velocity_gain if velocity_gain else np.inf
+    return float((-velocity_gain + np.sqrt(velocity_gain**2 + 4.0 * position_gain)) / position_gain)

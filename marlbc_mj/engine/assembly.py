@@ -1,0 +1,95 @@
+"""One model assembly: arena + N robots + the scenario's obstacles, built with MjSpec and handed on as one MJCF text.
+
+The engine compiles this text, and the dm_control arena is made from the same text, so there is one model.
+"""
+
+import mujoco
+import numpy as np
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.palette import agent_color
+from marlbc_mj.robots import MODELS, Robot, make_robot
+from marlbc_mj.scenarios import Obstacle, Scenario
+
+POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
+OBSTACLE_HEIGHT = 1.2  # [m]
+MEMORY = 256 * 1024  # arena of one MjData [bytes]; MuJoCo's default is 13.6 MB, too much for thousands of worlds
+
+
+def agent_prefix(agent: int) -> str:
+    """Prefix of every MJCF name of one agent: ``agent1_`` is agent 0's, as the paper counts from 1."""
+    return f"agent{agent + 1}_"
+
+
+def assemble(scenario: Scenario, limit: float) -> str:
+    """The MJCF of a whole scenario.
+
+    Args:
+        scenario: which robot, how many, what obstacles, which substep.
+        limit: force range of every motor [N]; infinite removes the ranges, for laws that ignore the actuator.
+
+    Raises:
+        ConfigurationError: unknown robot, or a limit that is not positive.
+    """
+    if not limit > 0:
+        raise ConfigurationError(f"force limit must be positive, got {limit}")
+    robot = make_robot(scenario.robot)
+    spec = mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
+    spec.modelname = scenario.name
+    spec.option.timestep = scenario.substep
+    spec.memory = MEMORY
+    for agent in range(scenario.agents):
+        _attach(spec, robot, agent, scenario.mass, limit)
+    for k, obstacle in enumerate(scenario.obstacles):
+        _add_obstacle(spec, k, obstacle)
+    _add_cameras(spec, scenario)
+    spec.compile()
+    return str(spec.to_xml())
+
+
+def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: float) -> None:
+    child = mujoco.MjSpec.from_file(str(robot.mjcf))
+    for geom in child.body(robot.body).geoms:
+        geom.rgba = agent_color(agent)
+        geom.mass = mass
+    for name in robot.motors:
+        motor = child.actuator(name)
+        bounded = np.isfinite(limit)
+        motor.ctrlrange = motor.forcerange = (-limit, limit) if bounded else (0.0, 0.0)
+        motor.ctrllimited = motor.forcelimited = int(bounded)
+    spec.attach(child, prefix=agent_prefix(agent), frame=spec.worldbody.add_frame())
+
+
+def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle) -> None:
+    """A cylinder without contact: the paper's obstacles are passed through, and counted."""
+    radius = max(obstacle.radius, POINT_RADIUS)
+    spec.worldbody.add_geom(
+        name=f"obstacle{k + 1}",
+        type=mujoco.mjtGeom.mjGEOM_CYLINDER,
+        size=[radius, 0.5 * OBSTACLE_HEIGHT, 0.0],
+        pos=[obstacle.x, obstacle.y, 0.5 * OBSTACLE_HEIGHT],
+        material="obstacle",
+        contype=0,
+        conaffinity=0,
+        mass=0.0,
+    )
+
+
+def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
+    """``top`` sees the whole mission; ``track`` follows the team's centre of mass."""
+    ends = np.array([scenario.path_origin, scenario.path_origin]) + np.outer(
+        (0.0, scenario.duration), scenario.path_velocity
+    )
+    middle = ends.mean(axis=0)
+    length = float(np.linalg.norm(ends[1] - ends[0]))
+    width = max(float(np.abs(scenario.formations).max()) * 2.0, 0.5 * (length + 20.0))
+    fovy = 30.0
+    height = 0.5 * width / np.tan(np.radians(0.5 * fovy))
+    spec.worldbody.add_camera(name="top", pos=[*middle, height], fovy=fovy)
+    spec.worldbody.add_camera(
+        name="track",
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[0.0, -34.0, 26.0],
+        xyaxes=[1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
+        fovy=40.0,
+    )

@@ -1,0 +1,230 @@
+"""One mission step of one agent team: references, then substeps of force law, drag and ``mj_step``, then the verdict.
+
+The pieces (:func:`begin_step`, :func:`team_forces`, :func:`run_substeps`, :func:`judge`) are also what the Python path and the
+dm_control task call, so there is one definition of a mission step. Its order of operations:
+
+1. at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p (``actual``), and held;
+2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), MuJoCo's
+   semi-implicit Euler step, then p_r += h v_r;
+3. at the end: clearances, formation identifier and reward from the measured positions.
+"""
+
+import numba
+import numpy as np
+from numba.extending import register_jitable
+
+from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
+from marlbc_mj.laws import allocation_free, compiled
+from marlbc_mj.nullspace import add_behavior
+
+DIVERGED = 1e9
+"""A position, velocity or force beyond this (or NaN) stops the world before MuJoCo sees it."""
+
+VIOLATION_REWARD = -10.0  # (14), whatever the formation
+FORMATION_REWARD = 5.0  # (14), times G
+SWITCH_REWARD = -3.0  # (15), once per team (erratum 11)
+
+
+@allocation_free
+def path_at(t, path, out):  # type: ignore[no-untyped-def]
+    """Desired centroid and its velocity at ``t`` [s]: ``out`` (2, 2) from ``path`` (2, 2) = origin [m], velocity [m/s]."""
+    for axis in range(2):
+        out[0, axis] = path[0, axis] + t * path[1, axis]
+        out[1, axis] = path[1, axis]
+
+
+@compiled
+def judge(p, obstacles, formations, tolerance, safe_distance, clearance):  # type: ignore[no-untyped-def]
+    """Clearances, formation identifier G and r1 (14) of a team at positions ``p`` (N, 2).
+
+    ``formations`` (2, N, 2): slots of G = 2, then of G = 1. ``clearance`` (N,) is written in place. Returns (G, r1).
+    """
+    agents = p.shape[0]
+    normal = np.empty(2)
+    violated = False
+    for i in range(agents):
+        clearance[i] = nearest_obstacle(p[i], obstacles, normal)
+        violated |= clearance[i] <= safe_distance
+    mean_x, mean_y = 0.0, 0.0
+    for i in range(agents):
+        mean_x += p[i, 0] / agents
+        mean_y += p[i, 1] / agents
+    formation = 0
+    for which in range(2):
+        held = True
+        for i in range(agents):
+            x = p[i, 0] - mean_x - formations[which, i, 0]
+            y = p[i, 1] - mean_y - formations[which, i, 1]
+            held &= x * x + y * y <= tolerance * tolerance
+        if held:
+            formation = 2 - which
+            break
+    return formation, VIOLATION_REWARD if violated else FORMATION_REWARD * formation
+
+
+@allocation_free
+def valid_orders(orders, count):  # type: ignore[no-untyped-def]
+    """Whether every one of ``orders`` (B, N) is an index below ``count``."""
+    valid = True
+    for b in range(orders.shape[0]):
+        for i in range(orders.shape[1]):
+            valid &= 0 <= orders[b, i] < count
+    return valid
+
+
+@allocation_free
+def count_switches(orders, command_of, commands, step):  # type: ignore[no-untyped-def]
+    """Turn orders (N,) into commands, in place, and return r2 (15); the first mission step switches nothing."""
+    switched = False
+    for i in range(orders.shape[0]):
+        command = command_of[orders[i]]
+        switched |= step > 0 and command != commands[i]
+        commands[i] = command
+    return SWITCH_REWARD if switched else 0.0
+
+
+@allocation_free
+def set_references(  # type: ignore[no-untyped-def]
+    behavior_laws, behavior_params, table, orders, at, path, obstacles, scratch, v_r
+):
+    """Reference velocity of every agent at positions ``at`` (N, 2): its behaviors composed in its order (12).
+
+    A behavior is evaluated only if those above it leave a direction free. ``scratch``: (1 + 2n, n).
+    """
+    n = at.shape[1]
+    velocity, jacobian, basis = scratch[0], scratch[1 : 1 + n], scratch[1 + n :]
+    for i in range(at.shape[0]):
+        for axis in range(n):
+            v_r[i, axis] = 0.0
+        rank = 0
+        for j in table[orders[i]]:
+            if rank == n:
+                break
+            law = as_behavior(behavior_laws[j])
+            rows = law(behavior_params[j, i], at[i], path, obstacles, at, i, velocity, jacobian)
+            rank = add_behavior(velocity, jacobian, rows, basis, rank, v_r[i])
+
+
+@register_jitable
+def team_forces(  # type: ignore[no-untyped-def]
+    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, p_r, v_r, state, drag, force
+):  # fmt: skip
+    """Drag and controller force of every agent for one substep, written to ``drag`` and ``force`` (N, 2) [N].
+
+    Returns 0, or 1 + agent where a position, velocity or force left the physical range; then nothing may be stepped.
+    """
+    controller = as_controller(controller_law)
+    disturbance = as_disturbance(disturbance_law)
+    for i in range(p.shape[0]):
+        disturbance(disturbance_params, t, p[i], v[i], drag[i])
+        controller(controller_params[i], state[i], p[i], v[i], p_r[i], v_r[i], drag[i], h, force[i])
+        size = abs(p[i, 0]) + abs(p[i, 1]) + abs(v[i, 0]) + abs(v[i, 1]) + abs(force[i, 0]) + abs(force[i, 1])
+        if not size < DIVERGED:
+            return 1 + i
+    return 0
+
+
+@register_jitable
+def run_substeps(  # type: ignore[no-untyped-def]
+    step_function, model, data, qpos, qvel, ctrl, applied, actuator_force, indices, controller_law, controller_params,
+    disturbance_law, disturbance_params, t, h, substeps, p, v, p_r, v_r, state, drag, force, record,
+):  # fmt: skip
+    """All substeps of one mission step of one world, with v_r held. Returns 0, or 1 + agent + N * substep that diverged.
+
+    Args:
+        data, qpos, qvel, ctrl, applied, actuator_force: MjData and its arrays; ``applied`` is qfrc_applied, which takes the drag.
+        indices: (3, N, 2), where in qpos, in qvel and in ctrl an agent's two axes are.
+        p, v, p_r, v_r: (N, 2) [m, m/s], changed in place; state: (N, S), the controllers' own, changed in place.
+        drag, force: (N, 2) [N], scratch.
+        record: (substeps, N, 10): p, v, p_r, v_r as the law saw them and the force MuJoCo applied; (0, N, 10) records nothing.
+    """
+    agents = p.shape[0]
+    for k in range(substeps):
+        failed = team_forces(
+            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, p_r, v_r, state,
+            drag, force,
+        )  # fmt: skip
+        if failed:
+            return failed + agents * k
+        for i in range(agents):
+            for axis in range(2):
+                ctrl[indices[2, i, axis]] = force[i, axis]
+                applied[indices[1, i, axis]] = drag[i, axis]
+        call_step(step_function, model, data)
+        for i in range(agents):
+            for axis in range(2):
+                if record.shape[0] > 0:
+                    record[k, i, axis] = p[i, axis]
+                    record[k, i, 2 + axis] = v[i, axis]
+                    record[k, i, 4 + axis] = p_r[i, axis]
+                    record[k, i, 6 + axis] = v_r[i, axis]
+                    record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]]
+                p[i, axis] = qpos[indices[0, i, axis]]
+                v[i, axis] = qvel[indices[1, i, axis]]
+                p_r[i, axis] += h * v_r[i, axis]
+    return 0
+
+
+team_forces_compiled = allocation_free(team_forces)
+_run_substeps_compiled = allocation_free(run_substeps)
+
+
+@compiled
+def begin_step(  # type: ignore[no-untyped-def]
+    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, obstacles, p, p_r, v_r, commands
+):  # fmt: skip
+    """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15)."""
+    now = np.empty((2, 2))
+    path_at(t, path, now)
+    scratch = np.empty((1 + 2 * p.shape[1], p.shape[1]))
+    at = p_r if virtual else p
+    set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch, v_r)
+    return count_switches(orders, command_of, commands, step)
+
+
+@compiled
+def mission_step(  # type: ignore[no-untyped-def]
+    b,
+    # fixed for all worlds
+    step_function, model, indices, sizes, controller_law, controller_params, disturbance_law,
+    behavior_laws, behavior_params, table, command_of, path, formations, settings,
+    # one row a world
+    data, disturbance_params, obstacles, orders, commands, p, v, p_r, v_r, state, clearance, formation, reward, steps,
+    status, record,
+):  # fmt: skip
+    """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance [m], safe distance [m], virtual (0/1)."""
+    t = steps[b] * settings[0]
+    r2 = begin_step(
+        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], obstacles[b],
+        p[b], p_r[b], v_r[b], commands[b],
+    )  # fmt: skip
+    forces = np.empty((2, p.shape[1], 2))
+    status[b] = _run_substeps_compiled(
+        step_function, model, data[b, 0], doubles(data[b, 1], sizes[0]), doubles(data[b, 2], sizes[1]),
+        doubles(data[b, 3], sizes[2]), doubles(data[b, 4], sizes[1]), doubles(data[b, 5], sizes[2]), indices,
+        controller_law, controller_params, disturbance_law, disturbance_params[b], t, settings[1],
+        round(settings[0] / settings[1]), p[b], v[b], p_r[b], v_r[b], state[b], forces[0], forces[1], record[b],
+    )  # fmt: skip
+    formation[b], r1 = judge(p[b], obstacles[b], formations, settings[2], settings[3], clearance[b])
+    reward[b] = r1 + r2
+    steps[b] += 1
+    return 1 if status[b] else 0
+
+
+@compiled
+def step_serial(worlds, *args):  # type: ignore[no-untyped-def]
+    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
+    failed = 0
+    for b in range(worlds):
+        failed += mission_step(b, *args)
+    return failed
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def step_parallel(worlds, *args):  # type: ignore[no-untyped-def]
+    """:func:`mission_step` of every world, worlds shared out over numba's threads; the same numbers as in series."""
+    failed = 0
+    for b in numba.prange(worlds):
+        failed += mission_step(b, *args)
+    return failed

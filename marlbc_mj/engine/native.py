@@ -1,0 +1,101 @@
+"""Calling MuJoCo and laws by address from compiled code. Everything unsafe of this package is in this file.
+
+Each function here has two faces. Called from Python it takes objects: a law, ``mujoco.mj_step``, an array. Inside compiled code
+it takes their addresses, plain integers, so that the compiled loop stays cached on disk whatever it calls. Whoever passes an address
+keeps its owner (MjModel, MjData, law) alive while the call lasts.
+"""
+
+import ctypes
+
+import mujoco
+from llvmlite import ir
+from numba import carray, types
+from numba.core import cgutils
+from numba.extending import intrinsic, overload
+
+from marlbc_mj import laws
+
+
+def step_address() -> int:
+    """Address of ``mj_step`` in the very library that the mujoco package has loaded."""
+    library = ctypes.CDLL(mujoco._functions.__file__)
+    return int(ctypes.cast(library.mj_step, ctypes.c_void_p).value or 0)
+
+
+def call_step(step, model, data):  # type: ignore[no-untyped-def]
+    """``step(model, data)``; for ``mj_step``."""
+    step(model, data)
+
+
+def doubles(source, n):  # type: ignore[no-untyped-def]
+    """The n float64 of MuJoCo's array at this address, as a view; the array itself in Python."""
+    return source
+
+
+def as_behavior(law):  # type: ignore[no-untyped-def]
+    """A behavior that can be called, from its address."""
+    return law
+
+
+def as_controller(law):  # type: ignore[no-untyped-def]
+    """A controller that can be called, from its address."""
+    return law
+
+
+def as_disturbance(law):  # type: ignore[no-untyped-def]
+    """A disturbance that can be called, from its address."""
+    return law
+
+
+@intrinsic
+def _call_address(typing_context, step, model, data):  # type: ignore[no-untyped-def]
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 2)
+        builder.call(builder.inttoptr(args[0], kind.as_pointer()), [args[1], args[2]])
+        return context.get_dummy_value()
+
+    return types.void(types.uintp, types.uintp, types.uintp), codegen
+
+
+@intrinsic
+def _double_pointer(typing_context, address):  # type: ignore[no-untyped-def]
+    signature = types.CPointer(types.float64)(types.uintp)
+
+    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+
+    return signature, codegen
+
+
+@overload(call_step, inline="always")
+def _call_step(step, model, data):  # type: ignore[no-untyped-def]
+    return lambda step, model, data: _call_address(step, model, data)
+
+
+@overload(doubles, inline="always")
+def _doubles(source, n):  # type: ignore[no-untyped-def]
+    return lambda source, n: carray(_double_pointer(source), n)
+
+
+def _compile_as(function, kind):  # type: ignore[no-untyped-def]
+    """Give ``function`` its compiled face: the law of signature ``kind`` at an address."""
+    function_type = types.FunctionType(kind)
+
+    @intrinsic
+    def from_address(typing_context, law):  # type: ignore[no-untyped-def]
+        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+            struct = cgutils.create_struct_proxy(function_type)(context, builder)
+            pointer = builder.inttoptr(args[0], context.get_value_type(types.voidptr))
+            struct.c_addr = struct.py_addr = struct.jit_addr = pointer
+            return struct._getvalue()
+
+        return function_type(types.uintp), codegen
+
+    @overload(function, inline="always")
+    def compiled_face(law):  # type: ignore[no-untyped-def]
+        return lambda law: from_address(law)
+
+
+_compile_as(as_behavior, laws.BEHAVIOR)
+_compile_as(as_controller, laws.CONTROLLER)
+_compile_as(as_disturbance, laws.DISTURBANCE)

@@ -1,0 +1,142 @@
+"""The state of B teams between mission steps, apart from the physics: what World and the dm_control task both keep."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.engine import loop
+from marlbc_mj.engine.plan import Plan
+from marlbc_mj.errors import SimulationError
+
+
+class Observation(NamedTuple):
+    """What a supervisor may see at the start of a mission step; B worlds, N agents."""
+
+    time: np.ndarray  # (B,) [s]
+    position: np.ndarray  # (B, N, 2) measured [m]
+    velocity: np.ndarray  # (B, N, 2) measured [m/s]
+    clearance: np.ndarray  # (B, N) to the nearest obstacle's surface [m]
+    formation: np.ndarray  # (B,) int64, G: 2 in formation, 1 in column, 0 neither
+    command: np.ndarray  # (B, N) int64, index into scenario.orders.commands of the last order; 0 before the first
+
+    def state(self) -> np.ndarray:
+        """The printed state s = (X, Pr, G), (B, (2n+1)N+1): positions and velocities agent by agent, priorities, G."""
+        joint = np.concatenate([self.position, self.velocity], axis=-1).reshape(len(self.time), -1)
+        return np.concatenate([joint, self.command, self.formation[:, None]], axis=1)
+
+
+class TeamState:
+    """Positions, references, controller states, commands and verdicts of B teams, one row a world.
+
+    All arrays are public, contiguous, and the very ones that the loop changes in place.
+    """
+
+    def __init__(self, plan: Plan, worlds: int) -> None:
+        agents = plan.scenario.agents
+        self.plan = plan
+        self.position = np.zeros((worlds, agents, 2))  # measured [m]
+        self.velocity = np.zeros((worlds, agents, 2))  # measured [m/s]
+        self.reference = np.zeros((worlds, agents, 2))  # p_r [m]
+        self.reference_velocity = np.zeros((worlds, agents, 2))  # v_r [m/s]
+        self.controller = np.zeros((worlds, *plan.initial_state.shape))  # (B, N, S)
+        self.obstacles = np.zeros((worlds, len(plan.scenario.obstacles), 3))  # x, y, radius [m]
+        self.disturbance_params = np.zeros((worlds, len(plan.disturbance_params)))
+        self.clearance = np.zeros((worlds, agents))  # [m]
+        self.formation = np.zeros(worlds, dtype=np.int64)  # G
+        self.command = np.zeros((worlds, agents), dtype=np.int64)
+        self.reward = np.zeros(worlds)
+        self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
+
+    def reset(self, b: int, rng: np.random.Generator) -> np.ndarray:
+        """Put world ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m]."""
+        draw = self.plan.scenario.draw(rng)
+        self.position[b] = self.reference[b] = draw.starts
+        self.velocity[b] = self.reference_velocity[b] = 0.0
+        self.controller[b] = self.plan.initial_state
+        self.obstacles[b] = draw.obstacles
+        self.disturbance_params[b] = self.plan.disturbance_params
+        self.disturbance_params[b, 0] *= draw.drag_scale
+        self.steps[b] = self.command[b] = self.reward[b] = 0
+        self._judge(b)
+        return draw.starts
+
+    def time(self, b: int) -> float:
+        """Mission time of world ``b`` [s]."""
+        return float(self.steps[b] * self.plan.scenario.mission_step)
+
+    def begin(self, b: int, orders: np.ndarray) -> None:
+        """Start a mission step of world ``b``: orders (N,) become commands, reference velocities and r2."""
+        plan = self.plan
+        orders_of = plan.scenario.orders
+        self.reward[b] = loop.begin_step(
+            self.time(b),
+            self.steps[b],
+            plan.scenario.reference == "virtual",
+            plan.behavior_laws,
+            plan.behavior_params,
+            orders_of.table,
+            orders_of.command_of,
+            plan.path,
+            orders,
+            self.obstacles[b],
+            self.position[b],
+            self.reference[b],
+            self.reference_velocity[b],
+            self.command[b],
+        )
+
+    def finish(self, b: int) -> None:
+        """End a mission step of world ``b``: clearances, G and the reward r1 + r2 from the measured positions."""
+        self.reward[b] += self._judge(b)
+        self.steps[b] += 1
+
+    def _judge(self, b: int) -> float:
+        scenario = self.plan.scenario
+        self.formation[b], reward = loop.judge(
+            self.position[b],
+            self.obstacles[b],
+            scenario.formations,
+            scenario.formation_tolerance,
+            scenario.safe_distance,
+            self.clearance[b],
+        )
+        return float(reward)
+
+    def observe(self) -> Observation:
+        """What a supervisor decides on, as copies."""
+        return Observation(
+            self.steps * self.plan.scenario.mission_step,
+            self.position.copy(),
+            self.velocity.copy(),
+            self.clearance.copy(),
+            self.formation.copy(),
+            self.command.copy(),
+        )
+
+    def rows(self, orders: np.ndarray) -> tuple[np.ndarray, ...]:
+        """The arguments of ``mission_step`` with one row a world, from disturbance_params to steps, in its order."""
+        return (
+            self.disturbance_params,
+            self.obstacles,
+            orders,
+            self.command,
+            self.position,
+            self.velocity,
+            self.reference,
+            self.reference_velocity,
+            self.controller,
+            self.clearance,
+            self.formation,
+            self.reward,
+            self.steps,
+        )
+
+    def diverged(self, b: int, status: int) -> SimulationError:
+        """The error for a status that ``run_substeps`` or ``team_forces`` returned: names world, agent and time."""
+        agent, substep = (status - 1) % self.plan.scenario.agents, (status - 1) // self.plan.scenario.agents
+        start = (self.steps[b] - 1) * self.plan.scenario.mission_step
+        return SimulationError(
+            f"world {b}, agent {agent + 1}, t = {start + substep * self.plan.scenario.substep:.3f} s: position, velocity or "
+            f"force is not finite or beyond {loop.DIVERGED:g} "
+            f"(p = {self.position[b, agent].tolist()}, v = {self.velocity[b, agent].tolist()})"
+        )

@@ -1,0 +1,24 @@
+"""The two ways in which this package refuses to go on; every message names the value and the valid ones."""
+
+from collections.abc import Iterable
+
+
+class MarlbcError(Exception):
+    """Root of all errors raised on purpose by marlbc_mj; the command line turns them into one line."""
+
+    exit_status = 2
+
+
+class ConfigurationError(MarlbcError, ValueError):
+    """A setting, a file or a combination of settings that cannot be run. Exit status 2."""
+
+
+class SimulationError(MarlbcError, RuntimeError):
+    """A run that started and could not be finished, a diverged world for example. Exit status 3."""
+
+    exit_status = 3
+
+
+def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
+    """The error for a name that is not in a list: says which one and shows the list."""
+    return ConfigurationError(f"unknown {kind} {name!r}; choose from: {', '.join(valid)}")

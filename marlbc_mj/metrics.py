@@ -1,0 +1,114 @@
+"""Trajectory -> named scalars. Definitions are fixed: changing one changes every published number."""
+
+from typing import TypedDict
+
+import numpy as np
+
+from marlbc_mj.episode import Trajectory
+from marlbc_mj.scenarios import Scenario
+
+
+class AgentMetrics(TypedDict):
+    """One agent's scalars."""
+
+    switches: int  # mission steps at which its command differs from the one before
+    clearance_min: float  # over all substeps [m]
+    violation_time: float  # time with d <= d_OA [s]
+    force_max_inf: float  # max |u|_inf, what the paper's "max |u|" must be (erratum 15) [N]
+    force_max_2: float  # max |u|_2 [N]
+    effort_integral: float  # integral of |u| dt [N s]
+    effort_sum: float  # effort_integral over the mission step: a sum over samples (erratum 16) [N]
+    cost_max: float  # max of |e_p|^2 + |e_v|^2 + |u|^2
+    cost_integral: float  # its integral
+    cost_sum: float  # cost_integral over the mission step
+    saturation_duty: float  # share of time with an axis at the force limit
+    rms_position_error: float  # [m]
+    rms_velocity_error: float  # [m/s]
+
+
+TeamMetrics = TypedDict(
+    "TeamMetrics",
+    {
+        "return": float,  # sum of rewards over the episode
+        "decision_ms_median": float,  # all agents, one mission step [ms]
+        "decision_ms_p99": float,
+        "agent_distance_min": float,  # no behavior of the paper guards it [m]
+        "formation_error": float,  # mean distance from the FM slot, relative to the centroid [m]
+    },
+)
+
+
+class Metrics(TypedDict):
+    """All scalars of one episode."""
+
+    agents: list[AgentMetrics]
+    team: TeamMetrics
+
+
+def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+    """Distance to the nearest obstacle's surface [m] for positions (..., 2); infinite without obstacles."""
+    if not len(obstacles):
+        return np.full(positions.shape[:-1], np.inf)
+    gaps = np.linalg.norm(positions[..., None, :] - obstacles[:, :2], axis=-1) - obstacles[:, 2]
+    return np.asarray(gaps.min(axis=-1))
+
+
+def measure(trajectory: Trajectory) -> Metrics:
+    """All metrics of one episode.
+
+    Errors and force are those at the start of each substep, weighted by its length; clearance is taken at its end.
+    """
+    return {
+        "agents": [_agent(trajectory, i) for i in range(trajectory.scenario.agents)],
+        "team": _team(trajectory),
+    }
+
+
+def _agent(trajectory: Trajectory, agent: int) -> AgentMetrics:
+    scenario = trajectory.scenario
+    h, dt = scenario.substep, scenario.mission_step
+    force = trajectory.force[:, agent]
+    position_error = trajectory.position[:-1, agent] - trajectory.reference[:, agent]
+    velocity_error = trajectory.velocity[:-1, agent] - trajectory.reference_velocity[:, agent]
+    square_p, square_v = (position_error**2).sum(-1), (velocity_error**2).sum(-1)
+    size = np.linalg.norm(force, axis=-1)
+    cost = square_p + square_v + size**2
+    clearance = clearances(trajectory.position[1:, agent], trajectory.obstacles)
+    return {
+        "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
+        "clearance_min": float(clearance.min()),
+        "violation_time": float((clearance <= scenario.safe_distance).sum() * h),
+        "force_max_inf": float(np.abs(force).max()),
+        "force_max_2": float(size.max()),
+        "effort_integral": float(size.sum() * h),
+        "effort_sum": float(size.sum() * h / dt),
+        "cost_max": float(cost.max()),
+        "cost_integral": float(cost.sum() * h),
+        "cost_sum": float(cost.sum() * h / dt),
+        "saturation_duty": float((np.abs(force) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).mean()),
+        "rms_position_error": float(np.sqrt(square_p.mean())),
+        "rms_velocity_error": float(np.sqrt(square_v.mean())),
+    }
+
+
+def _team(trajectory: Trajectory) -> TeamMetrics:
+    positions = trajectory.position[1:]
+    return {
+        "return": float(trajectory.reward.sum()),
+        "decision_ms_median": float(np.median(trajectory.decision_ms)),
+        "decision_ms_p99": float(np.percentile(trajectory.decision_ms, 99)),
+        "agent_distance_min": _closest_pair(positions),
+        "formation_error": float(_slot_distance(positions, trajectory.scenario).mean()),
+    }
+
+
+def _closest_pair(positions: np.ndarray) -> float:
+    """Smallest distance between two agents over (T, N, 2) [m]."""
+    first, second = np.triu_indices(positions.shape[1], 1)
+    return float(np.linalg.norm(positions[:, first] - positions[:, second], axis=-1).min())
+
+
+def _slot_distance(positions: np.ndarray, scenario: Scenario) -> np.ndarray:
+    """(T, N) distance of every agent from its first formation's slot, relative to the centroid [m]."""
+    centred = positions - positions.mean(axis=1, keepdims=True)
+    return np.asarray(np.linalg.norm(centred - scenario.formations[0], axis=-1))

@@ -1,0 +1,22 @@
+"""Colors of agents and behaviors: the same in the model, the figures, the video and the page (color-blind safe)."""
+
+AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7A5195", "#4D4D4D")
+BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000"}
+_OTHER_BEHAVIORS = ("#6A3D9A", "#33A02C", "#8C564B", "#17BECF")
+
+
+def rgba(color: str, alpha: float = 1.0) -> tuple[float, float, float, float]:
+    """``#RRGGBB`` as four numbers in [0, 1]."""
+    red, green, blue = (int(color[k : k + 2], 16) / 255.0 for k in (1, 3, 5))
+    return red, green, blue, alpha
+
+
+def agent_color(agent: int) -> tuple[float, float, float, float]:
+    """RGBA of an agent, repeating after the palette's end."""
+    return rgba(AGENT_COLORS[agent % len(AGENT_COLORS)])
+
+
+def command_color(command: str) -> str:
+    """Hex color of a command, that of its highest behavior."""
+    behavior = command.split(">")[0]
+    return BEHAVIOR_COLORS.get(behavior, _OTHER_BEHAVIORS[sum(map(ord, behavior)) % len(_OTHER_BEHAVIORS)])

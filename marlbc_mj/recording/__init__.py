@@ -1,0 +1,1 @@
+"""Recording: MCAP logs, and videos rendered from them."""

@@ -1,0 +1,199 @@
+"""A scenario: everything that defines one problem instance, as one frozen documented dataclass."""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.behaviors import Behavior, Formation, ObstacleAvoidance
+from marlbc_mj.disturbances import Disturbance, PaperDrag
+from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.orders import Orders
+
+Point = tuple[float, float]
+REFERENCE_MODES = ("virtual", "actual")
+
+
+class Obstacle(NamedTuple):
+    """A disc, or a point when its radius is zero."""
+
+    x: float  # [m]
+    y: float  # [m]
+    radius: float = 0.0  # [m]
+
+
+class Window(NamedTuple):
+    """From ``start`` to ``end`` (both exclusive) the scripted supervisor gives ``agent`` (-1: all) this order."""
+
+    start: float  # [s]
+    end: float  # [s]
+    agent: int
+    order: str
+
+
+@dataclass(frozen=True)
+class Perturbation:
+    """How a seed changes the scenario: uniform draws around it. All zero (the default) makes every seed the same."""
+
+    start_spread: float = 0.0  # each start coordinate moves by at most this [m]
+    obstacle_spread: float = 0.0  # each obstacle coordinate moves by at most this [m]
+    drag_scale: tuple[float, float] = (1.0, 1.0)  # the disturbance is multiplied by a draw from this range
+
+    def __post_init__(self) -> None:
+        values = (self.start_spread, self.obstacle_spread, *self.drag_scale)
+        if not np.isfinite(values).all() or min(values) < 0 or self.drag_scale[0] > self.drag_scale[1]:
+            raise ConfigurationError(f"perturbation ranges must be finite, non-negative and ordered, got {self}")
+
+
+class Draw(NamedTuple):
+    """One seed's instance of a scenario."""
+
+    starts: np.ndarray  # (N, 2) [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
+    drag_scale: float
+
+
+@dataclass(frozen=True)
+class Scenario:
+    """A team, its path, its behaviors, what is in the way and how it is simulated.
+
+    Three clocks: a supervisor decides every ``mission_step``; the control law and physics run every ``substep``, of which a
+    mission step holds a whole number. Every number is checked when the scenario is built.
+
+    Raises:
+        ConfigurationError: naming the value that cannot be run.
+    """
+
+    name: str
+    starts: tuple[Point, ...]  # p(0), one per agent [m]
+    behaviors: tuple[Behavior, ...]  # in the order of their indices
+    path_origin: Point = (0.0, 0.0)  # p_cd(0) [m]
+    path_velocity: Point = (0.0, 0.0)  # p_cd' [m/s]
+    obstacles: tuple[Obstacle, ...] = ()
+    safe_distance: float = 2.0  # d_OA: a clearance at or below it is a violation [m]
+    formation_names: tuple[str, str] = ("FM", "FR")  # behaviors whose slots G = 2 and G = 1 are judged by
+    formation_tolerance: float = 0.5  # [m], relative to the centroid
+    duration: float = 100.0  # [s]
+    mission_step: float = 0.05  # [s]
+    substep: float = 0.005  # [s]
+    reference: Literal["virtual", "actual"] = "virtual"  # where behaviors are evaluated: at p_r or at the measured p
+    robot: str = "point_mass"
+    mass: float = 1.0  # [kg]
+    force_limit: float = 200.0  # per axis [N]
+    disturbance: Disturbance = field(default_factory=PaperDrag)
+    perturbation: Perturbation = Perturbation()
+    schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        self._check_numbers()
+        self._check_team()
+        self._check_clocks()
+
+    @property
+    def agents(self) -> int:
+        """N, the number of agents."""
+        return len(self.starts)
+
+    @property
+    def mission_steps(self) -> int:
+        """Mission steps in one episode."""
+        return round(self.duration / self.mission_step)
+
+    @property
+    def substeps(self) -> int:
+        """Physics substeps in one mission step."""
+        return round(self.mission_step / self.substep)
+
+    @cached_property
+    def orders(self) -> Orders:
+        """All priority orders of this scenario's behaviors."""
+        return Orders([b.name for b in self.behaviors], [b.complete for b in self.behaviors])
+
+    @cached_property
+    def formations(self) -> np.ndarray:
+        """(2, N, 2) slot offsets [m] that define G = 2 (first) and G = 1 (second)."""
+        by_name = {b.name: b for b in self.behaviors}
+        offsets = [by_name[name].offsets for name in self.formation_names]  # type: ignore[attr-defined]
+        return np.array(offsets, dtype=np.float64)
+
+    def obstacle_array(self) -> np.ndarray:
+        """(K, 3) x, y, radius [m]."""
+        return np.array(self.obstacles, dtype=np.float64).reshape(-1, 3)
+
+    def draw(self, rng: np.random.Generator) -> Draw:
+        """One instance: starts, obstacles and drag scale drawn around this scenario's values."""
+        spread = self.perturbation
+        starts = np.array(self.starts, dtype=np.float64)
+        obstacles = self.obstacle_array()
+        starts += rng.uniform(-spread.start_spread, spread.start_spread, starts.shape)
+        obstacles[:, :2] += rng.uniform(-spread.obstacle_spread, spread.obstacle_spread, (len(obstacles), 2))
+        return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)))
+
+    def _check_numbers(self) -> None:
+        positive = ("safe_distance", "formation_tolerance", "duration", "mission_step", "substep", "mass", "force_limit")
+        for name in positive:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive and finite, got {value}")
+        if self.reference not in REFERENCE_MODES:
+            raise unknown("reference mode", self.reference, REFERENCE_MODES)
+        arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}
+        for name, values in arrays.items():
+            if not np.isfinite(np.array(values, dtype=float)).all():
+                raise ConfigurationError(f"scenario {self.name!r}: {name} must be finite, got {values}")
+
+    def _check_team(self) -> None:
+        if self.agents < 2:
+            raise ConfigurationError(f"scenario {self.name!r} has {self.agents} agent(s); a team needs at least 2")
+        names = [b.name for b in self.behaviors]
+        for name in self.formation_names:
+            if name not in names:
+                raise unknown("formation behavior", name, names)
+        for behavior in self.behaviors:
+            offsets = getattr(behavior, "offsets", None)
+            if offsets is not None:
+                self._check_slots(behavior.name, offsets)
+        for k, obstacle in enumerate(self.obstacles):
+            if obstacle.radius < 0:
+                raise ConfigurationError(f"obstacle {k} has a negative radius: {obstacle}")
+            for i, start in enumerate(self.starts):
+                if np.hypot(start[0] - obstacle.x, start[1] - obstacle.y) <= obstacle.radius:
+                    raise ConfigurationError(f"obstacle {k} {tuple(obstacle)} covers the start of agent {i + 1} {start}")
+
+    def _check_slots(self, name: str, offsets: tuple[Point, ...]) -> None:
+        if len(offsets) != self.agents:
+            raise ConfigurationError(f"{name} has {len(offsets)} slots for {self.agents} agents")
+        slots = np.array(offsets)
+        for i in range(self.agents):
+            for j in range(i):
+                if np.linalg.norm(slots[i] - slots[j]) < 1e-9:
+                    raise ConfigurationError(
+                        f"{name} slots of agents {j + 1} and {i + 1} overlap at {tuple(map(float, slots[i]))}"
+                    )
+
+    def _check_clocks(self) -> None:
+        for long, short in (("mission_step", "substep"), ("duration", "mission_step")):
+            ratio = getattr(self, long) / getattr(self, short)
+            if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9 * max(1.0, ratio):
+                raise ConfigurationError(
+                    f"{long} {getattr(self, long)} s must be a whole multiple of {short} {getattr(self, short)} s"
+                )
+
+
+def standard_behaviors(
+    formation: tuple[Point, ...],
+    reconstruction: tuple[Point, ...],
+    *,
+    avoidance_gain: float = 20.0,
+    formation_gain: float = 8.0,
+    safe_distance: float = 2.0,
+    two_sided: bool = False,
+) -> tuple[Behavior, ...]:
+    """OA, FM and FR in this order, with the gains of Table 2."""
+    return (
+        ObstacleAvoidance(avoidance_gain, safe_distance, two_sided),
+        Formation("FM", formation, formation_gain),
+        Formation("FR", reconstruction, formation_gain),
+    )

@@ -1,0 +1,39 @@
+"""The paper's case study: four agents, two points and a gate of four discs on a 100 m path (section 4.1, Tables 1 and 2)."""
+
+from typing import Any
+
+from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors
+
+STARTS = ((-2.0, 8.0), (-2.0, -8.0), (-7.0, 14.0), (-7.0, -14.0))
+SLOTS = ((2.5, 6.0), (2.5, -6.0), (-2.5, 12.0), (-2.5, -12.0))
+COLUMN = ((4.5, 0.0), (1.5, 0.0), (-1.5, 0.0), (-4.5, 0.0))
+"""Gamma_i p_c_i with Gamma_3 and Gamma_4 positive; the printed signs put two pairs of agents in one place (erratum 4)."""
+OBSTACLES = (
+    Obstacle(20, 5),
+    Obstacle(40, -11),
+    Obstacle(60, 9, 5),
+    Obstacle(70, 9, 5),
+    Obstacle(60, -9, 5),
+    Obstacle(70, -9, 5),
+)
+SCHEDULE = (
+    Window(18.1, 21.9, 0, "OA>FM"),
+    Window(43.1, 46.9, 3, "OA>FM"),
+    Window(50.0, 82.5, -1, "FR"),
+)
+"""The fewest switches the geometry allows: slots of agents 1 and 4 pass a point at 1 m, every slot meets a disc."""
+
+
+def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
+    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the printed OA (erratum 6)."""
+    fields: dict[str, Any] = {
+        "name": "paper",
+        "starts": STARTS,
+        "behaviors": standard_behaviors(SLOTS, COLUMN, two_sided=two_sided),
+        "path_origin": (-2.5, 0.0),
+        "path_velocity": (1.0, 0.0),
+        "obstacles": OBSTACLES,
+        "schedule": SCHEDULE,
+        "description": "four agents, two points and a gate on a 100 m path: the paper's case study",
+    }
+    return Scenario(**{**fields, **changes})
