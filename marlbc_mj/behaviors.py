@@ -92,7 +92,7 @@ class ObstacleAvoidance:
 
     def __post_init__(self) -> None:
         _require_positive(f"{self.name} gain", self.gain)
-        _require_positive(f"{self.name} safe distance", self.safe_distance)
+        _require_positive(f"{self.name} safe_distance", self.safe_distance)
 
     def params(self, agent: int) -> tuple[float, ...]:
         return (self.gain, self.safe_distance, float(self.two_sided))

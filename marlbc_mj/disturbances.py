@@ -1,13 +1,13 @@
 """Unknown dynamics f(chi) of the plant (1): what the controllers do not know. One law and one dataclass each."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from marlbc_mj import laws
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.errors import ConfigurationError, unknown
 
 
 @laws.disturbance
@@ -97,7 +97,7 @@ class QuadraticDrag(_Scaled):
 
 @dataclass(frozen=True)
 class ConstantWind(_Scaled):
-    """A constant force."""
+    """A constant force; unlike (1) asks, it does not vanish at rest."""
 
     force: tuple[float, float] = (5.0, 0.0)  # w [N]
     law = staticmethod(constant_wind)
@@ -106,10 +106,21 @@ class ConstantWind(_Scaled):
         return (self.scale, *self.force)
 
 
-DISTURBANCES: dict[str, type[_Scaled]] = {
-    "paper": PaperDrag,
-    "linear": LinearDrag,
-    "quadratic": QuadraticDrag,
-    "wind": ConstantWind,
+DISTURBANCES: dict[str, tuple[Callable[..., Disturbance], str]] = {
+    "paper": (PaperDrag, "the case study's drag (43), periodic in the position"),
+    "linear": (LinearDrag, "f = -c v"),
+    "quadratic": (QuadraticDrag, "f = -c |v| v"),
+    "wind": (ConstantWind, "a constant force"),
 }
-"""By the names of the command line."""
+"""Class and one line of description by name."""
+
+
+def make_disturbance(name: str, scale: float = 1.0) -> Disturbance:
+    """A disturbance by name, times ``scale``.
+
+    Raises:
+        ConfigurationError: unknown name, or a scale that is not finite.
+    """
+    if name not in DISTURBANCES:
+        raise unknown("disturbance", name, DISTURBANCES)
+    return DISTURBANCES[name][0](scale=scale)

@@ -88,13 +88,13 @@ def run_episode(
         frames.append(
             Frame(
                 float(observation.time[0]),
-                *record[:, 0],
-                clearance=observation.clearance[0],
-                formation=int(observation.formation[0]),
-                command=step.observation.command[0],
-                reward=float(step.reward[0]),
-                controller_state=controller_state,
-                decision_ms=decision_ms,
+                *(record[k, 0] for k in range(5)),  # type: ignore[call-arg]  # five fields, in the order of Record
+                observation.clearance[0],
+                int(observation.formation[0]),
+                step.observation.command[0],
+                float(step.reward[0]),
+                controller_state,
+                decision_ms,
             )
         )
         if on_frame is not None:

@@ -18,7 +18,8 @@ Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or 
 """
 
 from collections.abc import Callable
-from typing import Any
+from types import FunctionType
+from typing import Any, cast
 
 import numba
 from numba import types
@@ -38,14 +39,18 @@ BEHAVIOR = types.int64(_VECTOR, _VECTOR, _MATRIX, _MATRIX, _MATRIX, types.int64,
 """params (P,), p (2,) [m], path (2, 2): desired centroid [m] and its velocity [m/s], obstacles (K, 3): x, y, radius [m],
 team (N, 2): everyone's position [m], agent, velocity_out (2,) [m/s], jacobian_out (2, 2) -> rows used of the Jacobian."""
 
-CONTROLLER = types.void(
-    _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR
-)
-"""params (P,), state (S,) changed in place, p (2,) [m], v (2,) [m/s], p_r (2,) [m], v_r (2,) [m/s], drag (2,) [N]: the true f(chi),
-for laws that assume a known model, h [s], force_out (2,) [N]."""
+CONTROLLER = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
+"""params (P,), state (S,) changed in place, p (2,) [m], v (2,) [m/s], p_r (2,) [m], v_r (2,) [m/s], drag (2,) [N]: the
+true f(chi), for laws that assume a known model, h [s], force_out (2,) [N]."""
 
 DISTURBANCE = types.void(_VECTOR, types.float64, _VECTOR, _VECTOR, _VECTOR)
 """params (P,), t [s], p (2,) [m], v (2,) [m/s], force_out (2,) [N]."""
+
+TEAM_CONTROLLER = types.void(_MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, types.float64, _MATRIX)
+"""A controller for every agent in turn: the arguments of :data:`CONTROLLER`, one row an agent."""
+
+TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
+"""A disturbance for every agent in turn: the arguments of :data:`DISTURBANCE`, one row an agent."""
 
 
 def compiled(function: Law) -> Law:
@@ -58,19 +63,65 @@ def inlined(function: Law) -> Law:
     return register_jitable(inline="always")(function)  # type: ignore[no-any-return]
 
 
+@inlined
+def clip(value, limit):  # type: ignore[no-untyped-def]
+    """Saturation (2): ``value`` within +-limit. NaN passes through, so that the run stops instead of going on at the limit."""
+    if value > limit:
+        return limit
+    if value < -limit:
+        return -limit
+    return value
+
+
 def allocation_free(function: Law) -> Law:
     """Compile a law, or a helper that laws call: as :func:`compiled`, and without reference counting.
 
     Counting the arguments of one call costs more than the arithmetic of most laws. The price: the function cannot create arrays;
-    scratch belongs in a controller's ``state``.
+    scratch belongs in a controller's ``state``. A function typed at a prompt has no file, and is compiled anew in every session.
     """
-    return numba.njit(cache=True, error_model="numpy", nogil=True, _nrt=False)(function)  # type: ignore[no-any-return]
+    options = {"error_model": "numpy", "nogil": True, "_nrt": False}
+    try:
+        return numba.njit(cache=True, **options)(function)  # type: ignore[no-any-return]
+    except RuntimeError:  # no file to keep the cache beside
+        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+
+
+def _controller_team(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
+    for i in range(p.shape[0]):
+        law(params[i], state[i], p[i], v[i], p_r[i], v_r[i], drag[i], h, force_out[i])  # type: ignore[name-defined]  # noqa: F821
+
+
+def _disturbance_team(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
+    for i in range(p.shape[0]):
+        law(params, t, p[i], v[i], force_out[i])  # type: ignore[name-defined]  # noqa: F821
+
+
+_TEAMS = {CONTROLLER: (TEAM_CONTROLLER, _controller_team), DISTURBANCE: (TEAM_DISTURBANCE, _disturbance_team)}
+
+
+def for_team(law: Law, signature: Any) -> Law:
+    """The law applied to every agent in turn, as a Python function; for :data:`CONTROLLER` and :data:`DISTURBANCE`.
+
+    The template above becomes a function of its own whose global ``law`` is this one, with the law's file and line as its place,
+    by which numba's cache knows it when it is compiled.
+    """
+    name, source = getattr(law, "__name__", "law"), getattr(plain(law), "__code__", None)
+    code = _TEAMS[signature][1].__code__.replace(co_name=f"{name}_team")
+    if source is not None:
+        code = code.replace(co_filename=source.co_filename, co_firstlineno=source.co_firstlineno)
+    function = FunctionType(code, {"law": law, "range": range}, f"{name}_team")
+    function.__module__ = law.__module__
+    function.__qualname__ = f"{getattr(law, '__qualname__', name)}_team"
+    return function
 
 
 def _declare(function: Law, signature: Any) -> Law:
-    law = allocation_free(function)
-    law.signature_of_law = signature  # type: ignore[attr-defined]
-    return law
+    """Compile a law, and for the loop its team form: an indirect call costs more than most laws, so the loop makes one a team."""
+    law: Any = allocation_free(function)
+    if is_compiled(law):
+        law.signature_of_law = signature
+        law.entry = allocation_free(for_team(law, signature)) if signature in _TEAMS else law
+    return cast(Law, law)
 
 
 def behavior(function: Law) -> Law:
@@ -99,23 +150,26 @@ def plain(law: Law) -> Law:
 
 
 def address(law: Law, signature: Any) -> int:
-    """Machine address of a compiled law, for the compiled loop.
+    """Machine address of a compiled law for the compiled loop: of its team form for controllers and disturbances.
 
     Raises:
-        ConfigurationError: the law is plain Python, or was declared as another kind of law.
+        ConfigurationError: the law is plain Python, was declared as another kind of law, or does not compile.
     """
     name = getattr(law, "__name__", repr(law))
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.laws")
-    declared = getattr(law, "signature_of_law", signature)
+    declared = getattr(law, "signature_of_law", None)
     if declared != signature:
         raise ConfigurationError(f"law {name!r} was declared as {declared}, but is used as {signature}")
+    kind = _TEAMS[signature][0] if signature in _TEAMS else signature
     try:
         law.compile(signature.args)
+        entry = law.entry  # type: ignore[attr-defined]
+        entry.compile(kind.args)
     except NumbaError as error:
         raise ConfigurationError(f"law {name!r} does not compile as {signature}: {_last_line(error)}") from error
-    compiled_law = law.get_compile_result(signature)
-    return int(compiled_law.library.get_pointer_to_function(compiled_law.fndesc.llvm_func_name))
+    result = entry.get_compile_result(kind)
+    return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
 
 def _last_line(error: Exception) -> str:

@@ -2,6 +2,7 @@
 
 AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7A5195", "#4D4D4D")
 BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000"}
+SAFE_DISTANCE_COLOR = "#B4505E"
 _OTHER_BEHAVIORS = ("#6A3D9A", "#33A02C", "#8C564B", "#17BECF")
 
 
@@ -20,3 +21,10 @@ def command_color(command: str) -> str:
     """Hex color of a command, that of its highest behavior."""
     behavior = command.split(">")[0]
     return BEHAVIOR_COLORS.get(behavior, _OTHER_BEHAVIORS[sum(map(ord, behavior)) % len(_OTHER_BEHAVIORS)])
+
+
+def ink_on(color: str) -> str:
+    """Hex color of readable text on a ground ``#RRGGBB``: white, or near black where the ground's luminance (WCAG) is high."""
+    linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in rgba(color)[:3]]
+    luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    return "#1B1F26" if luminance > 0.35 else "#FFFFFF"

@@ -1,0 +1,39 @@
+"""Views of the benchmark for other people's tools: dm_control environments."""
+
+from typing import Any
+
+import dm_env
+import numpy as np
+
+from marlbc_mj.controllers import Controller
+from marlbc_mj.errors import unknown
+from marlbc_mj.scenarios import make_scenario
+
+DOMAINS = ("formation",)
+
+
+def load(
+    domain: str,
+    task: str,
+    *,
+    controller: Controller | None = None,
+    random_state: int | np.random.RandomState | None = None,
+    **changes: Any,
+) -> dm_env.Environment:
+    """A dm_control environment by name: ``load("formation", "paper")``.
+
+    Args:
+        domain: ``"formation"``.
+        task: a scenario's name.
+        controller: the force law; SORLC by default.
+        random_state: seed of the episodes' draws.
+        **changes: any field of the scenario, ``substep=0.001`` for example.
+
+    Raises:
+        ConfigurationError: unknown domain or scenario, or a change that cannot be run.
+    """
+    if domain not in DOMAINS:
+        raise unknown("domain", domain, DOMAINS)
+    from marlbc_mj.tasks.formation import make_environment
+
+    return make_environment(make_scenario(task, **changes), controller, random_state)

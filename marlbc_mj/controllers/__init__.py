@@ -1,19 +1,35 @@
 """Controllers: one law per file, and the names under which the command line offers them."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 
 from marlbc_mj.controllers.base import Controller, largest_stable_substep
+from marlbc_mj.controllers.homogeneous import FiniteTime, FixedTime
+from marlbc_mj.controllers.lqr import LQR
 from marlbc_mj.controllers.pd import PD
+from marlbc_mj.controllers.rlc import RLC
 from marlbc_mj.controllers.sorlc import SORLC
 from marlbc_mj.errors import unknown
+
+_UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR], str]] = {
+    "rlc": (RLC, "single-agent RL controller: SORLC's networks, next to no damping, no limit"),
+    "finite-time": (FiniteTime, "finite-time law, no limit, true drag known"),
+    "fixed-time": (FixedTime, "fixed-time law, no limit, true drag known"),
+    "lqr": (LQR, "Riccati gains of the paper's own cost, no limit, true drag known"),
+}
 
 CONTROLLERS: dict[str, tuple[Callable[[], Controller], str]] = {
     "sorlc": (SORLC, "identifier-actor-critic with input saturation (36)-(41), the paper's basis"),
     "sorlc-scaled": (SORLC.scaled, "SORLC with a basis relative to the reference, which keeps learning"),
-    "sorlc-off": (lambda: SORLC(basis="off"), "SORLC without networks: saturated PD and compensator (30)"),
+    "sorlc-off": (partial(SORLC, basis="off"), "SORLC without networks: saturated PD and compensator (30)"),
     "pd": (PD, "saturated PD with gains 100 and 100"),
 }
 """Factory and one line of description by name."""
+
+for _name, (_law, _line) in _UNLIMITED.items():
+    CONTROLLERS[_name] = (_law, _line)
+    CONTROLLERS[f"{_name}-limited"] = (partial(replace, _law(), limited=True), _line.replace("no limit", "actuator limited"))
 
 
 def make_controller(name: str) -> Controller:
@@ -27,4 +43,15 @@ def make_controller(name: str) -> Controller:
     return CONTROLLERS[name][0]()
 
 
-__all__ = ["CONTROLLERS", "PD", "SORLC", "Controller", "largest_stable_substep", "make_controller"]
+__all__ = [
+    "CONTROLLERS",
+    "LQR",
+    "PD",
+    "RLC",
+    "SORLC",
+    "Controller",
+    "FiniteTime",
+    "FixedTime",
+    "largest_stable_substep",
+    "make_controller",
+]

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from marlbc_mj import laws
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.errors import ConfigurationError, unknown
 
 
 @runtime_checkable
@@ -14,7 +14,8 @@ class Controller(Protocol):
     """A force law with its gains. Implementations are frozen dataclasses; the law itself holds no state.
 
     ``limited`` says whether the actuator keeps the scenario's force limit: an unlimited law is the paper's reading of its
-    rivals, and gets actuators without a range.
+    rivals, and gets actuators without a range. A law with decaying states of its own may offer ``decay_rates``, in 1/s, which
+    are then checked against the substep too.
     """
 
     @property
@@ -49,6 +50,17 @@ def largest_stable_substep(position_gain: float, velocity_gain: float) -> float:
 
     For the paper's 100 and 100 it is 19.8 ms, so a control law held over a mission step of 50 ms would diverge.
     """
-    if position_gain == 0.0:
-        return 2.0 / velocity_gain if velocity_gain else np.inf
-    return float((-velocity_gain + np.sqrt(velocity_gain**2 + 4.0 * position_gain)) / position_gain)
+    inverse = 0.25 * (velocity_gain + np.sqrt(velocity_gain**2 + 4.0 * position_gain))  # the root that does not cancel
+    return float(1.0 / inverse) if inverse > 0.0 else np.inf
+
+
+def model_weight(model: str) -> float:
+    """1 for a law that is given the true f, 0 for one that is given nothing.
+
+    Raises:
+        ConfigurationError: another word.
+    """
+    weights = {"exact": 1.0, "none": 0.0}
+    if model not in weights:
+        raise unknown("model of the drag", model, weights)
+    return weights[model]

@@ -13,7 +13,7 @@ def pd(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-un
     """u = clip(-k_p e_p - k_v e_v, +-limit); ``params`` = k_p, k_v, limit; no state."""
     for axis in range(2):
         wish = -params[0] * (p[axis] - p_r[axis]) - params[1] * (v[axis] - v_r[axis])
-        force_out[axis] = min(max(wish, -params[2]), params[2])
+        force_out[axis] = laws.clip(wish, params[2])
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 Identifier, critic and actor are linear in 12 Gaussians whose centres lie on the diagonal, c_k = (c_k, ..., c_k). Then
 |z - c_k|^2 = |z|^2 - 2 c_k sum(z) + n c_k^2, and neighbours differ by a factor that is itself geometric in k: two
-exponentials give all twelve values (equal to the textbook form to 1e-15).
+exponentials give all twelve values, equal to the textbook form to 1e-13.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ _F, _A, _C, _PSI_F, _PSI_V, _TAU = (row * NEURONS for row in (0, 2, 4, 6, 7, 8))
 STATE_SIZE = _TAU + 2
 
 BASES = ("printed", "scaled", "off")
-_UNDERFLOW = -700.0  # exp of less is taken as zero, 1e-304
+NEGLIGIBLE = 45.0  # exp(-45) = 3e-20 is taken as zero
 
 
 class Weights(NamedTuple):
@@ -32,18 +32,19 @@ class Weights(NamedTuple):
 
 
 @laws.allocation_free
-def diagonal_gaussians(square, total, n, first, step, width, out, at):  # type: ignore[no-untyped-def]
-    """exp(-|z - c_k 1|^2 / width^2) for c_k = first + k step, from |z|^2, sum(z) and the dimension n of z.
+def diagonal_gaussians(square, total, n, first, step, precision, factor, out, at):  # type: ignore[no-untyped-def]
+    """exp(-precision |z - c_k 1|^2) for c_k = first + k step, from |z|^2, sum(z) and the dimension n of z.
 
-    Written to ``out[at : at + 12]``; returns False and leaves it alone where every value is below 1e-304.
+    ``precision`` = 1 / width^2, ``factor`` = exp(-2 n step^2 precision). Written to ``out[at : at + 12]``; returns False
+    and leaves it
+    alone where every value is below 3e-20, which no force can feel.
     """
-    inverse = 1.0 / (width * width)
-    closest = min(max(total / n, first), first + (NEURONS - 1) * step)
-    if -(square - 2.0 * closest * total + n * closest * closest) * inverse < _UNDERFLOW:
+    last = first + (NEURONS - 1) * step
+    closest = min(max(total, n * first), n * last)  # n times the centre nearest to z
+    if precision * (square * n - closest * (2.0 * total - closest)) > NEGLIGIBLE * n:
         return False
-    value = np.exp(-(square - 2.0 * first * total + n * first * first) * inverse)
-    ratio = np.exp((2.0 * step * total - n * step * (2.0 * first + step)) * inverse)
-    factor = np.exp(-2.0 * n * step * step * inverse)
+    value = np.exp(-precision * (square - first * (2.0 * total - n * first)))
+    ratio = np.exp(precision * step * (2.0 * total - n * (2.0 * first + step)))
     for k in range(NEURONS):
         out[at + k] = value
         value *= ratio
@@ -55,8 +56,10 @@ def diagonal_gaussians(square, total, n, first, step, width, out, at):  # type: 
 def sorlc(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
     """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler.
 
-    ``params`` = xi_p, xi_v, xi_tau, Gamma_f, nu_f, gamma_c, gamma_a, beta_V, sign of tau, limit [N], networks on (0 or 1), basis
-    relative to the reference (0 or 1), scale of p [m], of v [m/s], of tau [N], first centre, distance of centres, width.
+    ``params`` = xi_p, xi_v, xi_tau, Gamma_f, nu_f, gamma_c, gamma_a, 1 / (2 beta_V), sign of tau, limit [N], networks on
+    (0 or 1), basis
+    relative to the reference (0 or 1), scale of p [m], of v [m/s], of tau [N], first centre, distance of centres,
+    1 / width^2, and the factors of :func:`diagonal_gaussians` for n = 4 and n = 2.
     """
     networks = params[10] != 0.0
     active = networks and _basis(params, state, p, v, p_r, v_r)
@@ -66,7 +69,7 @@ def sorlc(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no
         nominal = -params[0] * position_error - params[1] * velocity_error + params[8] * state[_TAU + axis]
         if active:
             nominal += _actor_critic(params, state, axis, h)
-        force = min(max(nominal, -params[9]), params[9])
+        force = laws.clip(nominal, params[9])
         force_out[axis] = force
         state[_TAU + axis] += h * (force - nominal - params[2] * state[_TAU + axis])
         if networks:
@@ -92,7 +95,7 @@ def _actor_critic(params, state, axis, h):  # type: ignore[no-untyped-def]
     for k in range(NEURONS):
         state[_A + axis * NEURONS + k] -= d_actor * state[_PSI_V + k]
         state[_C + axis * NEURONS + k] -= d_critic * state[_PSI_V + k]
-    return -f_hat - 0.5 / params[7] * actor
+    return -f_hat - params[7] * actor
 
 
 @laws.inlined
@@ -103,12 +106,12 @@ def _basis(params, state, p, v, p_r, v_r):  # type: ignore[no-untyped-def]
         z2, z3 = (v[0] - v_r[0]) / params[13], (v[1] - v_r[1]) / params[13]
     else:
         z0, z1, z2, z3 = p[0], p[1], v[0], v[1]
-    first, step, width = params[15], params[16], params[17]
+    first, step, precision = params[15], params[16], params[17]
     square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3
-    if not diagonal_gaussians(square, z0 + z1 + z2 + z3, 4.0, first, step, width, state, _PSI_F):
+    if not diagonal_gaussians(square, z0 + z1 + z2 + z3, 4.0, first, step, precision, params[18], state, _PSI_F):
         return False
     t0, t1 = state[_TAU] / params[14], state[_TAU + 1] / params[14]
-    if not diagonal_gaussians(t0 * t0 + t1 * t1, t0 + t1, 2.0, first, step, width, state, _PSI_V):
+    if not diagonal_gaussians(t0 * t0 + t1 * t1, t0 + t1, 2.0, first, step, precision, params[19], state, _PSI_V):
         for k in range(NEURONS):
             state[_PSI_V + k] = 0.0
     for k in range(NEURONS):
@@ -119,15 +122,16 @@ def _basis(params, state, p, v, p_r, v_r):  # type: ignore[no-untyped-def]
 def weights(state: np.ndarray) -> Weights:
     """Read one agent's state (S,), or a stack of them (..., S), as weight matrices (..., 12, 2)."""
     shape = (*state.shape[:-1], 2, NEURONS)
-    matrices = [state[..., at : at + 2 * NEURONS].reshape(shape).swapaxes(-1, -2) for at in (_F, _A, _C)]
-    return Weights(*matrices, tau=state[..., _TAU:])
+    identifier, actor, critic = (state[..., at : at + 2 * NEURONS].reshape(shape).swapaxes(-1, -2) for at in (_F, _A, _C))
+    return Weights(identifier, actor, critic, state[..., _TAU:])
 
 
 @dataclass(frozen=True)
 class SORLC:
     """Gains of Table 2, and the readings of the basis.
 
-    ``printed`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law. ``scaled``
+    ``printed`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law.
+    ``scaled``
     feeds the basis the tracking errors over ``position_scale`` and ``velocity_scale`` instead, so the identifier sees
     signals inside its range along the whole run; ``off`` has no networks. With the printed Gamma_f and nu_f the leak
     holds the identifier below a fifth of the PD terms, so ``scaled`` has its own: see :meth:`scaled`.
@@ -163,7 +167,19 @@ class SORLC:
         scales = ("position_scale", "velocity_scale", "tau_scale")
         require_gains(self, (*positive, *scales))
         require_gains(self, ("identifier_leak",), allow_zero=True)
+        if self.width < self.centre_range / 6.0:
+            raise ConfigurationError(
+                f"SORLC.width must be at least a sixth of centre_range, {self.centre_range / 6.0:g}, got {self.width}; narrower "
+                "Gaussians fall below what the recurrence over neurons can represent"
+            )
+        self._require_weights()
         self._require_theorem_1()
+
+    def _require_weights(self) -> None:
+        for name in ("identifier_weights", "actor_weights", "critic_weights"):
+            fills = getattr(self, name)
+            if not fills or not np.isfinite(fills).all():
+                raise ConfigurationError(f"SORLC.{name} must be finite numbers, at least one, got {fills}")
 
     def _require_theorem_1(self) -> None:
         """Gain conditions (42), without the one on xi_e, which the paper does not define (erratum 14)."""
@@ -181,13 +197,23 @@ class SORLC:
 
     @classmethod
     def scaled(cls, **changes: object) -> "SORLC":
-        """The scaled basis with the learning gains chosen for it by ``marlbc ablation`` (README, 'Does the basis learn?')."""
-        gains: dict[str, object] = {"identifier_rate": 2000.0, "identifier_leak": 1e-3, "width": 6.0}
+        """The scaled basis with learning gains of its own, chosen from the sweep that ``marlbc ablation`` prints.
+
+        Gamma_f Psi^T Psi / 100 is the identifier's bandwidth: 1000 and width 6 make it about 90 rad/s, a factor 8 below
+        where a substep of
+        5 ms starts to oscillate.
+        """
+        gains: dict[str, object] = {"identifier_rate": 1000.0, "identifier_leak": 1e-3, "width": 6.0}
         return cls(basis="scaled", **{**gains, **changes})  # type: ignore[arg-type]
 
     @property
     def linear_gains(self) -> tuple[float, float]:
         return self.position_error_gain, self.velocity_error_gain
+
+    @property
+    def decay_rates(self) -> tuple[float, ...]:
+        """Of the compensator (30) and of the identifier's leak (37) [1/s]."""
+        return self.compensator_gain, self.identifier_rate * self.identifier_leak
 
     def params(self, agent: int, limit: float) -> tuple[float, ...]:
         relative = self.basis == "scaled"
@@ -200,7 +226,7 @@ class SORLC:
             self.identifier_leak,
             self.critic_rate,
             self.actor_rate,
-            self.control_weight,
+            0.5 / self.control_weight,
             float(self.tau_sign),
             limit,
             float(self.basis != "off"),
@@ -210,7 +236,9 @@ class SORLC:
             self.tau_scale if relative else 1.0,
             -self.centre_range,
             step,
-            self.width,
+            1.0 / self.width**2,
+            float(np.exp(-8.0 * (step / self.width) ** 2)),
+            float(np.exp(-4.0 * (step / self.width) ** 2)),
         )
 
     def initial_state(self, agent: int) -> np.ndarray:

@@ -13,6 +13,7 @@ from marlbc_mj.scenarios import Obstacle, Scenario
 
 POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
 OBSTACLE_HEIGHT = 1.2  # [m]
+MARGIN = 4.0  # that the top camera leaves around the mission [m]
 MEMORY = 256 * 1024  # arena of one MjData [bytes]; MuJoCo's default is 13.6 MB, too much for thousands of worlds
 
 
@@ -49,9 +50,11 @@ def assemble(scenario: Scenario, limit: float) -> str:
 
 def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: float) -> None:
     child = mujoco.MjSpec.from_file(str(robot.mjcf))
-    for geom in child.body(robot.body).geoms:
+    geoms = child.body(robot.body).geoms
+    total = sum(geom.mass for geom in geoms)
+    for geom in geoms:
         geom.rgba = agent_color(agent)
-        geom.mass = mass
+        geom.mass *= mass / total
     for name in robot.motors:
         motor = child.actuator(name)
         bounded = np.isfinite(limit)
@@ -76,16 +79,14 @@ def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle) -> None:
 
 
 def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
-    """``top`` sees the whole mission; ``track`` follows the team's centre of mass."""
-    ends = np.array([scenario.path_origin, scenario.path_origin]) + np.outer(
-        (0.0, scenario.duration), scenario.path_velocity
-    )
-    middle = ends.mean(axis=0)
-    length = float(np.linalg.norm(ends[1] - ends[0]))
-    width = max(float(np.abs(scenario.formations).max()) * 2.0, 0.5 * (length + 20.0))
+    """``top`` sees the whole mission in a 16:9 picture; ``track`` follows the team's centre of mass."""
+    low, high = _mission_bounds(scenario)
+    width, depth = high - low + 2.0 * MARGIN
     fovy = 30.0
-    height = 0.5 * width / np.tan(np.radians(0.5 * fovy))
-    spec.worldbody.add_camera(name="top", pos=[*middle, height], fovy=fovy)
+    height = 0.5 * max(depth, width * 9.0 / 16.0) / np.tan(np.radians(0.5 * fovy))
+    spec.stat.center = [*(0.5 * (low + high)), 0.0]
+    spec.stat.extent = 0.5 * max(depth, width)
+    spec.worldbody.add_camera(name="top", pos=[*(0.5 * (low + high)), height], fovy=fovy)
     spec.worldbody.add_camera(
         name="track",
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
@@ -93,3 +94,14 @@ def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
         xyaxes=[1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
         fovy=40.0,
     )
+
+
+def _mission_bounds(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper corner (2,) [m] of a box around starts, obstacles and the formations' way along the path."""
+    ends = np.array(scenario.path_origin) + np.outer((0.0, scenario.duration), scenario.path_velocity)
+    slots = ends[:, None] + scenario.formations.reshape(1, -1, 2)
+    obstacles = scenario.obstacle_array()
+    zone = obstacles[:, 2:] + scenario.safe_distance
+    points = [slots.reshape(-1, 2), np.array(scenario.starts), obstacles[:, :2] - zone, obstacles[:, :2] + zone]
+    everything = np.concatenate(points)
+    return everything.min(axis=0), everything.max(axis=0)

@@ -112,14 +112,16 @@ def team_forces(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Drag and controller force of every agent for one substep, written to ``drag`` and ``force`` (N, 2) [N].
 
-    Returns 0, or 1 + agent where a position, velocity or force left the physical range; then nothing may be stepped.
+    Returns 0, or 1 + agent where a position, velocity, force or drag left the physical range; then nothing may be stepped.
     """
-    controller = as_controller(controller_law)
     disturbance = as_disturbance(disturbance_law)
+    controller = as_controller(controller_law)
+    disturbance(disturbance_params, t, p, v, drag)
+    controller(controller_params, state, p, v, p_r, v_r, drag, h, force)
     for i in range(p.shape[0]):
-        disturbance(disturbance_params, t, p[i], v[i], drag[i])
-        controller(controller_params[i], state[i], p[i], v[i], p_r[i], v_r[i], drag[i], h, force[i])
-        size = abs(p[i, 0]) + abs(p[i, 1]) + abs(v[i, 0]) + abs(v[i, 1]) + abs(force[i, 0]) + abs(force[i, 1])
+        size = 0.0
+        for axis in range(2):
+            size += abs(p[i, axis]) + abs(v[i, axis]) + abs(drag[i, axis]) + abs(force[i, axis])
         if not size < DIVERGED:
             return 1 + i
     return 0
@@ -193,7 +195,9 @@ def mission_step(  # type: ignore[no-untyped-def]
     data, disturbance_params, obstacles, orders, commands, p, v, p_r, v_r, state, clearance, formation, reward, steps,
     status, record,
 ):  # fmt: skip
-    """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance [m], safe distance [m], virtual (0/1)."""
+    """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
+    [m], safe distance [m], virtual (0/1).
+    """
     t = steps[b] * settings[0]
     r2 = begin_step(
         t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], obstacles[b],

@@ -1,7 +1,8 @@
 """Calling MuJoCo and laws by address from compiled code. Everything unsafe of this package is in this file.
 
 Each function here has two faces. Called from Python it takes objects: a law, ``mujoco.mj_step``, an array. Inside compiled code
-it takes their addresses, plain integers, so that the compiled loop stays cached on disk whatever it calls. Whoever passes an address
+it takes their addresses, plain integers, so that the compiled loop stays cached on disk whatever it calls. Whoever passes
+an address
 keeps its owner (MjModel, MjData, law) alive while the call lasts.
 """
 
@@ -38,12 +39,12 @@ def as_behavior(law):  # type: ignore[no-untyped-def]
 
 
 def as_controller(law):  # type: ignore[no-untyped-def]
-    """A controller that can be called, from its address."""
+    """A controller that can be called for a whole team, from its address."""
     return law
 
 
 def as_disturbance(law):  # type: ignore[no-untyped-def]
-    """A disturbance that can be called, from its address."""
+    """A disturbance that can be called for a whole team, from its address."""
     return law
 
 
@@ -97,5 +98,5 @@ def _compile_as(function, kind):  # type: ignore[no-untyped-def]
 
 
 _compile_as(as_behavior, laws.BEHAVIOR)
-_compile_as(as_controller, laws.CONTROLLER)
-_compile_as(as_disturbance, laws.DISTURBANCE)
+_compile_as(as_controller, laws.TEAM_CONTROLLER)
+_compile_as(as_disturbance, laws.TEAM_DISTURBANCE)

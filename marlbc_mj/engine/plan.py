@@ -1,5 +1,6 @@
 """A scenario and a controller, checked against each other and turned into the arrays that the loop takes."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -38,17 +39,28 @@ class Plan:
         """Whether the compiled loop can run it: every law is compiled."""
         return laws.is_compiled(self.controller.law) and laws.is_compiled(self.scenario.disturbance.law)
 
+    def compiled_laws(self) -> tuple[np.uint64, np.uint64]:
+        """Addresses of controller and disturbance for compiled callers."""
+        controller, disturbance = self.controller.law, self.scenario.disturbance.law
+        return np.uint64(laws.address(controller, laws.CONTROLLER)), np.uint64(laws.address(disturbance, laws.DISTURBANCE))
+
+    def python_laws(self) -> tuple[laws.Law, laws.Law]:
+        """Controller and disturbance for the Python path, which calls them agent by agent."""
+        controller, disturbance = self.controller.law, self.scenario.disturbance.law
+        return laws.for_team(controller, laws.CONTROLLER), laws.for_team(disturbance, laws.DISTURBANCE)
+
     def fixed_arguments(self) -> tuple[object, ...]:
         """The arguments of ``mission_step`` that are the same for all worlds, in its order."""
         orders = self.scenario.orders
+        controller, disturbance = self.compiled_laws()
         return (
             np.uint64(step_address()),
             np.uint64(self.model._address),
             self.indices,
             self.sizes,
-            np.uint64(laws.address(self.controller.law, laws.CONTROLLER)),
+            controller,
             self.controller_params,
-            np.uint64(laws.address(self.scenario.disturbance.law, laws.DISTURBANCE)),
+            disturbance,
             self.behavior_laws,
             self.behavior_params,
             orders.table,
@@ -111,22 +123,28 @@ def find_indices(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
 
 
 def _behavior_laws(scenario: Scenario) -> np.ndarray:
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if numba.config.DISABLE_JIT:
         return np.array([b.law for b in scenario.behaviors], dtype=object)
     return np.array([laws.address(b.law, laws.BEHAVIOR) for b in scenario.behaviors], dtype=np.uint64)
 
 
-def _padded(rows: list[list[object]]) -> np.ndarray:
+def _padded(rows: Sequence[Sequence[Sequence[float]]]) -> np.ndarray:
     """(M, N, P) float64 from ragged numbers, zeros at the end of the shorter ones."""
-    width = max(len(numbers) for row in rows for numbers in row)  # type: ignore[arg-type]
+    width = max(len(numbers) for row in rows for numbers in row)
     out = np.zeros((len(rows), len(rows[0]), width))
     for j, row in enumerate(rows):
         for i, numbers in enumerate(row):
-            out[j, i, : len(numbers)] = numbers  # type: ignore[arg-type,call-overload]
+            out[j, i, : len(numbers)] = numbers
     return out
 
 
 def _check_substep(scenario: Scenario, controller: Controller) -> None:
+    for rate in getattr(controller, "decay_rates", ()):
+        if scenario.substep * rate >= 2.0:
+            raise ConfigurationError(
+                f"substep {scenario.substep * 1e3:g} ms is beyond the stability limit {2e3 / rate:.1f} ms "
+                f"of a decay rate of {rate:g} /s"
+            )
     gains = controller.linear_gains
     if gains is None:
         return

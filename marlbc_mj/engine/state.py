@@ -60,6 +60,12 @@ class TeamState:
         self._judge(b)
         return draw.starts
 
+    def copy_row(self, source: "TeamState", source_world: int, world: int) -> None:
+        """Make row ``world`` equal to another state's row."""
+        for name, array in vars(self).items():
+            if isinstance(array, np.ndarray):
+                array[world] = getattr(source, name)[source_world]
+
     def time(self, b: int) -> float:
         """Mission time of world ``b`` [s]."""
         return float(self.steps[b] * self.plan.scenario.mission_step)

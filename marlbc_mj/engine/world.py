@@ -36,7 +36,8 @@ class Step(NamedTuple):
 class World:
     """B copies of one scenario under one controller.
 
-    Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled controller
+    Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled
+    controller
     the whole mission step runs inside one compiled call; a plain Python one takes the Python path, slower, with the same results.
 
     Args:
@@ -61,9 +62,9 @@ class World:
         record: bool = False,
         native: bool | None = None,
     ) -> None:
-        if worlds < 1:
-            raise ConfigurationError(f"worlds must be at least 1, got {worlds}")
-        most = numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        if not isinstance(worlds, int | np.integer) or worlds < 1:
+            raise ConfigurationError(f"worlds must be a whole number, at least 1, got {worlds}")
+        most = numba.config.NUMBA_NUM_THREADS
         if not 1 <= threads <= most:
             raise ConfigurationError(f"threads must be between 1 and {most} on this machine, got {threads}")
         self.plan = make_plan(scenario, controller or SORLC())
@@ -80,6 +81,7 @@ class World:
         self._status = np.zeros(worlds, dtype=np.int64)
         self._record = np.zeros((worlds, scenario.substeps if record else 0, scenario.agents, 10))
         self._fixed = self.plan.fixed_arguments() if self.native else ()
+        self._python_laws = self.plan.python_laws()
         self.reset()
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
@@ -87,12 +89,27 @@ class World:
 
         World b draws from its own stream, (seed, b), so what it does depends on neither B nor the other worlds.
         """
+        if seed < 0:
+            raise ConfigurationError(f"seed must not be negative, got {seed}")
+        if mask is not None and np.shape(mask) != (self.worlds,):
+            raise ConfigurationError(f"mask must have shape ({self.worlds},), got {np.shape(mask)}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
             rng = np.random.default_rng(np.random.SeedSequence([seed, int(b)]))
             starts = self.state.reset(int(b), rng)
             mujoco.mj_resetData(self.plan.model, self.data[b])
             self.data[b].qpos[self.plan.indices[0].ravel()] = starts.ravel()
         return self.observe()
+
+    def copy_world(self, source: "World", source_world: int, world: int) -> None:
+        """Put ``world`` in the state of another World's world: physics, references, controllers, clock. Same plan expected.
+
+        For starting many predictions from one state.
+        """
+        self.state.copy_row(source.state, source_world, world)
+        size = mujoco.mj_stateSize(self.plan.model, mujoco.mjtState.mjSTATE_INTEGRATION)
+        buffer = np.empty(size)
+        mujoco.mj_getState(self.plan.model, source.data[source_world], buffer, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_setState(self.plan.model, self.data[world], buffer, mujoco.mjtState.mjSTATE_INTEGRATION)
 
     def observe(self) -> Observation:
         """What a supervisor decides on, as copies."""
@@ -109,22 +126,24 @@ class World:
             SimulationError: a number left the physical range or is NaN; names world, agent and time.
         """
         orders = self._checked(orders)
-        if self.native:
-            rows = (self._addresses, *self.state.rows(orders), self._status, self._record)
-            if self.threads == 1 or self.worlds == 1:
-                failed = loop.step_serial(self.worlds, *self._fixed, *rows)
-            else:
-                numba.set_num_threads(self.threads)
-                failed = loop.step_parallel(self.worlds, *self._fixed, *rows)
-        else:
-            failed = sum(self._python_step(b, orders[b]) for b in range(self.worlds))
+        failed = self.advance(orders) if self.native else self._advance_in_python(orders)
         if failed:
             b = int(np.flatnonzero(self._status)[0])
             raise self.state.diverged(b, int(self._status[b]))
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
 
+    def advance(self, orders: np.ndarray) -> int:
+        """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64: no checks, no copies; how many worlds failed."""
+        rows = (self._addresses, *self.state.rows(orders), self._status, self._record)
+        if self.threads == 1 or self.worlds == 1:
+            return int(loop.step_serial(self.worlds, *self._fixed, *rows))
+        numba.set_num_threads(self.threads)
+        return int(loop.step_parallel(self.worlds, *self._fixed, *rows))
+
     def _checked(self, orders: np.ndarray) -> np.ndarray:
+        if getattr(orders, "dtype", np.dtype(np.int64)).kind not in "iu":
+            raise ConfigurationError(f"orders must be integers, got {orders.dtype}")
         orders = np.ascontiguousarray(orders, dtype=np.int64)
         shape, count = (self.worlds, self.scenario.agents), len(self.scenario.orders)
         if orders.shape != shape:
@@ -133,8 +152,13 @@ class World:
             raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
         return orders
 
+    def _advance_in_python(self, orders: np.ndarray) -> int:
+        return sum(self._python_step(b, orders[b]) for b in range(self.worlds))
+
     def _python_step(self, b: int, orders: np.ndarray) -> bool:
-        """The Python path: the same source as the compiled loop, with laws and ``mj_step`` called from Python; True if it failed."""
+        """The Python path: the same source as the compiled loop, with laws and ``mj_step`` called from Python; True if it
+        failed.
+        """
         plan, state = self.plan, self.state
         start = state.time(b)
         state.begin(b, orders)
@@ -144,9 +168,9 @@ class World:
             plan.model,
             *self._handles[b],
             plan.indices,
-            plan.controller.law,
+            self._python_laws[0],
             plan.controller_params,
-            self.scenario.disturbance.law,
+            self._python_laws[1],
             state.disturbance_params[b],
             start,
             self.scenario.substep,

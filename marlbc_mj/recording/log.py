@@ -4,14 +4,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.controllers import Controller
+from marlbc_mj.engine.loop import judge
+from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import Trajectory
 
 
 @dataclass(frozen=True)
 class EpisodeLog:
-    """M mission steps of N agents, self-contained: video and export need nothing but this."""
+    """M mission steps of N agents, self-contained: video and export need nothing but this.
+
+    As in :class:`marlbc_mj.episode.Frame`, motion, clearance and G are those at the start of a mission step, when orders were
+    given; force is that of its first substep, and the reward what the step led to.
+    """
 
     scenario: str
     supervisor: str
@@ -30,10 +35,10 @@ class EpisodeLog:
     reference_velocity: np.ndarray  # (M, N, 2) [m/s]
     force: np.ndarray  # (M, N, 2) [N]
     clearance: np.ndarray  # (M, N) [m]
-    formation: np.ndarray  # (M,) G
-    command: np.ndarray  # (M, N)
+    formation: np.ndarray  # (M,) G: 2 in formation, 1 in column, 0 neither
+    command: np.ndarray  # (M, N) index into commands
     reward: np.ndarray  # (M,)
-    decision_ms: np.ndarray  # (M,)
+    decision_ms: np.ndarray  # (M,) [ms]
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:
@@ -41,8 +46,7 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
     scenario = trajectory.scenario
     every = scenario.substeps
     position = trajectory.position[:-1:every]
-    from marlbc_mj.metrics import clearances
-
+    clearance, formation = _judge(trajectory, position)
     return EpisodeLog(
         scenario=scenario.name,
         supervisor=trajectory.supervisor,
@@ -54,15 +58,26 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         commands=scenario.orders.commands,
         obstacles=trajectory.obstacles,
         mjcf=make_plan(scenario, controller).xml,
-        time=trajectory.time[::every],
+        time=np.arange(len(position)) * scenario.mission_step,
         position=position,
         velocity=trajectory.velocity[:-1:every],
         reference=trajectory.reference[::every],
         reference_velocity=trajectory.reference_velocity[::every],
         force=trajectory.force[::every],
-        clearance=clearances(position, trajectory.obstacles),
-        formation=trajectory.formation,
+        clearance=clearance,
+        formation=formation,
         command=trajectory.command,
         reward=trajectory.reward,
         decision_ms=trajectory.decision_ms,
     )
+
+
+def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Clearances (M, N) [m] and G (M,) at positions (M, N, 2), by the loop's own function."""
+    scenario = trajectory.scenario
+    clearance = np.empty(position.shape[:2])
+    formation = np.empty(len(position), dtype=np.int64)
+    rule = (scenario.formations, scenario.formation_tolerance, scenario.safe_distance)
+    for k in range(len(position)):
+        formation[k], _ = judge(position[k], trajectory.obstacles, *rule, clearance[k])
+    return clearance, formation

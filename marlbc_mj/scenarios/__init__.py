@@ -5,9 +5,9 @@ from typing import Any
 
 from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
-from marlbc_mj.scenarios.paper import paper
+from marlbc_mj.scenarios.case_study import cruise, paper
 
-SCENARIOS: dict[str, Callable[..., Scenario]] = {"paper": paper}
+SCENARIOS: dict[str, Callable[..., Scenario]] = {"paper": paper, "cruise": cruise}
 """Factory by name."""
 
 
@@ -29,6 +29,7 @@ __all__ = [
     "Perturbation",
     "Scenario",
     "Window",
+    "cruise",
     "make_scenario",
     "paper",
     "standard_behaviors",

@@ -87,9 +87,12 @@ class Scenario:
     description: str = ""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
+        object.__setattr__(self, "schedule", tuple(Window(*w) for w in self.schedule))
         self._check_numbers()
         self._check_team()
         self._check_clocks()
+        self.check_windows(self.schedule)
 
     @property
     def agents(self) -> int:
@@ -123,13 +126,33 @@ class Scenario:
         return np.array(self.obstacles, dtype=np.float64).reshape(-1, 3)
 
     def draw(self, rng: np.random.Generator) -> Draw:
-        """One instance: starts, obstacles and drag scale drawn around this scenario's values."""
+        """One instance: starts, obstacles and drag scale drawn around this scenario's values.
+
+        A draw that puts an obstacle on a start is drawn again.
+
+        Raises:
+            ConfigurationError: a hundred draws in a row did.
+        """
         spread = self.perturbation
-        starts = np.array(self.starts, dtype=np.float64)
-        obstacles = self.obstacle_array()
-        starts += rng.uniform(-spread.start_spread, spread.start_spread, starts.shape)
-        obstacles[:, :2] += rng.uniform(-spread.obstacle_spread, spread.obstacle_spread, (len(obstacles), 2))
-        return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)))
+        for _ in range(100):
+            starts = np.array(self.starts, dtype=np.float64)
+            obstacles = self.obstacle_array()
+            starts += rng.uniform(-spread.start_spread, spread.start_spread, starts.shape)
+            obstacles[:, :2] += rng.uniform(-spread.obstacle_spread, spread.obstacle_spread, (len(obstacles), 2))
+            gaps = np.linalg.norm(starts[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
+            if (gaps > 0).all():
+                return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)))
+        raise ConfigurationError(f"scenario {self.name!r}: {spread} puts an obstacle on a start in every one of 100 draws")
+
+    def check_windows(self, windows: tuple[Window, ...]) -> None:
+        """Raise ConfigurationError for a window with an unknown agent or times that are not finite."""
+        for window in windows:
+            if not np.isfinite((window.start, window.end)).all():
+                raise ConfigurationError(f"window {tuple(window)}: times must be finite")
+            if not -1 <= window.agent < self.agents:
+                raise ConfigurationError(
+                    f"window {tuple(window)}: agent must be -1 (all) or 0 to {self.agents - 1}, got {window.agent}"
+                )
 
     def _check_numbers(self) -> None:
         positive = ("safe_distance", "formation_tolerance", "duration", "mission_step", "substep", "mass", "force_limit")
@@ -148,9 +171,12 @@ class Scenario:
         if self.agents < 2:
             raise ConfigurationError(f"scenario {self.name!r} has {self.agents} agent(s); a team needs at least 2")
         names = [b.name for b in self.behaviors]
+        if len(set(names)) != len(names):
+            raise ConfigurationError(f"scenario {self.name!r}: two behaviors share a name: {', '.join(names)}")
+        slotted = [b.name for b in self.behaviors if hasattr(b, "offsets")]
         for name in self.formation_names:
-            if name not in names:
-                raise unknown("formation behavior", name, names)
+            if name not in slotted:
+                raise unknown("formation behavior", name, slotted)
         for behavior in self.behaviors:
             offsets = getattr(behavior, "offsets", None)
             if offsets is not None:

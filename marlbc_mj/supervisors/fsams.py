@@ -25,10 +25,12 @@ class Automaton(NamedTuple):
 class FSAMS:
     """d <= d_OA: OA on top; d_OA < d <= 2 d_OA: FR; else FM.
 
-    As printed it chatters: each order moves the agent across the threshold that chose it. With ``hysteresis`` a threshold is crossed
-    inwards at -hysteresis and outwards at +hysteresis, and a state lasts at least ``dwell`` before a less urgent one may follow: the
-    fair baseline. A dwell that also delayed the more urgent states would drive agents into the discs (case study, SORLC:
-    return -829 instead of 6175), so that reading is an option only.
+    As printed it chatters: each order moves the agent across the threshold that chose it. With ``hysteresis`` a threshold
+    is crossed
+    inwards at -hysteresis and outwards at +hysteresis, and a state lasts at least ``dwell`` before a less urgent one may
+    follow: the
+    fair baseline. A dwell that also delays the more urgent states drives agents deep into the discs, so that reading is an
+    option only.
     """
 
     hysteresis: float = 0.0  # [m]

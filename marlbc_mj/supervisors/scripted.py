@@ -21,9 +21,7 @@ class Scripted:
         windows = scenario.schedule if self.windows is None else self.windows
         if not windows:
             raise ConfigurationError(f"scenario {scenario.name!r} has no schedule for the scripted supervisor")
-        for window in windows:
-            if not -1 <= window.agent < scenario.agents:
-                raise ConfigurationError(f"window {tuple(window)} names agent {window.agent} of {scenario.agents}")
+        scenario.check_windows(windows)
         default = np.full(scenario.agents, scenario.orders.index(self.default))
         return default, [(window, scenario.orders.index(window.order)) for window in windows]
 
@@ -34,6 +32,6 @@ class Scripted:
         default, windows = memory
         orders = default.copy()
         for window, order in windows:
-            if window.start < situation.time < window.end:
+            if window.start + 1e-9 < situation.time < window.end - 1e-9:  # 3 * 0.05 > 0.15, yet it is the bound
                 orders[window.agent if window.agent >= 0 else slice(None)] = order
         return orders, memory

@@ -25,11 +25,15 @@ SCHEDULE = (
 
 
 def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
-    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the printed OA (erratum 6)."""
+    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the printed OA (erratum 6).
+
+    OA keeps the ``safe_distance`` that violations are judged by.
+    """
+    distance = changes.get("safe_distance", 2.0)
     fields: dict[str, Any] = {
         "name": "paper",
         "starts": STARTS,
-        "behaviors": standard_behaviors(SLOTS, COLUMN, two_sided=two_sided),
+        "behaviors": standard_behaviors(SLOTS, COLUMN, two_sided=two_sided, safe_distance=distance),
         "path_origin": (-2.5, 0.0),
         "path_velocity": (1.0, 0.0),
         "obstacles": OBSTACLES,
@@ -37,3 +41,20 @@ def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
         "description": "four agents, two points and a gate on a 100 m path: the paper's case study",
     }
     return Scenario(**{**fields, **changes})
+
+
+def cruise(**changes: Any) -> Scenario:
+    """The case study's team, in formation from the start, on an oblique path with nothing in the way.
+
+    Crossing y sweeps the drag (43) through its periods while the forces stay small: the place to see whether an identifier
+    learns.
+    """
+    fields: dict[str, Any] = {
+        "name": "cruise",
+        "starts": tuple((x - 2.5, y) for x, y in SLOTS),
+        "path_velocity": (1.0, 0.5),
+        "obstacles": (),
+        "schedule": (Window(0.0, 0.0, -1, "FM"),),
+        "description": "the same team in formation on an oblique path, nothing in the way: identification of the drag",
+    }
+    return paper(**{**fields, **changes})

@@ -1,0 +1,76 @@
+# make test | benchmark | lint | wheel | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -eu -o pipefail -c
+.DEFAULT_GOAL := help
+.PHONY: help venv benchmark test lint wheel clean
+
+PYTHON ?=
+CANDIDATES := python3.12 python3.11 python3 python
+BIN := .venv/bin
+STAMP := .venv/installed
+
+# What the caller's shell may hold that would send an installation elsewhere or let foreign packages in.
+# Where packages come from (index, links, proxy, certificates, cache) stays the caller's business.
+unexport VIRTUAL_ENV CONDA_PREFIX PYTHONHOME PYTHONPATH PYTHONSTARTUP
+unexport PIP_TARGET PIP_PREFIX PIP_ROOT PIP_PYTHON PIP_CONSTRAINT PIP_BUILD_CONSTRAINT PIP_REQUIREMENT PIP_EDITABLE PIP_NO_DEPS
+unexport PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION PIP_IGNORE_REQUIRES_PYTHON PIP_REPORT PIP_DEPENDENCY_GROUP
+export PIP_USER := 0
+export PIP_PROGRESS_BAR := off
+export PIP_NO_INPUT := 1
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+help:
+	@echo 'make test        run the tests'
+	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
+	@echo 'make lint        ruff and mypy'
+	@echo 'make wheel       sdist and wheel, into dist'
+	@echo 'make clean       remove .venv, builds and caches; results in out and runs stay'
+
+benchmark: venv
+	@$(BIN)/marlbc bench paper --out out/paper --overwrite
+
+test: venv
+	@$(BIN)/python -m pytest
+
+lint: venv
+	@status=0; \
+	$(BIN)/ruff check --quiet --output-format concise . || status=1; \
+	$(BIN)/ruff format --quiet --check --output-format concise . || status=1; \
+	$(BIN)/python -m mypy || status=1; \
+	exit $$status
+
+wheel: venv
+	@rm -rf build dist
+	@$(BIN)/python -m build --no-isolation --outdir dist . >/dev/null
+	@ls dist/*
+
+clean:
+	@rm -rf .venv .cache build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@find marlbc_mj tasks training tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# A candidate counts only if it runs (version managers leave stubs that do not), has the right version and can make an environment.
+define FIND_PYTHON
+for candidate in $(if $(PYTHON),'$(PYTHON)',$(CANDIDATES)); do \
+	if "$$candidate" -c 'import sys, venv, ensurepip; sys.exit(not (3, 11) <= sys.version_info[:2] < (3, 13))' 2>/dev/null; \
+	then python=$$candidate; break; fi; \
+done
+endef
+
+# Installed again when the two files below change, made anew when the folder has moved or the Python is gone.
+# The lock is for two makes at once.
+venv:
+	@mkdir -p .cache; exec 9>.cache/venv.lock; if command -v flock >/dev/null; then flock 9; fi; \
+	wanted="$$(cat pyproject.toml constraints.txt | cksum) $$PWD"; \
+	found=$$(cat $(STAMP) 2>/dev/null || :); \
+	if ! $(BIN)/python -c '' 2>/dev/null; then found=; fi; \
+	if [ "$$found" = "$$wanted" ]; then exit 0; fi; \
+	case "$$found" in *" $$PWD") ;; *) \
+		python=; $(FIND_PYTHON); \
+		if [ -z "$$python" ]; then echo "make: none of $(or $(PYTHON),$(CANDIDATES)) runs as Python 3.11 or 3.12 with venv and ensurepip; \
+	install one (Debian: python3 and python3-venv) or name it: make PYTHON=..." >&2; exit 1; fi; \
+		rm -rf .venv; "$$python" -m venv .venv;; \
+	esac; \
+	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
+	rm -f $(STAMP); $(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'; \
+	echo "$$wanted" > $(STAMP)

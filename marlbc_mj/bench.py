@@ -1,0 +1,188 @@
+"""The benchmark: every supervisor with every controller on one scenario, and the folder of results it leaves."""
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from marlbc_mj.controllers import CONTROLLERS, Controller, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Frame, run_episode
+from marlbc_mj.errors import ConfigurationError, MarlbcError, SimulationError, unknown
+from marlbc_mj.files import check_folder, staged_folder, write_json
+from marlbc_mj.provenance import provenance
+from marlbc_mj.recording.reader import read_log
+from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.report.bundle import write_report
+from marlbc_mj.report.results import Result, method_key
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
+
+Progress = Callable[[str, float, float], None]
+"""Called with what is being done, how much of it is done and how much there is."""
+
+
+@dataclass(frozen=True)
+class BenchConfig:
+    """What one benchmark run does."""
+
+    supervisors: tuple[str, ...] = tuple(SUPERVISORS)
+    controllers: tuple[str, ...] = ("sorlc", "pd")
+    seed: int = 0
+    figures: bool = True
+    logs: bool = True
+    video: Literal["first", "all", "none"] = "first"
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        for kind, names, known in (
+            ("supervisor", self.supervisors, SUPERVISORS),
+            ("controller", self.controllers, CONTROLLERS),
+        ):
+            _check_names(kind, names, known)
+        if self.seed < 0:
+            raise ConfigurationError(f"seed must not be negative, got {self.seed}")
+        if self.video != "none" and not self.logs:
+            raise ConfigurationError("videos are rendered from logs; use --video none together with --no-logs")
+
+
+def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None:
+    if not names:
+        raise ConfigurationError(f"name at least one {kind}: {', '.join(known)}")
+    for name in names:
+        if name not in known:
+            raise unknown(kind, name, known)
+    if len(set(names)) != len(names):
+        raise ConfigurationError(f"a {kind} is named twice: {', '.join(names)}")
+
+
+def run_bench(
+    scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None
+) -> tuple[list[Result], list[str]]:
+    """Run the whole matrix and write ``out``; returns the results and what could not be written (a video without GL).
+
+    A method that fails is a reported outcome, not a missing row.
+
+    Raises:
+        ConfigurationError: a setting or the output folder; nothing is written then.
+    """
+    say = progress or (lambda what, done, total: None)
+    with staged_folder(out, overwrite=config.overwrite) as folder:
+        write_json(folder / "config.json", _config(scenario, config))
+        results = [
+            run_method(scenario, supervisor, controller, config.seed, folder if config.logs else None, say)
+            for supervisor in config.supervisors
+            for controller in config.controllers
+        ]
+        videos, problems = _render_videos(results, config, folder, say)
+        write_report(results, folder, config=_config(scenario, config), videos=videos, figures=config.figures, progress=say)
+    return results, problems
+
+
+def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
+    return {
+        **provenance(),
+        "command": " ".join(["marlbc", *sys.argv[1:]]),
+        "seed": config.seed,
+        "scenario": scenario,
+        "bench": config,
+    }
+
+
+def run_method(scenario: Scenario, supervisor: str, controller: str, seed: int, folder: Path | None, say: Progress) -> Result:
+    """One episode of one method, logged to ``folder/logs`` if there is a folder."""
+    key = method_key(supervisor, controller)
+    law = make_controller(controller)
+    chief = make_supervisor(supervisor)
+    chief.start(scenario)  # a supervisor that does not suit the scenario is a wrong setting, not a failed run
+    world = World(scenario, law, record=True)
+
+    def step_done(frame: Frame) -> None:
+        if round(frame.time / scenario.mission_step) % 50 == 0:
+            say(key, frame.time, scenario.duration)
+
+    try:
+        if folder is None:
+            trajectory = run_episode(world, chief, seed=seed, names=(supervisor, controller), on_frame=step_done)
+        else:
+            path = folder / "logs" / f"{key}.mcap"
+            with open_log(path, scenario, law, supervisor=supervisor, controller=controller, seed=seed) as log:
+
+                def record(frame: Frame) -> None:
+                    log.write(frame)
+                    step_done(frame)
+
+                trajectory = run_episode(world, chief, seed=seed, names=(supervisor, controller), on_frame=record)
+    except SimulationError as error:
+        return Result.failed(supervisor, controller, str(error))
+    say(key, scenario.duration, scenario.duration)
+    return Result.of(trajectory)
+
+
+def open_log(
+    path: Path, scenario: Scenario, law: Controller, *, supervisor: str, controller: str, seed: int, overwrite: bool = False
+) -> LogWriter:
+    """A log writer for one method, with everything that defines the run in its configuration."""
+    config = {"scenario": scenario, "controller": law, "supervisor": make_supervisor(supervisor), "seed": seed}
+    return LogWriter(
+        path,
+        scenario,
+        law,
+        supervisor=supervisor,
+        controller_name=controller,
+        seed=seed,
+        config=config,
+        overwrite=overwrite,
+    )
+
+
+def _render_videos(results: list[Result], config: BenchConfig, folder: Path, say: Progress) -> tuple[list[Path], list[str]]:
+    """Videos of the methods that ran; a machine without off-screen GL loses the videos and nothing else."""
+    if config.video == "none":
+        return [], []
+    from marlbc_mj.recording.video import render_video
+
+    ran = [r for r in results if r.trajectory is not None]
+    chosen = ran if config.video == "all" else ran[:1]
+    videos: list[Path] = []
+    try:
+        for result in chosen:
+            key = result.key
+            path = folder / "video" / f"{key}.mp4"
+            log = read_log(folder / "logs" / f"{key}.mcap")
+            render_video(log, path, progress=lambda done, total, key=key: say(f"video {key}", done, total))  # type: ignore[misc]
+            videos.append(path)
+    except MarlbcError as error:
+        return videos, [f"no video: {error}"]
+    return videos, []
+
+
+def run_single(
+    scenario: Scenario,
+    supervisor: str,
+    controller: str,
+    out: Path,
+    *,
+    seed: int = 0,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Result:
+    """One method, its log, metrics.json and config.json in ``out``.
+
+    The log grows in place as ``*.mcap.partial``, so that a killed run can be recovered.
+
+    Raises:
+        ConfigurationError: a setting or the output folder.
+        SimulationError: the run failed; its log stays as it was.
+    """
+    config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
+    check_folder(out, overwrite=overwrite)
+    make_supervisor(supervisor).start(scenario)
+    say = progress or (lambda what, done, total: None)
+    result = run_method(scenario, supervisor, controller, seed, out, say)
+    if result.metrics is None:
+        raise SimulationError(result.failure)
+    write_json(out / "config.json", _config(scenario, config))
+    write_json(out / "metrics.json", result.metrics)
+    return result

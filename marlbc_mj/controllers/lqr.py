@@ -1,0 +1,53 @@
+"""LQR: the regulator that minimises the paper's own cost for a double integrator; the floor of control cost, soft tracking."""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.controllers.base import model_weight, require_gains
+
+
+@laws.controller
+def state_feedback(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
+    """u = clip(-w f - k_p e_p - k_v e_v, +-limit); ``params`` = w, k_p, k_v, limit; no state."""
+    for axis in range(2):
+        wish = -params[0] * drag[axis] - params[1] * (p[axis] - p_r[axis]) - params[2] * (v[axis] - v_r[axis])
+        force_out[axis] = laws.clip(wish, params[3])
+
+
+def riccati_gains(state_weight: float, control_weight: float) -> tuple[float, float]:
+    """(k_p, k_v) that minimise the integral of alpha |e|^2 + beta |u|^2 for e_p' = e_v, e_v' = u.
+
+    The algebraic Riccati equation has the closed solution k_p = sqrt(alpha/beta), k_v = sqrt(alpha/beta + 2 k_p); (1, sqrt
+    3) for the
+    paper's weights.
+    """
+    k_p = float(np.sqrt(state_weight / control_weight))
+    return k_p, float(np.sqrt(state_weight / control_weight + 2.0 * k_p))
+
+
+@dataclass(frozen=True)
+class LQR:
+    """Riccati gains for the cost (24) with alpha_V and beta_V."""
+
+    state_weight: float = 1.0  # alpha_V
+    control_weight: float = 1.0  # beta_V
+    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    limited: bool = False
+    law = staticmethod(state_feedback)
+
+    def __post_init__(self) -> None:
+        require_gains(self, ("state_weight", "control_weight"))
+        model_weight(self.model)
+
+    @property
+    def linear_gains(self) -> tuple[float, float]:
+        return riccati_gains(self.state_weight, self.control_weight)
+
+    def params(self, agent: int, limit: float) -> tuple[float, ...]:
+        return (model_weight(self.model), *self.linear_gains, limit)
+
+    def initial_state(self, agent: int) -> np.ndarray:
+        return np.zeros(0)

@@ -1,0 +1,43 @@
+"""RLC, the single-agent reinforcement learning controller that SORLC is compared with (Zhang et al. 2022), reconstructed.
+
+u = -xi_p e_p - f^ - omega_a^T Psi_V / 2 - c e_v: SORLC's law without compensator and limit, and with next to no damping.
+The cited law has no velocity error at all, which leaves the loop undamped; c = 2.35 is what reproduces the printed 3.4 s
+that its velocity error takes to converge. No convergence theorem is claimed.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from marlbc_mj.controllers.base import require_gains
+from marlbc_mj.controllers.sorlc import SORLC, sorlc
+
+
+@dataclass(frozen=True)
+class RLC:
+    """Identifier, actor and critic as in SORLC with the printed basis."""
+
+    position_gain: float = 100.0  # xi_p [1/s^2]
+    damping: float = 2.35  # c [1/s]
+    networks: SORLC = field(default_factory=SORLC)
+    limited: bool = False
+    law = staticmethod(sorlc)
+
+    def __post_init__(self) -> None:
+        require_gains(self, ("position_gain",))
+        require_gains(self, ("damping",), allow_zero=True)
+
+    @property
+    def linear_gains(self) -> tuple[float, float]:
+        return self.position_gain, self.damping
+
+    @property
+    def decay_rates(self) -> tuple[float, ...]:
+        """Of the networks [1/s]."""
+        return self.networks.decay_rates
+
+    def params(self, agent: int, limit: float) -> tuple[float, ...]:
+        return (self.position_gain, self.damping, *self.networks.params(agent, limit)[2:])
+
+    def initial_state(self, agent: int) -> np.ndarray:
+        return self.networks.initial_state(agent)

@@ -1,0 +1,86 @@
+"""Output folders and files that appear whole or not at all."""
+
+import json
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.provenance import plain_data
+
+
+@contextmanager
+def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A folder to write into that becomes ``out`` when the block ends well, and vanishes when it does not.
+
+    Raises:
+        ConfigurationError: ``out`` is not empty (and ``overwrite`` is off), is a file, or cannot be written.
+    """
+    check_folder(out, overwrite=overwrite)
+    staging = out.with_name(f"{out.name}.partial-{os.getpid()}")
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        staging.mkdir()
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {out}: {error.strerror}") from error
+    try:
+        yield staging
+    except BaseException:
+        shutil.rmtree(staging, ignore_errors=True)
+        raise
+    _replace(out, staging)
+
+
+def check_folder(out: Path, *, overwrite: bool) -> None:
+    """Raise ConfigurationError where ``out`` holds something that may not be overwritten."""
+    if out.is_file():
+        raise ConfigurationError(f"output folder {out} is a file")
+    if out.is_dir() and any(out.iterdir()) and not overwrite:
+        raise ConfigurationError(f"output folder {out} is not empty; choose another or add --overwrite")
+
+
+def _replace(out: Path, staging: Path) -> None:
+    """Put ``staging`` in the place of ``out``; the old content goes only once the new one is there."""
+    old = out.with_name(f"{out.name}.old-{os.getpid()}")
+    if out.exists():
+        out.rename(old)
+    staging.rename(out)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """A temporary path beside ``path``, with its suffix, that becomes ``path`` when the block ends well.
+
+    Raises:
+        ConfigurationError: ``path`` exists (and ``overwrite`` is off) or its folder cannot be written.
+    """
+    check_target(path, overwrite=overwrite)
+    staging = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        staging.touch()
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+    try:
+        yield staging
+        staging.replace(path)
+    finally:
+        staging.unlink(missing_ok=True)
+
+
+def check_target(path: Path, *, overwrite: bool) -> None:
+    """Raise ConfigurationError where ``path`` is taken and must not be replaced."""
+    if path.is_dir():
+        raise ConfigurationError(f"cannot write {path}: it is a folder")
+    if path.exists() and not overwrite:
+        raise ConfigurationError(f"{path} exists; choose another name, or overwrite it")
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Indented JSON, finite numbers only, through a temporary file."""
+    with staged_file(path, overwrite=True) as staging:
+        staging.write_text(json.dumps(plain_data(value), indent=2, allow_nan=False) + "\n")

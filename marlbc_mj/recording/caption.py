@@ -1,0 +1,198 @@
+"""The frame around a picture: who is driving and when above it, every agent's priorities and a legend below it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from marlbc_mj.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, command_color, ink_on
+from marlbc_mj.recording.log import EpisodeLog
+
+FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
+HEADER, FOOTER = 48, 80  # heights of the bars
+SHARP = 3  # bars are drawn this many times larger and reduced, which smooths their edges
+PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
+GHOST_COLOR = "#A9B2BE"
+MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "reconstruction"}
+
+
+@lru_cache(maxsize=64)
+def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans as matplotlib brings it along."""
+    name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
+    return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), max(size, 4))
+
+
+@dataclass(frozen=True)
+class Caption:
+    """Draws the frames of one video; the bars are kept until what they say changes.
+
+    Args:
+        width, height: of the whole frame, bars included.
+    """
+
+    log: EpisodeLog
+    width: int
+    height: int
+    speed: float | None = None  # None: a still
+    _bars: dict[object, Image.Image] = field(default_factory=dict)
+
+    @property
+    def scale(self) -> float:
+        """Size of this frame's bars, 1 in a picture of 1280 x 720."""
+        return min(self.width / FULL[0], self.height / FULL[1])
+
+    @property
+    def header(self) -> int:
+        """Height of the upper bar."""
+        return round(HEADER * self.scale)
+
+    @property
+    def picture_height(self) -> int:
+        """What the bars leave."""
+        return self.height - self.header - round(FOOTER * self.scale)
+
+    def frame(self, picture: np.ndarray, time: float, step: int, labels: np.ndarray, radii: np.ndarray) -> Image.Image:
+        """The whole frame.
+
+        Args:
+            picture: (picture_height, width, 3) uint8.
+            time, step: mission time [s] and the mission step it lies in.
+            labels: (N, 2) where the agents' numbers go, column and row in the picture.
+            radii: (N,) how large agents are there [pixels].
+        """
+        frame = Image.new("RGB", (self.width, self.height), PAPER)
+        image = Image.fromarray(np.ascontiguousarray(picture))
+        _number(image, labels, radii)
+        commands = tuple(self.log.commands[k] for k in self.log.command[step])
+        frame.paste(image, (0, self.header))
+        frame.paste(self._kept("header"), (0, 0))
+        frame.paste(self._kept((commands, int(self.log.formation[step]))), (0, self.header + self.picture_height))
+        self._clock(frame, time)
+        return frame
+
+    def _clock(self, frame: Image.Image, time: float) -> None:
+        place = (self.width - 24 * self.scale, 0.5 * self.header)
+        ImageDraw.Draw(frame).text(place, f"t = {time:5.1f} s", INK, _font(round(20 * self.scale), True), "rm")
+
+    def _kept(self, key: object) -> Image.Image:
+        if key not in self._bars:
+            height = self.header if key == "header" else self.height - self.header - self.picture_height
+            pen = Pen(self.width, height, SHARP * self.scale)
+            if isinstance(key, tuple):
+                _draw_footer(pen, self.log, *key)
+            else:
+                _draw_header(pen, self.log, self.speed)
+            self._bars[key] = pen.image.resize((self.width, height), Image.Resampling.BOX)
+        return self._bars[key]
+
+
+def _number(image: Image.Image, labels: np.ndarray, radii: np.ndarray) -> None:
+    """Write every agent's number on it."""
+    pen = ImageDraw.Draw(image)
+    for agent, (column, row) in enumerate(labels):
+        size = round(min(1.25 * radii[agent], 0.05 * image.height))
+        if size >= 6 and 0 <= column < image.width and 0 <= row < image.height:
+            ink = ink_on(AGENT_COLORS[agent % len(AGENT_COLORS)])
+            pen.text((column, row), str(agent + 1), ink, _font(size, True), "mm")
+
+
+class Pen:
+    """Writes from left to right on a bar; all lengths are pixels of a picture of 1280 x 720."""
+
+    def __init__(self, width: int, height: int, scale: float) -> None:
+        self.scale = scale
+        self.image = Image.new("RGB", (width * SHARP, height * SHARP), PAPER)
+        self.draw = ImageDraw.Draw(self.image)
+        self.x = 24.0
+        self.width = width * SHARP / scale
+
+    def font(self, size: float, bold: bool = False) -> ImageFont.FreeTypeFont:
+        """The font whose size is ``size`` on the finished bar."""
+        return _font(round(size * self.scale), bold)
+
+    def length(self, text: str, size: float, bold: bool = False) -> float:
+        """How wide a text will be."""
+        return float(self.font(size, bold).getlength(text)) / self.scale
+
+    def text(self, text: str, y: float, size: float, color: str, *, bold: bool = False, gap: float = 0.0) -> None:
+        """Write a text, its middle at height ``y``, and move on."""
+        self.draw.text((self.x * self.scale, y * self.scale), text, color, self.font(size, bold), "lm")
+        self.x += self.length(text, size, bold) + gap
+
+    def pill(self, text: str, y: float, size: float, color: str, *, width: float = 0.0, gap: float = 0.0) -> None:
+        """Write a text on a rounded colored ground at least ``width`` wide, and move on."""
+        width = max(width, self.length(text, size, True) + 1.4 * size)
+        half = 0.82 * size
+        box = [v * self.scale for v in (self.x, y - half, self.x + width, y + half)]
+        self.draw.rounded_rectangle(box, half * self.scale, color)
+        middle = ((self.x + 0.5 * width) * self.scale, y * self.scale)
+        self.draw.text(middle, text, ink_on(color), self.font(size, True), "mm")
+        self.x += width + gap
+
+    def dot(self, y: float, radius: float, color: str, *, gap: float = 0.0) -> None:
+        """Draw a filled circle, and move on."""
+        box = [v * self.scale for v in (self.x, y - radius, self.x + 2 * radius, y + radius)]
+        self.draw.ellipse(box, color)
+        self.x += 2 * radius + gap
+
+    def rule(self, y: float) -> None:
+        """Draw a hairline across the bar."""
+        self.draw.line([0, y * self.scale, self.image.width, y * self.scale], RULE, round(self.scale))
+
+    def dashes(self, y: float, color: str, *, gap: float = 0.0) -> None:
+        """Draw a short dashed line, and move on."""
+        for k in range(3):
+            start = self.x + 10 * k
+            self.draw.line([v * self.scale for v in (start, y, start + 6, y)], color, round(2 * self.scale))
+        self.x += 26 + gap
+
+
+def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
+    y = 0.5 * HEADER
+    pen.text(log.scenario, y, 20, INK, bold=True, gap=20)
+    for role, name in (("supervisor", log.supervisor), ("controller", log.controller), ("seed", str(log.seed))):
+        pen.text(role, y, 15, MUTED, gap=6)
+        pen.text(name, y, 15, INK, bold=True, gap=20)
+    if speed is not None:
+        pen.x = pen.width - 24 - pen.length("t = 000.0 s", 20, True) - 84
+        pen.pill(f"{speed:g}\N{MULTIPLICATION SIGN}", y, 14, MUTED, width=52)
+    pen.rule(HEADER - 1)
+
+
+def _draw_footer(pen: Pen, log: EpisodeLog, commands: Sequence[str], formation: int) -> None:
+    pen.rule(0.5)
+    state = f"formation G = {formation}"
+    room = pen.width - 48 - pen.length(state, 15, True)
+    widest = max(pen.length(_spelled(name), 14, True) for name in log.commands) + 22
+    gap = 26 if len(commands) <= 6 else 8
+    for agent, command in enumerate(commands):
+        rest = len(commands) - agent
+        if pen.x + widest + (40 if rest == 1 else 90) > room:
+            pen.text(f"+{rest}", 28, 15, MUTED, bold=True)
+            break
+        pen.pill(str(agent + 1), 28, 15, AGENT_COLORS[agent % len(AGENT_COLORS)], width=25, gap=6)
+        pen.pill(_spelled(command), 28, 14, command_color(command), width=widest, gap=gap)
+    pen.x = pen.width - 24 - pen.length(state, 15, True)
+    pen.text(state, 28, 15, INK, bold=True)
+    _draw_legend(pen, list(dict.fromkeys(b for name in log.commands for b in name.split(">"))))
+
+
+def _draw_legend(pen: Pen, behaviors: Sequence[str]) -> None:
+    pen.x = 24.0
+    for behavior in behaviors:
+        pen.dot(60, 6, command_color(behavior), gap=8)
+        pen.text(behavior, 60, 13, INK, bold=True, gap=6)
+        pen.text(MEANINGS.get(behavior, ""), 60, 13, MUTED, gap=24)
+    pen.dashes(60, SAFE_DISTANCE_COLOR, gap=8)
+    pen.text("safe distance", 60, 13, MUTED, gap=24)
+    pen.dot(60, 4, GHOST_COLOR, gap=8)
+    pen.text("reference", 60, 13, MUTED)
+
+
+def _spelled(command: str) -> str:
+    return command.replace(">", " > ")

@@ -1,0 +1,290 @@
+"""Reading MCAP logs: whole ones back into arrays, torn ones into whole ones, and both into other formats."""
+
+import csv
+import io
+import json
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import zstandard
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+from mcap.reader import McapReader, make_reader
+from mcap.records import Attachment, Channel, Chunk, DataEnd, Header, McapRecord, Message, Metadata, Schema, Statistics
+from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.summary import Summary
+from mcap.writer import MCAP0_MAGIC, Writer
+
+from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.files import staged_file
+from marlbc_mj.recording import schemas
+from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.writer import METADATA, MODEL
+
+_END = struct.Struct("<BQQQI8s")
+"""How an MCAP ends: footer record (opcode, length, start of the summary, of its offsets, checksum of the summary), magic."""
+_DATA_END_SIZE = 1 + 8 + 4  # the record before the summary: opcode, length, checksum of everything before it [bytes]
+_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, MemoryError)
+"""What the mcap package raises on bytes that are not what they should be."""
+
+
+def read_log(path: str | Path) -> EpisodeLog:
+    """An episode from its log, every number bit for bit as it was recorded.
+
+    Raises:
+        ConfigurationError: no such file, no MCAP, a torn or damaged one, or one that is not a log of this package.
+    """
+    with _open_log(path) as reader:
+        metadata = _marlbc_metadata(path, reader)
+        model = next((a.data.decode() for a in reader.iter_attachments() if a.name == MODEL), None)
+        if model is None:
+            raise ConfigurationError(f"{path} has no attachment {MODEL}; it was not written by marlbc")
+        columns = _columns(_messages(path, reader))
+        return EpisodeLog(
+            scenario=metadata["scenario"],
+            supervisor=metadata["supervisor"],
+            controller=metadata["controller"],
+            seed=int(metadata["seed"]),
+            mission_step=float(metadata["mission_step"]),
+            safe_distance=float(metadata["safe_distance"]),
+            force_limit=float(metadata["force_limit"]),
+            commands=tuple(json.loads(metadata["commands"])),
+            obstacles=np.array(json.loads(metadata["obstacles"]), dtype=np.float64).reshape(-1, 3),
+            mjcf=model,
+            **columns,
+        )
+
+
+def log_info(path: str | Path) -> dict[str, Any]:
+    """What is in an MCAP, for people: JSON values only.
+
+    Keys: ``file, bytes, library, start_s, duration_s, messages, chunks``, ``topics`` (by name: ``messages, schema,
+    schema_encoding, message_encoding``), ``metadata`` (by record name) and ``attachments`` (``name, media_type, bytes``).
+
+    Raises:
+        ConfigurationError: no such file, no MCAP, or a torn or damaged one.
+    """
+    with _open_log(path) as reader:
+        summary = reader.get_summary()
+        if summary is None or summary.statistics is None:
+            raise ConfigurationError(f"{path} has no summary; `marlbc log recover {path} OUT` writes one")
+        count = summary.statistics
+        return {
+            "file": str(path),
+            "bytes": Path(path).stat().st_size,
+            "library": reader.get_header().library,
+            "start_s": count.message_start_time / 1e9,
+            "duration_s": (count.message_end_time - count.message_start_time) / 1e9,
+            "messages": count.message_count,
+            "chunks": count.chunk_count,
+            "topics": _topics(summary, count),
+            "metadata": {record.name: record.metadata for record in reader.iter_metadata()},
+            "attachments": [
+                {"name": a.name, "media_type": a.media_type, "bytes": a.data_size} for a in summary.attachment_indexes
+            ],
+        }
+
+
+def _topics(summary: Summary, count: Statistics) -> dict[str, dict[str, Any]]:
+    topics = {}
+    for channel in sorted(summary.channels.values(), key=lambda c: c.topic):
+        schema = summary.schemas.get(channel.schema_id)
+        topics[channel.topic] = {
+            "messages": count.channel_message_counts.get(channel.id, 0),
+            "schema": schema.name if schema else "",
+            "schema_encoding": schema.encoding if schema else "",
+            "message_encoding": channel.message_encoding,
+        }
+    return topics
+
+
+def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> int:
+    """Copy everything whole out of a torn or damaged MCAP into a new one, which any reader opens.
+
+    Metadata and attachments stand at the start of a log and survive with its first chunk. A chunk that fails its checksum is
+    left out.
+
+    Returns:
+        How many messages were saved: 0 if the file was torn before its first chunk ended.
+
+    Raises:
+        ConfigurationError: no such file, no MCAP, or an output that cannot or must not be written.
+    """
+    with _open_file(torn) as source, staged_file(Path(out), overwrite=overwrite) as staging, open(staging, "wb") as target:
+        writer = Writer(target, enable_data_crcs=True)
+        records = _whole_records(source, Path(torn).stat().st_size)
+        first = next(records, None)
+        header = first if isinstance(first, Header) else Header("", "")
+        writer.start(header.profile, header.library)
+        saved = _copy(records, writer)
+        writer.finish()
+    return saved
+
+
+def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> None:
+    """Write a log as a table (``.csv``: one row a mission step and agent) or as arrays (``.npz``: the fields of EpisodeLog).
+
+    Raises:
+        ConfigurationError: an unknown suffix, a log that cannot be read, or an output that cannot or must not be written.
+    """
+    writers = {".csv": _write_csv, ".npz": _write_npz}
+    suffix = Path(out).suffix
+    if suffix not in writers:
+        raise unknown("export format", suffix or str(out), writers)
+    log = read_log(path)
+    with staged_file(Path(out), overwrite=overwrite) as staging, open(staging, "wb") as stream:
+        writers[suffix](log, stream)
+
+
+@contextmanager
+def _open_file(path: str | Path) -> Iterator[BinaryIO]:
+    """A file that is an MCAP, whole or torn."""
+    try:
+        with open(path, "rb") as stream:
+            if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
+                raise ConfigurationError(f"{path} is not an MCAP file")
+            stream.seek(0)
+            yield stream
+    except OSError as error:
+        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+
+
+@contextmanager
+def _open_log(path: str | Path) -> Iterator[McapReader]:
+    """A reader of a whole MCAP; parse errors inside the block become one line."""
+    with _open_file(path) as stream:
+        try:
+            _check_whole(path, stream)
+            yield make_reader(stream, validate_crcs=True)
+        except ConfigurationError:
+            raise
+        except _DAMAGE as error:
+            text = f"{path} is damaged ({error}); `marlbc log recover {path} OUT` salvages what is whole"
+            raise ConfigurationError(text) from error
+
+
+def _check_whole(path: str | Path, stream: BinaryIO) -> None:
+    """Raise unless the file ends as an MCAP does and its checksums hold; the mcap package checks those of chunks only."""
+    data = stream.read()
+    stream.seek(0)
+    opcode, length, summary_start, _, summary_crc, magic = _END.unpack(data[-_END.size :].rjust(_END.size, b"\0"))
+    if (opcode, length, magic) != (Opcode.FOOTER, 20, MCAP0_MAGIC):
+        raise ConfigurationError(f"{path} is truncated; `marlbc log recover {path} OUT` salvages it")
+    if summary_crc and zlib.crc32(data[summary_start : -len(MCAP0_MAGIC) - 4]) != summary_crc:
+        raise ValueError("wrong checksum of its summary")
+    if summary_start:
+        data_crc = int.from_bytes(data[summary_start - 4 : summary_start], "little")
+        if data_crc and zlib.crc32(data[: summary_start - _DATA_END_SIZE]) != data_crc:
+            raise ValueError("wrong checksum of its data")
+
+
+def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
+    for record in reader.iter_metadata():
+        if record.name == METADATA:
+            return record.metadata
+    raise ConfigurationError(f"{path} has no metadata {METADATA!r}; it was not written by marlbc")
+
+
+def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
+    """Decoded messages of every required topic, the same number of each."""
+    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in schemas.REQUIRED}
+    for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
+        found[channel.topic].append(json.loads(message.data))
+    counts = {name: len(messages) for name, messages in found.items()}
+    if not all(counts.values()):
+        missing = ", ".join(name for name, count in counts.items() if not count)
+        raise ConfigurationError(f"{path} has no messages on {missing}: no mission step was recorded")
+    if len(set(counts.values())) > 1:
+        raise ConfigurationError(f"{path} has mission steps that are not whole: {counts}")
+    return found
+
+
+def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
+    """The arrays of EpisodeLog from decoded messages."""
+
+    def agents(topic: str, *names: str) -> np.ndarray:
+        # Infinite numbers are left out of the JSON, and only a clearance can be.
+        return np.array([[[row.get(n, np.inf) for n in names] for row in m["agents"]] for m in found[topic]])
+
+    def scalar(topic: str, name: str) -> np.ndarray:
+        return np.array([m[name] for m in found[topic]])
+
+    return {
+        "time": scalar("/state", "time"),
+        "position": agents("/state", "x", "y"),
+        "velocity": agents("/state", "vx", "vy"),
+        "reference": agents("/reference", "x", "y"),
+        "reference_velocity": agents("/reference", "vx", "vy"),
+        "force": agents("/force", "x", "y"),
+        "clearance": agents("/metrics", "clearance")[..., 0],
+        "formation": scalar("/metrics", "formation"),
+        "command": agents("/priorities", "index")[..., 0],
+        "reward": scalar("/metrics", "reward"),
+        "decision_ms": scalar("/metrics", "decision_ms"),
+    }
+
+
+def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
+    """Records of the data section up to the first that is not whole, chunks opened."""
+    records = iter(StreamReader(source, emit_chunks=True, record_size_limit=size).records)
+    while True:
+        try:
+            record = next(records, None)
+        except _DAMAGE:
+            return
+        if record is None or isinstance(record, DataEnd):
+            return
+        if isinstance(record, Chunk):
+            with suppress(*_DAMAGE):  # a damaged chunk between whole ones costs only itself
+                yield from breakup_chunk(record, validate_crc=True)
+        else:
+            yield record
+
+
+def _copy(records: Iterator[McapRecord], writer: Writer) -> int:
+    """Write records under new schema and channel numbers. Returns the number of messages."""
+    schema_ids: dict[int, int] = {0: 0}
+    channel_ids: dict[int, int] = {}
+    saved = 0
+    for record in records:
+        if isinstance(record, Message) and record.channel_id in channel_ids:
+            channel = channel_ids[record.channel_id]
+            writer.add_message(channel, record.log_time, record.data, record.publish_time, record.sequence)
+            saved += 1
+        elif isinstance(record, Schema) and record.id not in schema_ids:
+            schema_ids[record.id] = writer.register_schema(record.name, record.encoding, record.data)
+        elif isinstance(record, Channel) and record.id not in channel_ids and record.schema_id in schema_ids:
+            channel_ids[record.id] = writer.register_channel(
+                record.topic, record.message_encoding, schema_ids[record.schema_id], record.metadata
+            )
+        elif isinstance(record, Metadata):
+            writer.add_metadata(record.name, record.metadata)
+        elif isinstance(record, Attachment):
+            writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
+    return saved
+
+
+def _write_csv(log: EpisodeLog, stream: BinaryIO) -> None:
+    text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
+    table = csv.writer(text, lineterminator="\n")
+    pairs = ("position", "velocity", "reference", "reference_velocity", "force")
+    plane = [f"{name}_{axis}" for name in pairs for axis in ("x", "y")]
+    table.writerow(["time", "agent", *plane, "clearance", "command", "formation", "reward", "decision_ms"])
+    motion = np.concatenate([getattr(log, name) for name in pairs], axis=-1).tolist()
+    scalars = zip(log.formation.tolist(), log.reward.tolist(), log.decision_ms.tolist(), strict=True)
+    for k, (time, shared) in enumerate(zip(log.time.tolist(), scalars, strict=True)):
+        for i, numbers in enumerate(motion[k]):
+            command = log.commands[log.command[k, i]]
+            table.writerow([time, i + 1, *numbers, float(log.clearance[k, i]), command, *shared])
+    text.detach()
+
+
+def _write_npz(log: EpisodeLog, stream: BinaryIO) -> None:
+    arrays: dict[str, Any] = {field.name: np.asarray(getattr(log, field.name)) for field in fields(log)}
+    np.savez_compressed(stream, **arrays)

@@ -1,0 +1,134 @@
+"""What a log looks like at one time: the posed model, and the marks that belong in the picture but not in the model.
+
+Marks are flat shapes on the ground, added to a scene when it is drawn, so physics never pays for them.
+"""
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from marlbc_mj.engine.assembly import agent_prefix
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
+from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, disc, make_trail, ribbon
+
+BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m
+HALO = 1.6  # radius of the disc under an agent, in drawn radii
+RIM = 0.14  # width of the white rim around it, in drawn radii
+GHOST = 0.45  # radius of a reference's ghost, in drawn radii
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A log's model and marks. Build with :func:`make_stage`."""
+
+    log: EpisodeLog
+    model: mujoco.MjModel
+    data: mujoco.MjData
+    joints: np.ndarray  # (N, 2) addresses of the agents' axes in qpos
+    radii: np.ndarray  # (N,) drawn radii of the agents [m]
+    rings: list[Mark]
+    trails: list[Trail]
+
+    def step(self, time: float) -> int:
+        """Index of the mission step that ``time`` [s] lies in, the nearest one outside the log."""
+        return int(np.clip(np.searchsorted(self.log.time, time + 1e-9, side="right") - 1, 0, len(self.log.time) - 1))
+
+    def sample(self, values: np.ndarray, time: float) -> np.ndarray:
+        """``values`` (M, ...) at ``time`` [s], linear between mission steps and constant outside them."""
+        k = self.step(time)
+        after = min(k + 1, len(values) - 1)
+        weight = np.clip((time - self.log.time[k]) / self.log.mission_step, 0.0, 1.0)
+        return np.asarray((1.0 - weight) * values[k] + weight * values[after])
+
+    def commands(self, time: float) -> list[str]:
+        """Every agent's command at ``time`` [s], "OA>FM" for example."""
+        return [self.log.commands[k] for k in self.log.command[self.step(time)]]
+
+    def pose(self, time: float) -> None:
+        """Move the model's agents to where they are at ``time`` [s]."""
+        self.data.qpos[self.joints] = self.sample(self.log.position, time)
+        mujoco.mj_forward(self.model, self.data)
+
+    def draw(self, scene: mujoco.MjvScene, time: float) -> None:
+        """Add rings, trails, halos and references at ``time`` [s] to a scene, after its model is in it.
+
+        Raises:
+            ConfigurationError: the scene has no room for them.
+        """
+        marks = [*self.rings, *self._trails(time), *self._agents(time)]
+        if scene.ngeom + len(marks) > scene.maxgeom:
+            raise ConfigurationError(f"a scene of {scene.maxgeom} shapes cannot hold {len(marks)} marks")
+        for mark in marks:
+            add(scene, mark)
+
+    def middles(self) -> np.ndarray:
+        """(N, 3) middle of every agent as drawn [m]."""
+        return np.column_stack([self.data.qpos[self.joints], self.radii])
+
+    def _trails(self, time: float) -> list[Mark]:
+        here = self.sample(self.log.position, time)
+        return [mark for i, trail in enumerate(self.trails) for mark in trail.until(time, here[i])]
+
+    def _agents(self, time: float) -> list[Mark]:
+        """Halos in the color of the command, and the references as ghosts."""
+        position, reference = (self.sample(v, time) for v in (self.log.position, self.log.reference))
+        marks = []
+        for i, command in enumerate(self.commands(time)):
+            radius = float(self.radii[i])
+            marks.append(disc(position[i], HALO * radius, 0.06, rgba("#FFFFFF")))
+            marks.append(disc(position[i], (HALO - RIM) * radius, 0.09, rgba(command_color(command))))
+            if np.hypot(*(reference[i] - position[i])) > radius:
+                marks.append(ribbon(position[i], reference[i], 0.1, 0.12, agent_color(i)))
+            marks.append(ball(reference[i], GHOST * radius, (*agent_color(i)[:3], 0.45)))
+        return marks
+
+
+def make_stage(log: EpisodeLog) -> Stage:
+    """The stage of a log, its obstacles where this episode had them.
+
+    Raises:
+        ConfigurationError: the log is empty, or its model does not fit it.
+    """
+    if len(log.time) == 0:
+        raise ConfigurationError("the log holds no mission step, so there is nothing to show")
+    agents = range(log.position.shape[1])
+    try:
+        model = mujoco.MjModel.from_xml_string(log.mjcf)
+        joints = [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
+        for k, (x, y, _) in enumerate(log.obstacles):
+            model.geom(f"obstacle{k + 1}").pos[:2] = x, y
+    except (KeyError, ValueError) as error:
+        raise ConfigurationError(f"the log's model cannot be shown: {str(error).strip()}") from error
+    return Stage(
+        log=log,
+        model=model,
+        data=mujoco.MjData(model),
+        joints=np.array(joints),
+        radii=np.array([_enlarge(model, agent_prefix(i)) for i in agents]),
+        rings=[mark for obstacle in log.obstacles for mark in _zone(obstacle, log.safe_distance)],
+        trails=[make_trail(i, log.time, log.position[:, i]) for i in agents],
+    )
+
+
+def _zone(obstacle: np.ndarray, safe_distance: float) -> list[Mark]:
+    """Where the clearance to an obstacle (3,) is below the safe distance [m]: a tinted disc in a dashed circle."""
+    center, radius = obstacle[:2], float(obstacle[2]) + safe_distance
+    return [disc(center, radius, 0.01, rgba(SAFE_DISTANCE_COLOR, 0.1)), *dashed_circle(center, radius, rgba(SAFE_DISTANCE_COLOR))]
+
+
+def _enlarge(model: mujoco.MjModel, prefix: str) -> float:
+    """Draw an agent's spheres no smaller than ``BALL``, resting on the ground; returns the largest drawn radius [m]."""
+    largest = BALL
+    for geom in range(model.ngeom):
+        if not model.body(model.geom_bodyid[geom]).name.startswith(prefix):
+            continue
+        size = model.geom_size[geom]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE and size[0] < BALL:
+            model.geom_pos[geom, 2] += BALL - size[0]
+            model.geom_sameframe[geom] = 0  # or MuJoCo would skip the new position
+            size[:] = BALL
+        largest = max(largest, float(size[0]))
+    return largest

@@ -1,0 +1,147 @@
+"""Videos and stills of an episode, drawn from its log after the run."""
+
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from itertools import chain
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+
+from marlbc_mj.errors import ConfigurationError, SimulationError
+from marlbc_mj.files import staged_file
+from marlbc_mj.recording.camera import make_camera, project
+from marlbc_mj.recording.caption import Caption
+from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.offscreen import Offscreen
+from marlbc_mj.recording.stage import make_stage
+
+LEAST, MOST = 64, 4096  # pixels, either side
+COLORS = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
+ENCODING = ["-vf", COLORS, "-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
+"""Colors as players expect them of a high-definition picture, constant quality, and an index at the file's beginning."""
+
+
+def render_video(
+    log: EpisodeLog,
+    path: str | Path,
+    *,
+    speed: float = 4.0,
+    fps: int = 30,
+    width: int = 1280,
+    height: int = 720,
+    camera: str = "track",
+    start: float | None = None,
+    end: float | None = None,
+    overwrite: bool = False,
+    samples: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write an H.264 MP4 of an episode; the file appears under its name when it is complete.
+
+    Args:
+        speed: seconds of the mission per second of video.
+        camera: ``track``, ``top`` or a camera of the model.
+        start, end: part of the mission [s]; all of it by default.
+        samples: per pixel; 4 smooths edges and takes about twice as long.
+        progress: called after every frame with how many are done and how many there are.
+
+    Returns:
+        The number of frames.
+
+    Raises:
+        ConfigurationError: an argument that cannot be used, an existing file without ``overwrite``, or no OpenGL.
+        SimulationError: the encoder failed.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".mp4":
+        raise ConfigurationError(f"a video's name must end in .mp4, got {path.name!r}")
+    times = frame_times(log, speed=speed, fps=fps, start=start, end=end)
+    pictures = _frames(log, times, width=width, height=height, camera=camera, samples=samples, speed=speed)
+    with staged_file(path, overwrite=overwrite) as partial, closing(pictures):
+        try:
+            _encode(pictures, partial, (width, height), fps, len(times), progress)
+        except OSError as error:
+            raise SimulationError(f"cannot write video {path}: {str(error).splitlines()[0]}") from error
+    return len(times)
+
+
+def render_still(
+    log: EpisodeLog, time: float, *, width: int = 1280, height: int = 720, camera: str = "track", samples: int = 4
+) -> np.ndarray:
+    """(height, width, 3) uint8: the frame that a video shows at ``time`` [s].
+
+    Raises:
+        ConfigurationError: an argument that cannot be used, or no OpenGL.
+    """
+    frames = _frames(log, np.array([time]), width=width, height=height, camera=camera, samples=samples, speed=None)
+    with closing(frames):
+        return next(frames)
+
+
+def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None, end: float | None) -> np.ndarray:
+    """(F,) mission time of every frame [s].
+
+    Raises:
+        ConfigurationError: a speed or rate that is not positive, or an empty part of the mission.
+    """
+    for name, value in (("speed", speed), ("fps", fps)):
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigurationError(f"{name} must be positive, got {value}")
+    if len(log.time) == 0:
+        raise ConfigurationError("the log holds no mission step, so there is nothing to show")
+    first, last = float(log.time[0]), float(log.time[-1]) + log.mission_step
+    begin, until = max(first, first if start is None else start), min(last, last if end is None else end)
+    if not begin < until:
+        raise ConfigurationError(f"start {start} and end {end} leave nothing of the log's {first:g} to {last:g} s")
+    count = max(1, int(np.ceil((until - begin) * fps / speed - 1e-6)))
+    return begin + np.arange(count) * speed / fps
+
+
+def _frames(
+    log: EpisodeLog, times: np.ndarray, *, width: int, height: int, camera: str, samples: int, speed: float | None
+) -> Generator[np.ndarray, None, None]:
+    """(height, width, 3) uint8 for every time [s]."""
+    _check_size(width, height)
+    stage = make_stage(log)
+    caption = Caption(log, width, height, speed)
+    size = width, caption.picture_height
+    view = make_camera(camera, stage, size[0] / size[1])
+    with Offscreen(stage, view, *size, samples=samples) as offscreen:
+        for time in times:
+            picture = offscreen.render(float(time))
+            labels, radii = project(offscreen.scene, stage.middles(), stage.radii, *size)
+            yield np.asarray(caption.frame(picture, float(time), stage.step(float(time)), labels, radii))
+
+
+def _encode(
+    pictures: Iterator[np.ndarray],
+    path: Path,
+    size: tuple[int, int],
+    fps: int,
+    count: int,
+    progress: Callable[[int, int], None] | None,
+) -> None:
+    first = next(pictures)  # before the encoder starts: what cannot be drawn fails here
+    writer = imageio_ffmpeg.write_frames(
+        str(path),
+        size,
+        fps=fps,
+        codec="libx264",
+        quality=None,  # ENCODING says it
+        macro_block_size=2,
+        ffmpeg_log_level="error",
+        output_params=ENCODING.copy(),
+    )
+    with closing(writer):
+        writer.send(None)
+        for done, picture in enumerate(chain([first], pictures), 1):
+            writer.send(np.ascontiguousarray(picture))
+            if progress is not None:
+                progress(done, count)
+
+
+def _check_size(width: int, height: int) -> None:
+    for name, value in (("width", width), ("height", height)):
+        if not LEAST <= value <= MOST or value % 2:
+            raise ConfigurationError(f"{name} must be an even number of pixels from {LEAST} to {MOST}, got {value}")

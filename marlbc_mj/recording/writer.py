@@ -1,0 +1,261 @@
+"""Writing an episode to an MCAP log while it runs, so that a killed run leaves a log that can be recovered.
+
+Metadata and attachments come first, and every chunk holds whole mission steps, so a file torn anywhere is a shorter episode.
+"""
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from functools import cache
+from pathlib import Path
+from time import monotonic
+from types import TracebackType
+from typing import Any, BinaryIO, Self
+
+import numpy as np
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from mcap.writer import Writer
+from mcap_protobuf.schema import register_schema
+
+from marlbc_mj import __version__
+from marlbc_mj.controllers import Controller, sorlc
+from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.episode import Frame
+from marlbc_mj.errors import ConfigurationError, SimulationError
+from marlbc_mj.files import check_target
+from marlbc_mj.provenance import config_hash, git_revision, plain_data, versions
+from marlbc_mj.recording import schemas
+from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
+from marlbc_mj.scenarios import Scenario
+
+METADATA = "marlbc"
+"""Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
+VERSIONS = "versions"
+MODEL, CONFIG, LAYOUT = "model.xml", "config.json", "foxglove-layout.json"
+
+_versions = cache(versions)  # reading them from the packages takes as long as a tenth of an episode
+
+FLUSH_PERIOD = 0.5  # wall time after which a chunk is closed and handed to the operating system [s]
+CHUNK_SIZE = 1024 * 1024  # [bytes]
+
+
+class LogWriter:
+    """Writes one episode: ``run_episode(..., on_frame=log.write)`` inside ``with LogWriter(...) as log``.
+
+    While it runs the file is ``PATH.partial``, and what has been written is handed to the operating system every half
+    second: a killed process loses less than a second. A clean end renames it to ``PATH``. After an exception inside the ``with``
+    block the episode is not whole, so the name stays ``PATH.partial``; the file is ended properly, and readable, if the disk
+    allows it.
+
+    Args:
+        path: a name that ends in ``.mcap``; missing folders are made.
+        scenario, controller: what runs.
+        supervisor, controller_name: their names.
+        seed: which draw of the scenario.
+        config: all settings; attached as JSON, and hashed.
+        overwrite: replace a log, finished or partial, of the same name.
+
+    Raises:
+        ConfigurationError: a path that cannot or must not be written, or a scenario that cannot be assembled.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        scenario: Scenario,
+        controller: Controller,
+        *,
+        supervisor: str,
+        controller_name: str,
+        seed: int,
+        config: dict[str, Any],
+        overwrite: bool = False,
+    ) -> None:
+        self.path = Path(path)
+        self._overwrite = overwrite
+        obstacles = _drawn_obstacles(scenario, seed)
+        metadata = {
+            "supervisor": supervisor,
+            "controller": controller_name,
+            "seed": str(seed),
+            "config_sha256": config_hash(config),
+            "revision": git_revision(),
+            **_describe(scenario, controller, obstacles),
+        }
+        attachments = _attachments(scenario, controller, config)
+        self._scene = Scene(scenario, obstacles)
+        self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
+        self._weighted = controller.initial_state(0).shape == (sorlc.STATE_SIZE,)
+        self._steps = 0
+        self._pending = 0  # since the last flush [bytes]
+        self._flushed = monotonic()  # when [s]
+        self._stream = _create(self.path, overwrite)
+        try:
+            self._start(metadata, attachments)
+        except OSError as error:
+            with suppress(OSError):
+                self._stream.close()
+            raise ConfigurationError(f"cannot write {self.path}: {error.strerror}") from error
+
+    @property
+    def partial(self) -> Path:
+        """Name of the file while it is written."""
+        return partial_name(self.path)
+
+    def write(self, frame: Frame) -> None:
+        """Append one mission step.
+
+        Raises:
+            SimulationError: the disk does not take it.
+        """
+        stamp = round(frame.time * 1e9)
+        try:
+            for topic, data in self._messages(frame, stamp):
+                self._mcap.add_message(self._channels[topic], stamp, data, stamp, self._steps)
+                self._pending += len(data)
+            self._steps += 1
+            now = monotonic()
+            if self._pending >= CHUNK_SIZE or now - self._flushed >= FLUSH_PERIOD:
+                self._mcap.flush()
+                self._pending, self._flushed = 0, now
+        except OSError as error:
+            raise SimulationError(f"cannot write {self.partial}: {error.strerror}") from error
+
+    def close(self) -> None:
+        """End the file and give it its final name; nothing if that has been done.
+
+        Raises:
+            ConfigurationError: meanwhile another file has taken the name.
+            SimulationError: the disk does not take it.
+        """
+        if self._stream.closed:
+            return
+        try:
+            self._end()
+            if not self._overwrite:
+                check_target(self.path, overwrite=False)
+            os.replace(self.partial, self.path)
+        except OSError as error:
+            raise SimulationError(f"cannot write {self.path}: {error.strerror}") from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        if kind is None:
+            self.close()
+        elif not self._stream.closed:
+            with suppress(OSError):  # the exception under way says more than a full disk would
+                self._end()
+
+    def _start(self, metadata: dict[str, str], attachments: list[tuple[str, str, bytes]]) -> None:
+        """Header, metadata and attachments, on disk before the first mission step."""
+        # Chunks are zstd by default. When one is closed is decided here: between two messages of a mission step it would tear
+        # that step apart.
+        self._mcap = Writer(self._stream, chunk_size=sys.maxsize, enable_data_crcs=True)
+        self._mcap.start(library=f"marlbc_mj {__version__}")
+        self._mcap.add_metadata(METADATA, metadata)
+        self._mcap.add_metadata(VERSIONS, _versions())
+        for name, media_type, data in attachments:
+            self._mcap.add_attachment(0, 0, name, media_type, data)
+        self._channels = self._register()
+        self._mcap.flush()
+
+    def _register(self) -> dict[str, int]:
+        """Channel numbers by topic."""
+        channels = {}
+        for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
+            channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
+        for topic in schemas.TOPICS:
+            if topic is not schemas.WEIGHTS or self._weighted:
+                text = json.dumps(schemas.json_schema(topic)).encode()
+                schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
+                channels[topic.name] = self._mcap.register_channel(topic.name, schemas.MESSAGE_ENCODING, schema)
+        return channels
+
+    def _messages(self, frame: Frame, stamp: int) -> Iterator[tuple[str, bytes]]:
+        """All messages of one mission step."""
+        scene, transforms = self._scene.encode(stamp, frame.position, frame.reference)
+        yield SCENE_TOPIC, scene
+        yield TRANSFORMS_TOPIC, transforms
+        motion = np.concatenate([frame.position, frame.velocity], axis=1)
+        yield "/state", schemas.encode(schemas.STATE, motion, time=float(frame.time))
+        reference = np.concatenate([frame.reference, frame.reference_velocity], axis=1)
+        yield "/reference", schemas.encode(schemas.REFERENCE, reference)
+        yield "/force", schemas.encode(schemas.FORCE, frame.force)
+        yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
+        if self._weighted:
+            yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
+        verdicts = {"formation": int(frame.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}
+        yield "/metrics", schemas.encode(schemas.METRICS, frame.clearance[:, None], **verdicts)
+
+    def _end(self) -> None:
+        try:
+            self._mcap.finish()
+        finally:
+            self._stream.close()
+
+
+def partial_name(path: Path) -> Path:
+    """Name of a log while it is written."""
+    return path.with_name(path.name + ".partial")
+
+
+def _create(path: Path, overwrite: bool) -> BinaryIO:
+    """Open the partial file of a log that may be written."""
+    if path.suffix != ".mcap":
+        raise ConfigurationError(f"a log's name must end in .mcap, got {path}")
+    partial = partial_name(path)
+    try:
+        check_target(path, overwrite=overwrite)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        return open(partial, "wb" if overwrite else "xb")
+    except FileExistsError as error:
+        if not partial.exists():  # a file where a folder should be
+            raise ConfigurationError(f"cannot write {path}: {error.filename} is not a folder") from error
+        raise ConfigurationError(
+            f"{partial} exists: a run in progress, or a torn log that `marlbc log recover {partial} OUT` salvages; "
+            "choose another name, or overwrite it"
+        ) from error
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _describe(scenario: Scenario, controller: Controller, obstacles: np.ndarray) -> dict[str, str]:
+    """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
+    return {
+        "scenario": scenario.name,
+        "mission_step": repr(float(scenario.mission_step)),
+        "safe_distance": repr(float(scenario.safe_distance)),
+        "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",
+        "commands": json.dumps(scenario.orders.commands),
+        "obstacles": json.dumps(obstacles.tolist()),
+    }
+
+
+def _attachments(scenario: Scenario, controller: Controller, config: dict[str, Any]) -> list[tuple[str, str, bytes]]:
+    """Name, media type and content."""
+    canonical = json.dumps(plain_data(config), sort_keys=True, separators=(",", ":"))  # what config_hash hashes
+    return [
+        (CONFIG, "application/json", canonical.encode()),
+        (MODEL, "application/xml", make_plan(scenario, controller).xml.encode()),
+        (LAYOUT, "application/json", json.dumps(foxglove_layout(scenario)).encode()),
+    ]
+
+
+def _drawn_obstacles(scenario: Scenario, seed: int) -> np.ndarray:
+    """(K, 3) obstacles of the episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
+    return scenario.draw(np.random.default_rng(np.random.SeedSequence([seed, 0]))).obstacles
+
+
+def _weight_table(state: np.ndarray) -> np.ndarray:
+    """(N, 5) norms of w_f, w_a and w_c, and tau, from controller states (N, S)."""
+    weights = sorlc.weights(state)
+    table = np.empty((len(state), 5))
+    for k, matrix in enumerate(weights[:3]):
+        table[:, k] = np.sqrt(np.einsum("nkj,nkj->n", matrix, matrix))
+    table[:, 3:] = weights.tau
+    return table

@@ -1,0 +1,143 @@
+"""What all figures share: style, sizes, and decimation that keeps every peak."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from marlbc_mj.orders import SEPARATOR
+from marlbc_mj.palette import AGENT_COLORS, command_color
+
+SINGLE = 3.5  # width of a column [in]
+DOUBLE = 7.16  # width of two columns and the gap between them [in]
+GREY = "#6E6E6E"
+LINE_STYLES = ("-", (0, (5, 1.2)), (0, (3, 1, 1, 1)), (0, (1.2, 1)))
+BINS = 500  # per curve: more than a printed column resolves
+
+_STYLE: Any = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 8,
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "legend.fontsize": 7,
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "axes.linewidth": 0.5,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.labelpad": 2,
+    "axes.titlepad": 3,
+    "xtick.major.width": 0.5,
+    "ytick.major.width": 0.5,
+    "xtick.major.size": 2.5,
+    "ytick.major.size": 2.5,
+    "xtick.minor.size": 0,
+    "ytick.minor.size": 0,
+    "lines.linewidth": 0.8,
+    "lines.solid_capstyle": "butt",
+    "pdf.fonttype": 42,
+    "ps.fonttype": 42,
+    "savefig.dpi": 300,
+}
+
+
+def style() -> AbstractContextManager[None]:
+    """Matplotlib's settings for the time of drawing or saving a figure; fonts are embedded as TrueType."""
+    return matplotlib.rc_context(_STYLE)
+
+
+class Margins(NamedTuple):
+    """Room around and between panels [in]; fixed, so that one kind of figure has its axes in one place for every method."""
+
+    left: float = 0.5
+    right: float = 0.14
+    bottom: float = 0.36
+    top: float = 0.3
+    across: float = 0.2
+    between: float = 0.27
+
+
+def panels(
+    width: float, height: float, rows: int, columns: int, margins: Margins, *, sharex: bool = False, sharey: bool = False
+) -> tuple[Figure, np.ndarray]:
+    """A figure of exactly this size [in] and its (rows, columns) panels."""
+    figure = Figure(figsize=(width, height))
+    m = margins
+    each_width = (width - m.left - m.right - (columns - 1) * m.across) / columns
+    each_height = (height - m.bottom - m.top - (rows - 1) * m.between) / rows
+    grid = {
+        "left": m.left / width,
+        "right": 1 - m.right / width,
+        "bottom": m.bottom / height,
+        "top": 1 - m.top / height,
+        "wspace": m.across / each_width,
+        "hspace": m.between / each_height,
+    }
+    return figure, np.asarray(figure.subplots(rows, columns, squeeze=False, sharex=sharex, sharey=sharey, gridspec_kw=grid))
+
+
+def legend_above(figure: Figure, handles: Sequence[Artist], **options: Any) -> None:
+    """One row of legend at the figure's top edge."""
+    options = {"ncols": len(handles), "columnspacing": 1.3, "borderaxespad": 0.25, "borderpad": 0.2, **options}
+    figure.legend(handles=list(handles), loc="upper center", **options)
+
+
+def agent_line(agent: int) -> dict[str, Any]:
+    """Color, line style and label of an agent's curve."""
+    return {
+        "color": AGENT_COLORS[agent % len(AGENT_COLORS)],
+        "linestyle": LINE_STYLES[agent % len(LINE_STYLES)],
+        "label": f"agent {agent + 1}",
+    }
+
+
+def envelope(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate a curve to at most ``2 bins + 2`` of its samples: both ends, and each bin's smallest and largest in their order.
+
+    Args:
+        time: (T,) abscissa.
+        values: (T,) ordinate.
+    """
+    size = -(-len(values) // bins)
+    if size <= 2:
+        return time, values
+    starts = np.arange(0, len(values), size)
+    padded = np.pad(values, (0, len(starts) * size - len(values)), mode="edge").reshape(len(starts), size)
+    picked = np.concatenate([starts + padded.argmin(axis=1), starts + padded.argmax(axis=1), [0, len(values) - 1]])
+    keep = np.unique(np.minimum(picked, len(values) - 1))
+    return time[keep], values[keep]
+
+
+def bin_maxima(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
+    """Decimate (T,) to the largest value of each bin, at the bin's start."""
+    size = -(-len(values) // bins)
+    starts = np.arange(0, len(values), size)
+    return time[starts], np.maximum.reduceat(values, starts)
+
+
+def runs(values: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """(start, end, value) of every stretch of equal values in (M,); ``end`` is exclusive."""
+    if len(values):
+        starts = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1])
+        for start, end in zip(starts, [*starts[1:], len(values)], strict=True):
+            yield int(start), int(end), int(values[start])
+
+
+def command_handles(commands: tuple[str, ...], width: float = 2.0) -> list[Line2D]:
+    """Legend entries, one per behavior that commands can begin with."""
+    heads = list(dict.fromkeys(command.split(SEPARATOR)[0] for command in commands))
+    return [Line2D([], [], color=command_color(head), linewidth=width, label=head) for head in heads]
+
+
+def panel_label(axes: Axes, text: str) -> None:
+    """A title flush with the panel's left edge."""
+    axes.set_title(text, loc="left")

@@ -1,0 +1,31 @@
+"""Shared by all tests: hypothesis settings, and the expensive episodes, each run once per session."""
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import pytest
+from hypothesis import settings
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Trajectory, run_episode
+from marlbc_mj.scenarios import paper
+from marlbc_mj.supervisors import make_supervisor
+
+settings.register_profile("marlbc", deadline=None, max_examples=60, derandomize=True)
+settings.load_profile("marlbc")
+
+Episode = Callable[..., Trajectory]
+
+
+@pytest.fixture(scope="session")
+def episode() -> Episode:
+    """``episode(supervisor, controller, native=None, **scenario changes)``: a whole case-study episode, kept for the session."""
+
+    @cache
+    def run(supervisor: str, controller: str, native: bool | None = None, **changes: Any) -> Trajectory:
+        world = World(paper(**changes), make_controller(controller), record=True, native=native)
+        return run_episode(world, make_supervisor(supervisor), names=(supervisor, controller))
+
+    return run

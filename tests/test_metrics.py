@@ -1,0 +1,197 @@
+"""Metrics of trajectories made by hand, whose answers are closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Trajectory, run_episode
+from marlbc_mj.metrics import clearances, measure
+from marlbc_mj.scenarios import Obstacle, Scenario, paper, standard_behaviors
+from marlbc_mj.supervisors import make_supervisor
+
+STEPS, SUBSTEPS, H = 20, 10, 0.005  # one second
+T = STEPS * SUBSTEPS
+
+
+def pair(**changes) -> Scenario:
+    """Two agents side by side, a point obstacle ahead of the first."""
+    fields = {
+        "starts": ((0.0, 1.0), (0.0, -1.0)),
+        "behaviors": standard_behaviors(((0.0, 1.0), (0.0, -1.0)), ((1.0, 0.0), (-1.0, 0.0))),
+        "obstacles": (Obstacle(4.0, 4.0),),
+        "duration": 1.0,
+        "schedule": (),
+    }
+    return paper(**{**fields, **changes})
+
+
+def straight(scenario: Scenario, speed: float = 8.0) -> Trajectory:
+    """Both agents move along x at ``speed`` on their references, without force, in formation, without a switch."""
+    x = np.arange(T + 1) * H * speed
+    position = np.array(scenario.starts) + x[:, None, None] * np.array([1.0, 0.0])
+    velocity = np.tile([speed, 0.0], (T + 1, 2, 1))
+    return Trajectory(
+        scenario=scenario,
+        supervisor="none",
+        controller="none",
+        seed=0,
+        obstacles=scenario.obstacle_array(),
+        time=np.arange(T) * H,
+        position=position,
+        velocity=velocity,
+        reference=position[:-1].copy(),
+        reference_velocity=velocity[:-1].copy(),
+        force=np.zeros((T, 2, 2)),
+        command=np.full((STEPS, 2), 2),
+        formation=np.full(STEPS, 2),
+        reward=np.full(STEPS, 10.0),
+        controller_state=np.zeros((STEPS, 2, 0)),
+        decision_ms=np.arange(1.0, STEPS + 1.0),
+    )
+
+
+def test_a_perfect_run_costs_nothing():
+    """No errors, no force, no switches; the return is the sum of the rewards."""
+    metrics = measure(straight(pair()))
+    for agent in metrics["agents"]:
+        zero = {k: v for k, v in agent.items() if k not in ("clearance_min", "violation_time")}
+        assert set(zero.values()) == {0}
+    assert metrics["team"]["return"] == 200.0
+    assert metrics["team"]["formation_error"] == pytest.approx(0.0, abs=1e-12)
+    assert metrics["team"]["agent_distance_min"] == pytest.approx(2.0)
+
+
+def test_clearance_and_violation_are_taken_after_every_substep():
+    """A point is passed at 3 m and 5 m; d <= 3.4 m while |x - 4| <= 1.6, which at 0.04 m a substep is 81 substeps."""
+    metrics = measure(straight(pair(safe_distance=3.4001)))
+    first, second = metrics["agents"]
+    assert (first["clearance_min"], second["clearance_min"]) == (pytest.approx(3.0), pytest.approx(5.0))
+    assert first["violation_time"] == pytest.approx(81 * H)
+    assert second["violation_time"] == 0.0
+
+
+def test_the_start_is_not_a_clearance_but_the_end_is():
+    """Clearance is taken after each substep: T values, the last state included, the first not."""
+    scenario = pair(obstacles=(Obstacle(9.0, 1.0),), safe_distance=1.0)
+    assert measure(straight(scenario))["agents"][0]["clearance_min"] == pytest.approx(1.0)
+    assert measure(straight(scenario))["agents"][0]["violation_time"] in (0.0, pytest.approx(H))
+    behind = pair(obstacles=(Obstacle(-1.0, 1.0),))
+    assert measure(straight(behind))["agents"][0]["clearance_min"] == pytest.approx(1.0 + 8.0 * H)
+
+
+def test_distance_is_to_surfaces_and_infinite_without_obstacles():
+    """Errata 7; no obstacle, no violation."""
+    positions = np.array([[[0.0, 0.0], [60.0, 9.0]]])
+    np.testing.assert_allclose(clearances(positions, np.array([[60.0, 9.0, 5.0], [3.0, 4.0, 1.0]])), [[4.0, -5.0]])
+    assert np.isinf(clearances(positions, np.zeros((0, 3)))).all()
+    assert measure(straight(pair(obstacles=())))["agents"][0]["violation_time"] == 0.0
+
+
+def test_force_metrics_of_a_constant_force():
+    """u = (3, -4): |u|_inf 4, |u|_2 5, effort 5 N s over a second, a sum of 5 / 0.05 over samples, and |u|^2 as the cost."""
+    trajectory = straight(pair())
+    trajectory.force[:, 0] = (3.0, -4.0)
+    agent, other = measure(trajectory)["agents"]
+    assert (agent["force_max_inf"], agent["force_max_2"]) == (4.0, 5.0)
+    assert agent["effort_integral"] == pytest.approx(5.0) and agent["effort_sum"] == pytest.approx(100.0)
+    assert agent["cost_max"] == 25.0
+    assert agent["cost_integral"] == pytest.approx(25.0) and agent["cost_sum"] == pytest.approx(500.0)
+    assert agent["saturation_duty"] == 0.0 and other["effort_integral"] == 0.0
+
+
+def test_saturation_duty_counts_substeps_with_an_axis_at_the_limit():
+    """A quarter of the time one axis, a quarter the other, once both: 0.5."""
+    trajectory = straight(pair())
+    trajectory.force[:50, 1, 0] = 200.0
+    trajectory.force[50:100, 1, 1] = -200.0
+    trajectory.force[10, 1] = (200.0, -200.0)
+    trajectory.force[100:, 1] = 199.99
+    agents = measure(trajectory)["agents"]
+    assert [a["saturation_duty"] for a in agents] == [0.0, 0.5]
+
+
+def test_tracking_errors_and_their_cost():
+    """e_p = (0.3, 0.4), e_v = (t, 0): RMS 0.5 and sqrt(mean t^2), cost 0.25 + t^2, with the errors at each substep's start."""
+    trajectory = straight(pair())
+    t = trajectory.time
+    trajectory.reference[:, 0] -= (0.3, 0.4)
+    trajectory.reference_velocity[:, 0, 0] -= t
+    agent = measure(trajectory)["agents"][0]
+    assert agent["rms_position_error"] == pytest.approx(0.5)
+    assert agent["rms_velocity_error"] == pytest.approx(np.sqrt((T - 1) * (2 * T - 1) / 6.0) * H)
+    assert agent["cost_max"] == pytest.approx(0.25 + t[-1] ** 2)
+    assert agent["cost_integral"] == pytest.approx(0.25 + H**3 * (T - 1) * T * (2 * T - 1) / 6.0)
+
+
+def test_switches_count_changes_of_the_command():
+    """FM OA FM FM FR: three; the first step changes nothing."""
+    trajectory = straight(pair())
+    trajectory.command[3, 0], trajectory.command[10:, 0] = 0, 3
+    assert [a["switches"] for a in measure(trajectory)["agents"]] == [3, 0]
+
+
+def test_formation_error_is_relative_to_the_centroid():
+    """A common displacement is no error; agent 1 off by d puts both off by d / 2."""
+    trajectory = straight(pair())
+    shifted = replace(trajectory, position=trajectory.position + np.array([5.0, -2.0]))
+    assert measure(shifted)["team"]["formation_error"] == pytest.approx(0.0, abs=1e-12)
+    trajectory.position[:, 0, 0] += 0.6
+    assert measure(trajectory)["team"]["formation_error"] == pytest.approx(0.3)
+
+
+def test_closest_pair_of_three():
+    """The smallest of all distances at all times; agents 1 and 3 meet halfway."""
+    slots = ((0.0, 0.0), (0.0, 10.0), (6.0, 0.0))
+    scenario = pair(starts=slots, behaviors=standard_behaviors(slots, slots))
+    base = straight(pair())
+    position = np.repeat(np.array(slots)[None], T + 1, axis=0)
+    position[:, 0, 0] = np.linspace(0.0, 5.5, T + 1)
+    three = np.zeros((T, 3, 2))
+    trajectory = replace(
+        base,
+        scenario=scenario,
+        position=position,
+        velocity=np.zeros((T + 1, 3, 2)),
+        reference=position[:-1],
+        reference_velocity=three,
+        force=three,
+        command=np.zeros((STEPS, 3), dtype=int),
+    )
+    assert measure(trajectory)["team"]["agent_distance_min"] == pytest.approx(0.5)
+
+
+def test_decision_times_are_quantiles_over_mission_steps():
+    """1, 2, ..., 20 ms: median 10.5, 99 % at 19.81."""
+    team = measure(straight(pair()))["team"]
+    assert team["decision_ms_median"] == 10.5 and team["decision_ms_p99"] == pytest.approx(19.81)
+
+
+def test_metrics_agree_with_the_worlds_own_verdict(episode):
+    """Violations, return and switches of a chattering episode, counted from the recorded arrays and from the rewards."""
+    trajectory = episode("fsams", "sorlc")
+    metrics = measure(trajectory)
+    ends = trajectory.position[10::10]
+    violated = (clearances(ends, trajectory.obstacles) <= 2.0).any(axis=1)
+    r1 = np.where(violated, -10.0, 5.0 * trajectory.formation)
+    switched = (np.diff(trajectory.command, axis=0) != 0).any(axis=1)
+    r2 = np.concatenate([[0.0], -3.0 * switched])
+    np.testing.assert_array_equal(trajectory.reward, r1 + r2)
+    assert metrics["team"]["return"] == (r1 + r2).sum()
+
+
+def test_frames_show_the_state_in_which_orders_were_given():
+    """Every mission step gives one frame: its start's state, and the command and reward that followed."""
+    frames = []
+    scenario = paper(duration=1.0)
+    trajectory = run_episode(World(scenario, record=True), make_supervisor("scripted"), on_frame=frames.append)
+    assert len(frames) == 20
+    for k, frame in enumerate(frames):
+        assert frame.time == pytest.approx(0.05 * k)
+        for name in ("position", "velocity", "reference", "reference_velocity", "force"):
+            assert (getattr(frame, name) == getattr(trajectory, name)[10 * k]).all()
+        np.testing.assert_allclose(frame.clearance, clearances(frame.position, trajectory.obstacles), atol=1e-12)
+        assert (frame.command == trajectory.command[k]).all() and frame.reward == trajectory.reward[k]
+        assert (frame.controller_state == trajectory.controller_state[k]).all() and frame.decision_ms >= 0.0
+        assert k == 0 or frame.formation == trajectory.formation[k - 1]

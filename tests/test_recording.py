@@ -1,0 +1,427 @@
+"""Recording: what is written is what is read back, and a log torn anywhere is a shorter log."""
+
+import csv
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap.writer import Writer
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Trajectory, run_episode
+from marlbc_mj.errors import ConfigurationError, SimulationError
+from marlbc_mj.provenance import config_hash
+from marlbc_mj.recording import schemas
+from marlbc_mj.recording.log import EpisodeLog, from_trajectory
+from marlbc_mj.recording.reader import export_log, log_info, read_log, recover_log
+from marlbc_mj.recording.writer import LogWriter, partial_name
+from marlbc_mj.scenarios import Perturbation, Scenario, paper
+from marlbc_mj.supervisors import make_supervisor
+
+CONFIG = {"steps": 3, "nested": {"a": [1.5, None, "µ"]}}
+JSON_TOPICS = [topic.name for topic in schemas.TOPICS]
+
+
+def writer(path: Path, scenario: Scenario, controller: str = "sorlc", **changes) -> LogWriter:
+    names = {"supervisor": "scripted", "controller_name": controller, "seed": 0, "config": CONFIG}
+    return LogWriter(path, scenario, make_controller(controller), **{**names, **changes})
+
+
+def record(path: Path, scenario: Scenario, controller: str = "sorlc", seed: int = 0) -> Trajectory:
+    world = World(scenario, make_controller(controller), record=True)
+    with writer(path, scenario, controller, seed=seed) as log:
+        return run_episode(world, make_supervisor("scripted"), seed=seed, names=("scripted", controller), on_frame=log.write)
+
+
+def assert_same(one: EpisodeLog, other: EpisodeLog) -> None:
+    """Equal field by field, bit for bit."""
+    for field in fields(EpisodeLog):
+        a, b = getattr(one, field.name), getattr(other, field.name)
+        if isinstance(a, np.ndarray):
+            assert a.dtype == b.dtype, field.name
+            np.testing.assert_array_equal(a, b, err_msg=field.name)
+        else:
+            assert a == b, field.name
+
+
+def messages(path: Path) -> dict[str, list[bytes]]:
+    found: dict[str, list[bytes]] = {}
+    with open(path, "rb") as stream:
+        for _, channel, message in make_reader(stream).iter_messages():
+            found.setdefault(channel.topic, []).append(message.data)
+    return found
+
+
+def strict_json(data: bytes):
+    """Parse, refusing what JSON does not have but Python accepts."""
+
+    def refuse(constant: str):
+        raise AssertionError(f"{constant} in {data!r}")
+
+    return json.loads(data, parse_constant=refuse)
+
+
+def matches(value, schema: dict) -> bool:
+    """As much of JSON Schema as the topics use."""
+    kind = schema["type"]
+    if kind == "object":
+        known = all(name in schema["properties"] and matches(v, schema["properties"][name]) for name, v in value.items())
+        return known and all(name in value for name in schema["required"])
+    if kind == "array":
+        return isinstance(value, list) and all(matches(v, schema["items"]) for v in value)
+    python = {"number": (int, float), "integer": int, "string": str}[kind]
+    return isinstance(value, python) and not isinstance(value, bool)
+
+
+@pytest.fixture(scope="session")
+def short(tmp_path_factory) -> tuple[Path, Trajectory]:
+    path = tmp_path_factory.mktemp("logs") / "short.mcap"
+    return path, record(path, paper(duration=2.0))
+
+
+@pytest.fixture(scope="session")
+def empty_field(tmp_path_factory) -> tuple[Path, Trajectory]:
+    """No obstacles, so that every clearance is infinite; a controller without SORLC's weights and limit."""
+    path = tmp_path_factory.mktemp("logs") / "empty.mcap"
+    return path, record(path, paper(duration=1.0, obstacles=()), "pd")
+
+
+@pytest.mark.parametrize(("name", "controller"), [("short", "sorlc"), ("empty_field", "pd")])
+def test_round_trip_is_exact(name, controller, request):
+    path, trajectory = request.getfixturevalue(name)
+    assert_same(read_log(path), from_trajectory(trajectory, make_controller(controller)))
+
+
+def test_round_trip_of_a_drawn_episode(tmp_path):
+    """Obstacles in the log are this seed's, not the scenario's."""
+    scenario = paper(duration=1.0, perturbation=Perturbation(start_spread=0.5, obstacle_spread=1.0, drag_scale=(0.5, 2.0)))
+    trajectory = record(tmp_path / "a.mcap", scenario, seed=7)
+    log = read_log(tmp_path / "a.mcap")
+    assert_same(log, from_trajectory(trajectory, make_controller("sorlc")))
+    assert not np.array_equal(log.obstacles, scenario.obstacle_array())
+
+
+@given(values=st.lists(st.tuples(st.floats(), st.floats(), st.floats(), st.floats()), min_size=1, max_size=4))
+def test_encoded_numbers_are_json_and_exact(values):
+    """Finite floats come back bit for bit, others are left out: no NaN, no Infinity."""
+    rows = strict_json(schemas.encode(schemas.STATE, np.array(values), time=0.1))["agents"]
+    for row, expected in zip(rows, values, strict=True):
+        finite = {n: x for n, x in zip(schemas.STATE.columns, expected, strict=True) if math.isfinite(x)}
+        assert row == finite
+
+
+def test_every_channel_has_a_schema(short):
+    topics = log_info(short[0])["topics"]
+    assert set(topics) == {"/scene", "/tf", *JSON_TOPICS}
+    for name, topic in topics.items():
+        kind = ("protobuf", "protobuf") if name in ("/scene", "/tf") else ("jsonschema", "json")
+        assert (topic["schema_encoding"], topic["message_encoding"]) == kind
+        assert topic["schema"]
+        assert topic["messages"] == 40
+
+
+@pytest.mark.parametrize("name", ["short", "empty_field"])
+def test_json_messages_match_their_schemas(name, request):
+    path, _ = request.getfixturevalue(name)
+    found = messages(path)
+    for topic in schemas.TOPICS:
+        for data in found.get(topic.name, []):
+            assert matches(strict_json(data), schemas.json_schema(topic)), (topic.name, data)
+
+
+def test_schemas_are_simple_enough_for_viewers():
+    """One plain type a field, and no array of arrays: what Foxglove's schema parser takes."""
+
+    def check(schema: dict) -> None:
+        assert isinstance(schema["type"], str)
+        for child in schema.get("properties", {}).values():
+            check(child)
+        if schema["type"] == "array":
+            assert schema["items"]["type"] == "object"
+            check(schema["items"])
+
+    for topic in schemas.TOPICS:
+        check(schemas.json_schema(topic))
+
+
+def test_topics_that_do_not_apply_are_absent(empty_field):
+    assert "/weights" not in log_info(empty_field[0])["topics"]
+    assert all(row == {} for row in strict_json(messages(empty_field[0])["/metrics"][0])["agents"])
+
+
+def test_scene_shows_agents_references_and_obstacles(short):
+    path, _ = short
+    log, found = read_log(path), messages(path)
+    for k in (0, 17, 39):
+        scene, transforms = SceneUpdate.FromString(found["/scene"][k]), FrameTransforms.FromString(found["/tf"][k])
+        entities = {entity.id: entity for entity in scene.entities}
+        assert set(entities) == {"obstacles", "agent1", "agent2", "agent3", "agent4"}
+        assert len(entities["obstacles"].cylinders) == len(entities["obstacles"].lines) == 6
+        for i, transform in enumerate(transforms.transforms):
+            entity = entities[f"agent{i + 1}"]
+            body, reference = (s.pose.position for s in entity.spheres)
+            assert (body.x, body.y) == tuple(log.position[k, i])
+            assert (reference.x, reference.y) == tuple(log.reference[k, i])
+            assert [(p.x, p.y) for p in entity.lines[0].points] == [(body.x, body.y), (reference.x, reference.y)]
+            assert (transform.parent_frame_id, transform.child_frame_id) == ("world", f"agent{i + 1}")
+            assert (transform.translation.x, transform.translation.y) == (body.x, body.y)
+            assert transform.timestamp.ToNanoseconds() == entity.timestamp.ToNanoseconds() == round(log.time[k] * 1e9)
+
+
+def test_rings_are_at_the_safe_distance(short):
+    scene = SceneUpdate.FromString(messages(short[0])["/scene"][0])
+    obstacles = next(entity for entity in scene.entities if entity.id == "obstacles")
+    for obstacle, ring in zip(read_log(short[0]).obstacles, obstacles.lines, strict=True):
+        assert (ring.pose.position.x, ring.pose.position.y) == tuple(obstacle[:2])
+        assert [math.hypot(p.x, p.y) for p in ring.points] == pytest.approx([obstacle[2] + 2.0] * len(ring.points))
+
+
+def test_metadata_and_attachments(short):
+    path, trajectory = short
+    info = log_info(path)
+    about = info["metadata"]["marlbc"]
+    assert about["config_sha256"] == config_hash(CONFIG)
+    assert (about["scenario"], about["supervisor"], about["controller"], about["seed"]) == ("paper", "scripted", "sorlc", "0")
+    assert {"python", "mujoco", "numpy", "numba", "mcap"} <= set(info["metadata"]["versions"])
+    assert info["duration_s"] == pytest.approx(1.95)
+    with open(path, "rb") as stream:
+        attached = {a.name: a.data for a in make_reader(stream).iter_attachments()}
+    assert json.loads(attached["config.json"]) == CONFIG
+    assert attached["model.xml"].decode() == from_trajectory(trajectory, make_controller("sorlc")).mjcf
+    layout = json.loads(attached["foxglove-layout.json"])
+    assert set(layout["configById"]) == {"3D!scene", "Plot!force", "Plot!clearance", "StateTransitions!priorities"}
+
+
+def test_layout_plots_fields_that_exist(short):
+    """Every message path of the layout, ``/topic.agents[i].field``, is in the topic's schema."""
+    with open(short[0], "rb") as stream:
+        layout = next(a.data for a in make_reader(stream).iter_attachments() if a.name == "foxglove-layout.json")
+    known = {f"{t.name}.agents[{i}].{column}" for t in schemas.TOPICS for i in range(4) for column in t.columns}
+    panels = json.loads(layout)["configById"].values()
+    assert {path["value"] for panel in panels for path in panel.get("paths", [])} <= known
+
+
+def test_existing_files_are_kept_unless_told(tmp_path):
+    """A finished log, and a torn one that someone may want to recover."""
+    scenario, path = paper(duration=1.0), tmp_path / "a.mcap"
+    for taken in (path, partial_name(path)):
+        taken.write_bytes(b"precious")
+        with pytest.raises(ConfigurationError, match="exists"):
+            writer(path, scenario)
+        assert taken.read_bytes() == b"precious"
+        taken.unlink()
+    path.write_bytes(b"old")
+    writer(path, scenario, overwrite=True).close()
+    assert log_info(path)["messages"] == 0
+
+
+def test_paths_that_cannot_be_written(tmp_path):
+    scenario = paper(duration=1.0)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "folder.mcap").mkdir()
+    for path in (tmp_path / "file" / "a.mcap", tmp_path / "folder.mcap", tmp_path / "a.txt", Path("/proc/a.mcap")):
+        with pytest.raises(ConfigurationError) as error:
+            writer(path, scenario)
+        assert "\n" not in str(error.value)
+
+
+def test_a_run_that_fails_leaves_a_readable_partial_log(tmp_path, short):
+    frames = 5
+
+    def fail_after(log: LogWriter):
+        def on_frame(frame):
+            if len(written) == frames:
+                raise SimulationError("diverged")
+            written.append(frame)
+            log.write(frame)
+
+        return on_frame
+
+    written: list = []
+    scenario, path = paper(duration=2.0), tmp_path / "a.mcap"
+    world = World(scenario, record=True)
+    with pytest.raises(SimulationError), writer(path, scenario) as log:
+        run_episode(world, make_supervisor("scripted"), on_frame=fail_after(log))
+    assert not path.exists()
+    np.testing.assert_array_equal(read_log(partial_name(path)).position, read_log(short[0]).position[:frames])
+
+
+@pytest.fixture(scope="session")
+def chunked(tmp_path_factory) -> Path:
+    """A log with many chunks, as a run in real time leaves it."""
+    path = tmp_path_factory.mktemp("logs") / "chunked.mcap"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("marlbc_mj.recording.writer.CHUNK_SIZE", 20_000)
+        record(path, paper(duration=2.0))
+    assert log_info(path)["chunks"] >= 5
+    return path
+
+
+@settings(max_examples=25)
+@given(share=st.floats(0.0, 1.0, exclude_max=True))
+def test_torn_anywhere(chunked, share):
+    """One clear error for the reader; whole mission steps, metadata and attachments from recovery."""
+    data, whole = chunked.read_bytes(), read_log(chunked)
+    with tempfile.TemporaryDirectory() as folder:
+        torn, out = Path(folder) / "torn.mcap.partial", Path(folder) / "out.mcap"
+        torn.write_bytes(data[: int(share * len(data))])
+        for read in (read_log, log_info):
+            with pytest.raises(ConfigurationError, match=r"is truncated; `marlbc log recover .*` salvages it"):
+                read(torn)
+        saved = recover_log(torn, out)
+        info = log_info(out)
+        assert info["messages"] == saved
+        assert saved % 8 == 0
+        if saved:
+            log = read_log(out)
+            np.testing.assert_array_equal(log.position, whole.position[: saved // 8])
+            assert log.mjcf == whole.mjcf
+            assert len(info["attachments"]) == 3
+
+
+@settings(max_examples=25)
+@given(share=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
+def test_damaged_anywhere(chunked, share, flip):
+    """One wrong byte anywhere is one clear error for the reader; recovery still ends, and saves no wrong motion."""
+    data, whole = bytearray(chunked.read_bytes()), read_log(chunked)
+    place = int(share * len(data))
+    data[place] ^= flip
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / "damaged.mcap", Path(folder) / "out.mcap"
+        path.write_bytes(data)
+        with pytest.raises(ConfigurationError, match=r"^.*(damaged|truncated|not an MCAP).*$"):
+            read_log(path)
+        if place < 8:
+            with pytest.raises(ConfigurationError, match="not an MCAP"):
+                recover_log(path, out)
+        elif recover_log(path, out):
+            assert np.isin(read_log(out).position, whole.position).all()
+
+
+def test_recovering_a_whole_log_changes_nothing(short, tmp_path):
+    assert recover_log(short[0], tmp_path / "out.mcap") == 8 * 40
+    assert_same(read_log(tmp_path / "out.mcap"), read_log(short[0]))
+    assert log_info(tmp_path / "out.mcap")["metadata"] == log_info(short[0])["metadata"]
+
+
+def test_recovery_beside_the_torn_log(short, tmp_path):
+    """``a.mcap.partial`` -> ``a.mcap``, the obvious call, leaves the torn file alone."""
+    torn = tmp_path / "a.mcap.partial"
+    data = short[0].read_bytes()[:-100]
+    torn.write_bytes(data)
+    recover_log(torn, tmp_path / "a.mcap")
+    assert torn.read_bytes() == data
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.partial"]
+
+
+SLOW_RUN = """
+import sys, time
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.scenarios import paper
+from marlbc_mj.supervisors import make_supervisor
+
+scenario, controller = paper(), make_controller("sorlc")
+log = LogWriter(sys.argv[1], scenario, controller, supervisor="scripted", controller_name="sorlc", seed=0, config={})
+
+def slowly(frame):
+    log.write(frame)
+    print(time.monotonic(), flush=True)
+    time.sleep(0.02)
+
+run_episode(World(scenario, controller, record=True), make_supervisor("scripted"), on_frame=slowly)
+"""
+
+
+def test_killed_run_loses_at_most_its_last_second(tmp_path):
+    """``kill -9`` in the middle: the monotonic clock, shared by all processes, says which frames are older than a second."""
+    path = tmp_path / "killed.mcap"
+    with subprocess.Popen([sys.executable, "-c", SLOW_RUN, str(path)], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        written = [float(process.stdout.readline())]
+        while written[-1] < written[0] + 2.3:
+            written.append(float(process.stdout.readline()))
+        os.kill(process.pid, signal.SIGKILL)
+        killed = time.monotonic()
+        written += [float(line) for line in process.stdout]
+    assert process.returncode == -signal.SIGKILL
+    assert not path.exists()
+    recover_log(partial_name(path), path)
+    log = read_log(path)
+    assert len(log.time) >= sum(moment < killed - 1.0 for moment in written) > 0
+    np.testing.assert_array_equal(log.time, np.arange(len(log.time)) * 0.05)
+
+
+def test_unreadable_inputs(tmp_path):
+    text, foreign = tmp_path / "a.txt", tmp_path / "foreign.mcap"
+    text.write_text("no log at all, but long enough to have a footer")
+    with open(foreign, "wb") as stream:
+        other = Writer(stream)
+        other.start()
+        schema = other.register_schema("x", "jsonschema", b'{"type":"object"}')
+        other.add_message(other.register_channel("/x", "json", schema), 0, b"{}", 0)
+        other.finish()
+    cases = [(tmp_path / "missing.mcap", "cannot read"), (tmp_path, "cannot read"), (text, "is not an MCAP file")]
+    for path, text_of_error in cases:
+        for read in (read_log, log_info, lambda p: recover_log(p, tmp_path / "out.mcap")):
+            with pytest.raises(ConfigurationError, match=text_of_error):
+                read(path)
+    with pytest.raises(ConfigurationError, match="not written by marlbc"):
+        read_log(foreign)
+    assert log_info(foreign)["topics"]["/x"]["messages"] == 1
+    assert not (tmp_path / "out.mcap").exists()
+
+
+def test_csv_is_the_log(short, tmp_path):
+    log = read_log(short[0])
+    export_log(short[0], tmp_path / "a.csv")
+    with open(tmp_path / "a.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(float(r["time"]), int(r["agent"])) for r in rows] == [(t, i) for t in log.time for i in (1, 2, 3, 4)]
+    for name in ("position", "velocity", "reference", "reference_velocity", "force"):
+        table = np.array([[float(row[f"{name}_x"]), float(row[f"{name}_y"])] for row in rows])
+        np.testing.assert_array_equal(table.reshape(-1, 4, 2), getattr(log, name))
+    np.testing.assert_array_equal([float(row["clearance"]) for row in rows], log.clearance.ravel())
+    assert [row["command"] for row in rows] == [log.commands[c] for c in log.command.ravel()]
+    for name in ("formation", "reward", "decision_ms"):
+        np.testing.assert_array_equal([float(row[name]) for row in rows[::4]], getattr(log, name))
+
+
+def test_npz_is_the_log(empty_field, tmp_path):
+    log = read_log(empty_field[0])
+    export_log(empty_field[0], tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as arrays:
+        assert set(arrays) == {field.name for field in fields(EpisodeLog)}
+        for name in arrays:
+            np.testing.assert_array_equal(arrays[name], getattr(log, name))
+
+
+def test_outputs_are_not_overwritten_and_formats_are_checked(short, tmp_path):
+    with pytest.raises(ConfigurationError, match=r"unknown export format '\.xlsx'; choose from: \.csv, \.npz"):
+        export_log(short[0], tmp_path / "a.xlsx")
+    for name, write in (("a.csv", export_log), ("a.npz", export_log), ("a.mcap", recover_log)):
+        out = tmp_path / name
+        out.write_text("precious")
+        with pytest.raises(ConfigurationError, match="exists"):
+            write(short[0], out)
+        assert out.read_text() == "precious"
+        write(short[0], out, overwrite=True)
+        assert out.stat().st_size > 1000
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.csv", "a.mcap", "a.npz"]

@@ -1,0 +1,268 @@
+"""Videos and stills come from the real renderer; the viewer is tested up to its window."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import imageio_ffmpeg
+import mujoco
+import numpy as np
+import pytest
+from conftest import Episode
+
+from marlbc_mj.controllers import SORLC
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.palette import AGENT_COLORS, BEHAVIOR_COLORS, agent_color, ink_on, rgba
+from marlbc_mj.recording.camera import make_camera, project
+from marlbc_mj.recording.caption import Caption
+from marlbc_mj.recording.gl import choose_gl
+from marlbc_mj.recording.log import EpisodeLog, from_trajectory
+from marlbc_mj.recording.marks import corner_indices
+from marlbc_mj.recording.offscreen import Offscreen
+from marlbc_mj.recording.stage import make_stage
+from marlbc_mj.recording.video import frame_times, render_still, render_video
+from marlbc_mj.recording.view import HOME, LEFT, RIGHT, SPACE, Playback, view
+
+SMALL = {"width": 320, "height": 180}
+
+
+@pytest.fixture(scope="module")
+def log(episode: Episode) -> EpisodeLog:
+    """The case study under the scripted supervisor, with SORLC."""
+    return from_trajectory(episode("scripted", "sorlc"), SORLC())
+
+
+def _look(log: EpisodeLog, camera: str, time: float, points: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """A picture without bars, 640 x 360, and the pixels (P, 2) of points (P, 3), of the agents' middles by default."""
+    stage = make_stage(log)
+    size = 640, 360
+    with Offscreen(stage, make_camera(camera, stage, size[0] / size[1]), *size) as offscreen:
+        picture = offscreen.render(time)
+        points = stage.middles() if points is None else points
+        pixels, _ = project(offscreen.scene, points, np.ones(len(points)), *size)
+    return picture, pixels.round().astype(int)
+
+
+def _hue(color: np.ndarray) -> np.ndarray:
+    """Direction of a color from gray, which light and shade leave alone."""
+    difference = np.asarray(color, dtype=float) - np.mean(color)
+    return np.asarray(difference / np.linalg.norm(difference))
+
+
+def _read(path: Path) -> tuple[str, np.ndarray]:
+    """What ffmpeg says of a video, and its frames (F, 180, 320, 3)."""
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
+    done = subprocess.run(command, capture_output=True, check=True)
+    return done.stderr.decode(), np.frombuffer(done.stdout, np.uint8).reshape(-1, 180, 320, 3)
+
+
+def test_video_decodes_to_what_was_asked_for(log: EpisodeLog, tmp_path: Path) -> None:
+    """Two seconds of the mission at 4x and 20 frames a second are ten frames, and the first one is the still of its time."""
+    path = tmp_path / "clip.mp4"
+    counted: list[tuple[int, int]] = []
+    count = render_video(log, path, start=19, end=21, fps=20, **SMALL, progress=lambda *done: counted.append(done))
+    said, frames = _read(path)
+    for part in ("Video: h264", "yuv420p(tv, bt709", "320x180", "20 fps"):
+        assert part in said
+    assert len(frames) == count == 10
+    assert counted == [(k, 10) for k in range(1, 11)]
+    still = render_still(log, 19.0, **SMALL, samples=0)
+    picture = slice(Caption(log, 320, 180).header + 1, 158)
+    assert np.abs(frames[0][picture].astype(int) - still[picture]).mean() < 4
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_video_replaces_a_file_only_when_told(log: EpisodeLog, tmp_path: Path) -> None:
+    """An existing file stays as it is, unless overwriting is asked for."""
+    path = tmp_path / "clip.mp4"
+    path.write_bytes(b"mine")
+    with pytest.raises(ConfigurationError, match="exists"):
+        render_video(log, path, **SMALL)
+    assert path.read_bytes() == b"mine"
+    render_video(log, path, start=0, end=0.2, **SMALL, overwrite=True)
+    assert len(_read(path)[1]) == 2
+
+
+def test_interrupted_video_leaves_nothing(log: EpisodeLog, tmp_path: Path) -> None:
+    """Neither the file nor a part of it stays behind."""
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        render_video(log, tmp_path / "clip.mp4", **SMALL, progress=stop)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("camera", ["track", "top"])
+@pytest.mark.parametrize("time", [20.0, 65.0])
+def test_agents_are_where_they_are_projected(log: EpisodeLog, camera: str, time: float) -> None:
+    """The pixel at an agent's projected middle has the agent's hue."""
+    picture, pixels = _look(log, camera, time)
+    for agent, (column, row) in enumerate(pixels):
+        assert _hue(picture[row, column]) @ _hue(np.array(agent_color(agent)[:3])) > 0.95
+
+
+def test_halo_has_the_color_of_the_command(log: EpisodeLog) -> None:
+    """While agent 1 avoids an obstacle its halo is that of OA, the others' is that of FM."""
+    stage = make_stage(log)
+    stage.pose(20.0)
+    rims = stage.middles() + np.array([1.22 * stage.radii[0], 0.0, 0.1 - stage.radii[0]])
+    picture, pixels = _look(log, "top", 20.0, rims)
+    colors = [picture[row, column] for column, row in pixels]
+    expected = [BEHAVIOR_COLORS[name] for name in ("OA", "FM", "FM", "FM")]
+    for color, name in zip(colors, expected, strict=True):
+        assert _hue(color) @ _hue(np.array(rgba(name)[:3])) > 0.95
+
+
+def test_picture_follows_the_log(log: EpisodeLog) -> None:
+    """The same time gives the same pixels, another one others."""
+    first, again, later = (_look(log, "top", time)[0] for time in (10.0, 10.0, 12.0))
+    np.testing.assert_array_equal(first, again)
+    assert (first != later).any(axis=2).sum() > 50
+
+
+def test_obstacle_is_drawn_where_the_log_has_it(log: EpisodeLog) -> None:
+    """The model has the nominal place; a perturbed episode's log has its own."""
+    obstacles = log.obstacles.copy()
+    obstacles[2, :2] = 10.0, -4.0
+    moved = replace(log, obstacles=obstacles)
+    for shown, dark in ((log, (True, False)), (moved, (False, True))):
+        places = np.array([[*log.obstacles[2, :2], 1.2], [*obstacles[2, :2], 1.2]])
+        picture, pixels = _look(shown, "top", 0.0, places)
+        assert tuple(bool(picture[row, column].mean() < 140) for column, row in pixels) == dark
+
+
+def test_log_is_interpolated_and_held(log: EpisodeLog) -> None:
+    """Positions are linear between mission steps and constant outside the log."""
+    stage = make_stage(log)
+    middle = 0.5 * (log.position[100] + log.position[101])
+    np.testing.assert_allclose(stage.sample(log.position, 100.5 * log.mission_step), middle, atol=1e-9)
+    np.testing.assert_array_equal(stage.sample(log.position, -1.0), log.position[0])
+    np.testing.assert_array_equal(stage.sample(log.position, 1e3), log.position[-1])
+
+
+def test_corners_stay_close_to_the_path() -> None:
+    """No point of a path is farther than the tolerance from the straight pieces; a straight path needs two corners."""
+    angle = np.linspace(0.0, 3.0, 400)
+    path = np.column_stack([angle, np.sin(3 * angle)])
+    corners = corner_indices(path, 0.02)
+    assert len(corners) < 60
+    drawn = np.interp(path[:, 0], path[corners, 0], path[corners, 1])
+    assert np.abs(drawn - path[:, 1]).max() < 0.02 * np.hypot(1, 3)
+    assert corner_indices(np.column_stack([angle, angle]), 0.02).tolist() == [0, 399]
+    assert corner_indices(np.zeros((5, 2)), 0.02).tolist() == [0, 4]
+
+
+def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
+    """100 s at 4x and 30 frames a second are 750 frames, the last one before the end."""
+    times = frame_times(log, speed=4.0, fps=30, start=None, end=None)
+    assert len(times) == 750
+    assert times[0] == 0.0
+    assert 99.8 < times[-1] < 100.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"width": 321}, "width must be an even number"),
+        ({"height": 20}, "height must be"),
+        ({"camera": "moon"}, "choose from: track, top"),
+        ({"speed": 0.0}, "speed must be positive"),
+        ({"fps": -1}, "fps must be positive"),
+        ({"start": 50.0, "end": 40.0}, "leave nothing"),
+        ({"start": 200.0}, "leave nothing"),
+    ],
+)
+def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, object], message: str) -> None:
+    """What cannot be used is refused before anything is written."""
+    with pytest.raises(ConfigurationError, match=message):
+        render_video(log, tmp_path / "clip.mp4", **{**SMALL, **changes})  # type: ignore[arg-type]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_files_and_logs_are_named(log: EpisodeLog, tmp_path: Path) -> None:
+    """A name that is no MP4's, a folder that cannot be made, a log without steps or with another's model."""
+    with pytest.raises(ConfigurationError, match="must end in .mp4"):
+        render_video(log, tmp_path / "clip.avi")
+    (tmp_path / "none").touch()
+    with pytest.raises(ConfigurationError, match="cannot write"):
+        render_video(log, tmp_path / "none" / "clip.mp4")
+    with pytest.raises(ConfigurationError, match="no mission step"):
+        render_video(replace(log, time=log.time[:0]), tmp_path / "clip.mp4")
+    with pytest.raises(ConfigurationError, match="agent1_x"):
+        make_stage(replace(log, mjcf="<mujoco/>"))
+
+
+def test_top_camera_of_the_model_sees_the_mission(log: EpisodeLog) -> None:
+    """As it is in the MJCF, in a 16:9 picture, for anyone who renders the model without this package."""
+    model = mujoco.MjModel.from_xml_string(log.mjcf)
+    half = model.camera("top").pos[2] * np.tan(np.radians(0.5 * model.camera("top").fovy[0])) * np.array([16 / 9, 1.0])
+    assert (np.abs(log.position - model.camera("top").pos[:2]) < half).all()
+
+
+def _choose_in_a_new_process(**environment: str) -> str:
+    """What choose_gl says there."""
+    code = (
+        "import sys\nfrom marlbc_mj.errors import ConfigurationError\nfrom marlbc_mj.recording.gl import choose_gl\n"
+        "assert 'mujoco' not in sys.modules\n"
+        "try: print(choose_gl())\nexcept ConfigurationError as error: print(error)"
+    )
+    root = str(Path(__file__).resolve().parents[1])
+    variables = {**os.environ, "PYTHONPATH": root, **environment}
+    return subprocess.run([sys.executable, "-c", code], env=variables, capture_output=True, text=True, check=True).stdout
+
+
+def test_missing_opengl_is_one_clear_line() -> None:
+    """It names the packages that help; here EGL's loader finds no driver."""
+    said = _choose_in_a_new_process(MUJOCO_GL="egl", __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
+    assert said.count("\n") == 1
+    for part in ("tried egl", "libegl1 libgl1-mesa-dri", "libosmesa6", "MUJOCO_GL=osmesa"):
+        assert part in said
+
+
+def test_gl_setting_is_respected() -> None:
+    """An unknown backend and a switched-off one are refused; a working one is chosen."""
+    assert "unknown MUJOCO_GL 'vulkan'; choose from: " in _choose_in_a_new_process(MUJOCO_GL="vulkan")
+    assert "switches rendering off" in _choose_in_a_new_process(MUJOCO_GL="off")
+    assert choose_gl() in ("egl", "osmesa", "glfw", "cgl")
+
+
+def test_viewer_without_display_says_what_to_do(log: EpisodeLog, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line, which names the other way to see the episode."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(ConfigurationError, match="`marlbc video`"):
+        view(log)
+
+
+def test_playback_obeys_speed_and_keys() -> None:
+    """Mission time runs at the given speed, stops at the ends, pauses, jumps and starts again."""
+    playback = Playback(first=0.0, last=20.0, speed=4.0, time=0.0)
+    assert playback.advance(1.0) == 4.0
+    playback.press(SPACE)
+    assert playback.advance(1.0) == 4.0
+    playback.press(RIGHT)
+    assert playback.advance(1.0) == 9.0
+    playback.press(LEFT)
+    playback.press(LEFT)
+    assert playback.time == 0.0
+    playback.press(SPACE)
+    assert playback.advance(100.0) == 20.0
+    playback.press(HOME)
+    assert playback.time == 0.0
+
+
+@pytest.mark.parametrize("color", [*AGENT_COLORS, *BEHAVIOR_COLORS.values()])
+def test_text_is_readable_on_every_color(color: str) -> None:
+    """At least 2.6 to 1 (WCAG's contrast), which suits large bold text."""
+
+    def luminance(name: str) -> float:
+        linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in rgba(name)[:3]]
+        return float(np.dot([0.2126, 0.7152, 0.0722], linear))
+
+    low, high = sorted([luminance(color), luminance(ink_on(color))])
+    assert (high + 0.05) / (low + 0.05) > 2.6
