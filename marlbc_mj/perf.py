@@ -74,7 +74,7 @@ class Fleet:
         self.world = World(scenario, controller, worlds=worlds, threads=threads, native=native)
         self.orders = orders
         if worlds > 1:
-            self._spread(World(scenario, worlds=min(worlds, BATCH)), scenario.mission_steps)
+            self._spread(World(scenario, controller, worlds=min(worlds, BATCH)), scenario.mission_steps)
 
     def _spread(self, source: World, steps: int) -> None:
         """Reset one world after the other while all of them run; more worlds than that are copies of these."""

@@ -428,7 +428,7 @@ def test_the_formation_identifier_is_relative_to_the_centroid():
         for displacement, held in ((0.0, True), (0.66, True), (0.67, False), (-0.66, True), (-0.67, False)):
             p = scenario.formations[which] + (40.0, -3.0)
             p[2, 1] += displacement
-            formation, r1 = judge(p, scenario.obstacle_array(), scenario.formations, 0.5, 2.0, np.empty(4))
+            formation, r1 = judge(p, scenario.obstacle_array(), scenario.formations, 0.5, 2.0, np.empty(4), np.empty((1, 2)))
             assert formation == (expected if held else 0) and r1 == 5.0 * formation
 
 

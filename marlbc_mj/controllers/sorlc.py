@@ -15,7 +15,8 @@ from marlbc_mj.controllers.base import require_gains
 from marlbc_mj.errors import ConfigurationError, unknown
 
 NEURONS = 12
-_F, _A, _C, _PSI_F, _PSI_V, _TAU = (row * NEURONS for row in (0, 2, 4, 6, 7, 8))  # offsets in the state; weights axis by axis
+_F, _A, _C, _PSI_F, _PSI_V, _SCALE = (row * NEURONS for row in (0, 2, 4, 6, 7, 8))  # offsets in the state; weights axis by axis
+_TAU = _SCALE + 1  # omega_f is the stored numbers times state[_SCALE]: a leak of them all is one multiplication
 STATE_SIZE = _TAU + 2
 
 BASES = ("printed", "scaled", "off")
@@ -57,29 +58,29 @@ def sorlc(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no
     """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler.
 
     ``params`` = xi_p, xi_v, xi_tau, Gamma_f, nu_f, gamma_c, gamma_a, 1 / (2 beta_V), sign of tau, limit [N], networks on
-    (0 or 1), basis
-    relative to the reference (0 or 1), scale of p [m], of v [m/s], of tau [N], first centre, distance of centres,
-    1 / width^2, and the factors of :func:`diagonal_gaussians` for n = 4 and n = 2.
+    (0 or 1), basis relative to the reference (0 or 1), scale of p [m], of v [m/s], of tau [N], first centre, distance of
+    centres, 1 / width^2, and the factors of :func:`diagonal_gaussians` for n = 4 and n = 2.
     """
-    networks = params[10] != 0.0
-    active = networks and _basis(params, state, p, v, p_r, v_r)
+    active = params[10] != 0.0 and _basis(params, state, p, v, p_r, v_r)
+    leak = 1.0 - h * params[3] * params[4]
+    if params[10] != 0.0 and not active:
+        state[_SCALE] *= leak  # with Psi_f = 0 (37) only leaks
+    elif state[_SCALE] != 1.0:
+        for k in range(2 * NEURONS):
+            state[_F + k] *= state[_SCALE]
+        state[_SCALE] = 1.0
     for axis in range(2):
         position_error = p[axis] - p_r[axis]
         velocity_error = v[axis] - v_r[axis]
         nominal = -params[0] * position_error - params[1] * velocity_error + params[8] * state[_TAU + axis]
         if active:
             nominal += _actor_critic(params, state, axis, h)
+            gain = h * params[3] * (position_error + velocity_error)
+            for k in range(NEURONS):
+                state[_F + axis * NEURONS + k] = leak * state[_F + axis * NEURONS + k] + gain * state[_PSI_F + k]
         force = laws.clip(nominal, params[9])
         force_out[axis] = force
         state[_TAU + axis] += h * (force - nominal - params[2] * state[_TAU + axis])
-        if networks:
-            leak = 1.0 - h * params[3] * params[4]
-            gain = h * params[3] * (position_error + velocity_error)
-            for k in range(NEURONS):
-                state[_F + axis * NEURONS + k] *= leak
-            if active:
-                for k in range(NEURONS):
-                    state[_F + axis * NEURONS + k] += gain * state[_PSI_F + k]
 
 
 @laws.inlined
@@ -123,7 +124,7 @@ def weights(state: np.ndarray) -> Weights:
     """Read one agent's state (S,), or a stack of them (..., S), as weight matrices (..., 12, 2)."""
     shape = (*state.shape[:-1], 2, NEURONS)
     identifier, actor, critic = (state[..., at : at + 2 * NEURONS].reshape(shape).swapaxes(-1, -2) for at in (_F, _A, _C))
-    return Weights(identifier, actor, critic, state[..., _TAU:])
+    return Weights(identifier * state[..., _SCALE, None, None], actor, critic, state[..., _TAU:])
 
 
 @dataclass(frozen=True)
@@ -243,6 +244,7 @@ class SORLC:
 
     def initial_state(self, agent: int) -> np.ndarray:
         state = np.zeros(STATE_SIZE)
+        state[_SCALE] = 1.0
         for at, fills in (
             (_F, self.identifier_weights),
             (_A, self.actor_weights),

@@ -10,7 +10,6 @@ dm_control task call, so there is one definition of a mission step. Its order of
 """
 
 import numba
-import numpy as np
 from numba.extending import register_jitable
 
 from marlbc_mj.behaviors import nearest_obstacle
@@ -20,6 +19,9 @@ from marlbc_mj.nullspace import add_behavior
 
 DIVERGED = 1e9
 """A position, velocity or force beyond this (or NaN) stops the world before MuJoCo sees it."""
+
+SCRATCH = 7
+"""Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
 FORMATION_REWARD = 5.0  # (14), times G
@@ -34,14 +36,14 @@ def path_at(t, path, out):  # type: ignore[no-untyped-def]
         out[1, axis] = path[1, axis]
 
 
-@compiled
-def judge(p, obstacles, formations, tolerance, safe_distance, clearance):  # type: ignore[no-untyped-def]
+@allocation_free
+def judge(p, obstacles, formations, tolerance, safe_distance, clearance, scratch):  # type: ignore[no-untyped-def]
     """Clearances, formation identifier G and r1 (14) of a team at positions ``p`` (N, 2).
 
     ``formations`` (2, N, 2): slots of G = 2, then of G = 1. ``clearance`` (N,) is written in place. Returns (G, r1).
     """
     agents = p.shape[0]
-    normal = np.empty(2)
+    normal = scratch[0]
     violated = False
     for i in range(agents):
         clearance[i] = nearest_obstacle(p[i], obstacles, normal)
@@ -172,20 +174,20 @@ team_forces_compiled = allocation_free(team_forces)
 _run_substeps_compiled = allocation_free(run_substeps)
 
 
-@compiled
+@allocation_free
 def begin_step(  # type: ignore[no-untyped-def]
-    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, obstacles, p, p_r, v_r, commands
+    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, obstacles, p, p_r, v_r, commands,
+    scratch,
 ):  # fmt: skip
     """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15)."""
-    now = np.empty((2, 2))
+    now = scratch[:2]
     path_at(t, path, now)
-    scratch = np.empty((1 + 2 * p.shape[1], p.shape[1]))
     at = p_r if virtual else p
-    set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch, v_r)
+    set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch[2:7], v_r)
     return count_switches(orders, command_of, commands, step)
 
 
-@compiled
+@allocation_free
 def mission_step(  # type: ignore[no-untyped-def]
     b,
     # fixed for all worlds
@@ -193,7 +195,7 @@ def mission_step(  # type: ignore[no-untyped-def]
     behavior_laws, behavior_params, table, command_of, path, formations, settings,
     # one row a world
     data, disturbance_params, obstacles, orders, commands, p, v, p_r, v_r, state, clearance, formation, reward, steps,
-    status, record,
+    status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
     [m], safe distance [m], virtual (0/1).
@@ -201,16 +203,17 @@ def mission_step(  # type: ignore[no-untyped-def]
     t = steps[b] * settings[0]
     r2 = begin_step(
         t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], obstacles[b],
-        p[b], p_r[b], v_r[b], commands[b],
+        p[b], p_r[b], v_r[b], commands[b], scratch[b],
     )  # fmt: skip
-    forces = np.empty((2, p.shape[1], 2))
+    agents = p.shape[1]
+    drag, force = scratch[b, SCRATCH : SCRATCH + agents], scratch[b, SCRATCH + agents :]
     status[b] = _run_substeps_compiled(
         step_function, model, data[b, 0], doubles(data[b, 1], sizes[0]), doubles(data[b, 2], sizes[1]),
         doubles(data[b, 3], sizes[2]), doubles(data[b, 4], sizes[1]), doubles(data[b, 5], sizes[2]), indices,
         controller_law, controller_params, disturbance_law, disturbance_params[b], t, settings[1],
-        round(settings[0] / settings[1]), p[b], v[b], p_r[b], v_r[b], state[b], forces[0], forces[1], record[b],
+        round(settings[0] / settings[1]), p[b], v[b], p_r[b], v_r[b], state[b], drag, force, record[b],
     )  # fmt: skip
-    formation[b], r1 = judge(p[b], obstacles[b], formations, settings[2], settings[3], clearance[b])
+    formation[b], r1 = judge(p[b], obstacles[b], formations, settings[2], settings[3], clearance[b], scratch[b])
     reward[b] = r1 + r2
     steps[b] += 1
     return 1 if status[b] else 0

@@ -10,9 +10,10 @@ import ctypes
 
 import mujoco
 from llvmlite import ir
-from numba import carray, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, overload
+from numba.np.arrayobj import populate_array
 
 from marlbc_mj import laws
 
@@ -26,11 +27,6 @@ def step_address() -> int:
 def call_step(step, model, data):  # type: ignore[no-untyped-def]
     """``step(model, data)``; for ``mj_step``."""
     step(model, data)
-
-
-def doubles(source, n):  # type: ignore[no-untyped-def]
-    """The n float64 of MuJoCo's array at this address, as a view; the array itself in Python."""
-    return source
 
 
 def as_behavior(law):  # type: ignore[no-untyped-def]
@@ -59,23 +55,22 @@ def _call_address(typing_context, step, model, data):  # type: ignore[no-untyped
 
 
 @intrinsic
-def _double_pointer(typing_context, address):  # type: ignore[no-untyped-def]
-    signature = types.CPointer(types.float64)(types.uintp)
+def doubles(typing_context, address, n):  # type: ignore[no-untyped-def]
+    """The n float64 at an address as an array that owns nothing; compiled code only."""
 
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
-        return builder.inttoptr(args[0], context.get_value_type(signature.return_type))
+        array = context.make_array(signature.return_type)(context, builder)
+        size = context.get_constant(types.intp, 8)
+        data = builder.inttoptr(args[0], array.data.type)
+        populate_array(array, data=data, shape=[args[1]], strides=[size], itemsize=size, meminfo=None)
+        return array._getvalue()
 
-    return signature, codegen
+    return types.float64[::1](types.uintp, types.intp), codegen
 
 
 @overload(call_step, inline="always")
 def _call_step(step, model, data):  # type: ignore[no-untyped-def]
     return lambda step, model, data: _call_address(step, model, data)
-
-
-@overload(doubles, inline="always")
-def _doubles(source, n):  # type: ignore[no-untyped-def]
-    return lambda source, n: carray(_double_pointer(source), n)
 
 
 def _compile_as(function, kind):  # type: ignore[no-untyped-def]

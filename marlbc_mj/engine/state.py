@@ -46,6 +46,7 @@ class TeamState:
         self.command = np.zeros((worlds, agents), dtype=np.int64)
         self.reward = np.zeros(worlds)
         self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
+        self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
 
     def reset(self, b: int, rng: np.random.Generator) -> np.ndarray:
         """Put world ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m]."""
@@ -89,6 +90,7 @@ class TeamState:
             self.reference[b],
             self.reference_velocity[b],
             self.command[b],
+            self.scratch[b],
         )
 
     def finish(self, b: int) -> None:
@@ -105,6 +107,7 @@ class TeamState:
             scenario.formation_tolerance,
             scenario.safe_distance,
             self.clearance[b],
+            self.scratch[b],
         )
         return float(reward)
 

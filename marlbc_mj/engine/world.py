@@ -135,7 +135,7 @@ class World:
 
     def advance(self, orders: np.ndarray) -> int:
         """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64: no checks, no copies; how many worlds failed."""
-        rows = (self._addresses, *self.state.rows(orders), self._status, self._record)
+        rows = (self._addresses, *self.state.rows(orders), self._status, self._record, self.state.scratch)
         if self.threads == 1 or self.worlds == 1:
             return int(loop.step_serial(self.worlds, *self._fixed, *rows))
         numba.set_num_threads(self.threads)
@@ -162,7 +162,7 @@ class World:
         plan, state = self.plan, self.state
         start = state.time(b)
         state.begin(b, orders)
-        forces = np.empty((2, self.scenario.agents, 2))
+        drag, force = np.split(state.scratch[b, loop.SCRATCH :], 2)
         self._status[b] = loop.run_substeps(
             mujoco.mj_step,
             plan.model,
@@ -180,7 +180,8 @@ class World:
             state.reference[b],
             state.reference_velocity[b],
             state.controller[b],
-            *forces,
+            drag,
+            force,
             self._record[b],
         )
         state.finish(b)

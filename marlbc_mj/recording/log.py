@@ -78,6 +78,7 @@ def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np
     clearance = np.empty(position.shape[:2])
     formation = np.empty(len(position), dtype=np.int64)
     rule = (scenario.formations, scenario.formation_tolerance, scenario.safe_distance)
+    scratch = np.empty((1, 2))
     for k in range(len(position)):
-        formation[k], _ = judge(position[k], trajectory.obstacles, *rule, clearance[k])
+        formation[k], _ = judge(position[k], trajectory.obstacles, *rule, clearance[k], scratch)
     return clearance, formation

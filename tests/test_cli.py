@@ -1,0 +1,182 @@
+"""The command line as a newcomer meets it: what it writes, and one clear line for everything that cannot be done."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from marlbc_mj.cli import main
+from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
+
+SHORT = ("--duration", "1.0")
+
+
+def refused(arguments: list[str], capsys: pytest.CaptureFixture[str], status: int = 2) -> str:
+    """Run a command that must fail with ``status``; returns its one line."""
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == status
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A benchmark of a 2 s mission, with a small video."""
+    out = tmp_path_factory.mktemp("bench") / "out"
+    supervisors = ["--supervisors", "scripted", "fsams"]
+    main(["bench", "paper", *supervisors, "--controllers", "sorlc", "pd", "--out", str(out), "--duration", "2.0"])
+    return out
+
+
+def test_bench_leaves_what_it_promises(results: Path) -> None:
+    """Every file of the run directory is there, and nothing else beside it."""
+    names = {p.name for p in results.iterdir()}
+    files = {"config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"}
+    assert names == files | {"figures", "logs", "video"}
+    methods = {f"{s}+{c}" for s in ("scripted", "fsams") for c in ("sorlc", "pd")}
+    assert {p.stem for p in (results / "logs").iterdir()} == methods
+    assert [p.name for p in (results / "video").iterdir()] == ["scripted+sorlc.mp4"]
+    assert {p.suffix for p in (results / "figures").iterdir()} == {".pdf", ".png"}
+    assert [p.name for p in results.parent.iterdir()] == ["out"]
+
+
+def test_summary_and_config_hold_what_the_design_fixes(results: Path) -> None:
+    """Keys of summary.json by method, agent and team; config.json names versions, CPU, revision and seed."""
+    summary = json.loads((results / "summary.json").read_text())
+    assert (summary["schema"], summary["scenario"]) == (1, "paper")
+    for method in summary["methods"].values():
+        assert len(method["agents"]) == 4
+        assert all(set(agent) == set(AGENT_KEYS) for agent in method["agents"])
+        assert set(method["team"]) == set(TEAM_KEYS)
+    config = json.loads((results / "config.json").read_text())
+    assert {"versions", "cpu", "git_revision", "seed", "scenario", "bench", "command"} <= set(config)
+    assert config["scenario"]["force_limit"] == 200.0
+
+
+def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder with something in it is refused, and left as it is, unless --overwrite says so."""
+    before = (results / "summary.json").read_bytes()
+    line = refused(["bench", "paper", "--out", str(results), *SHORT], capsys)
+    assert str(results) in line
+    assert "--overwrite" in line
+    assert (results / "summary.json").read_bytes() == before
+    quick = ["--supervisors", "scripted", "--controllers", "pd", "--video", "none", "--no-figures", "--no-logs"]
+    copy = results.parent / "copy"
+    main(["bench", "paper", "--out", str(copy), *quick, *SHORT])
+    main(["bench", "paper", "--out", str(copy), *quick, *SHORT, "--overwrite"])
+    assert set(json.loads((copy / "summary.json").read_text())["methods"]) == {"scripted+pd"}
+    assert not [p for p in results.parent.iterdir() if p.name.startswith("copy.")]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["bench", "papers"], ("scenario 'papers'", "paper")),
+        (["bench", "--supervisors", "oracl"], ("supervisor 'oracl'", "scripted, fsams")),
+        (["bench", "--controllers", "sorlc", "pid"], ("controller 'pid'", "sorlc")),
+        (["bench", "--controllers", "pd", "pd"], ("twice", "pd")),
+        (["run", "--reference", "real"], ("reference mode 'real'", "virtual, actual")),
+        (["run", "--disturbance", "fog"], ("disturbance 'fog'", "paper, linear")),
+        (["run", "--substep", "0.003"], ("0.05", "0.003")),
+        (["run", "--substep", "0.025"], ("25 ms", "19.8 ms")),
+        (["run", "--force-limit", "-1"], ("force_limit", "-1")),
+        (["run", "--drag-scale", "nan"], ("nan",)),
+        (["run", "--seed", "-1"], ("seed", "-1")),
+        (["perf", "--rounds", "2"], ("rounds", "2")),
+        (["bench", "--no-logs"], ("video", "logs")),
+    ],
+)
+def test_wrong_settings_are_one_line(
+    arguments: list[str], fragments: tuple[str, ...], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """Each is named together with what would be right, with exit status 2 and nothing written."""
+    out = [] if arguments[0] == "perf" else ["--out", str(tmp_path / "out")]
+    line = refused([*arguments, *out], capsys)
+    assert all(fragment in line for fragment in fragments), line
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """A drag that nothing can hold: `run` stops with where it happened; `bench` reports it beside the methods that ran."""
+    line = refused(["run", "--drag-scale", "20", "--duration", "5", "--out", str(tmp_path / "run")], capsys, status=3)
+    assert "agent 1, t = 1.31" in line
+    quick = [
+        "--supervisors",
+        "scripted",
+        "--controllers",
+        "pd",
+        "--video",
+        "none",
+        "--no-figures",
+        "--out",
+        str(tmp_path / "bench"),
+    ]
+    main(["bench", *quick, "--drag-scale", "20", "--duration", "5"])
+    summary = json.loads((tmp_path / "bench" / "summary.json").read_text())
+    assert "agent 1, t = 1.31" in summary["methods"]["scripted+pd"]["failure"]
+    assert "1.31" in (tmp_path / "bench" / "tables.md").read_text()
+
+
+def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And the log's commands: info, export, video; a truncated log is one line, and recover brings it back."""
+    out = tmp_path / "run"
+    main(["run", "--out", str(out), *SHORT])
+    log = out / "logs" / "scripted+sorlc.mcap"
+    assert {p.name for p in out.iterdir()} == {"logs", "metrics.json", "config.json"}
+    capsys.readouterr()
+    main(["log", "info", str(log)])
+    assert json.loads(capsys.readouterr().out)["metadata"]["marlbc"]["supervisor"] == "scripted"
+    main(["log", "export", str(log), str(out / "episode.npz")])
+    assert np.load(out / "episode.npz")["position"].shape == (20, 4, 2)
+    main(["video", str(log), "--width", "320", "--height", "180", "--fps", "5"])
+    assert log.with_suffix(".mp4").stat().st_size > 1000
+    torn = out / "torn.mcap"
+    torn.write_bytes(log.read_bytes()[:-100])
+    capsys.readouterr()
+    assert "truncated" in refused(["log", "export", str(torn), str(out / "x.csv")], capsys)
+    main(["log", "recover", str(torn), str(out / "saved.mcap")])
+    main(["log", "export", str(out / "saved.mcap"), str(out / "saved.csv")])
+    assert "exists" in refused(["log", "export", str(log), str(out / "saved.csv")], capsys)
+
+
+def test_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A folder inside a file cannot be made: one line names it."""
+    (tmp_path / "file").touch()
+    assert "file" in refused(["bench", "--out", str(tmp_path / "file" / "out"), *SHORT], capsys)
+
+
+def test_view_without_a_display(results: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It says so, and what to use instead."""
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    assert "marlbc video" in refused(["view", str(results / "logs" / "scripted+pd.mcap")], capsys)
+
+
+def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every registry's names, each with a description."""
+    main(["list"])
+    text = capsys.readouterr().out
+    for name in ("paper", "fsams-hysteresis", "sorlc-scaled", "finite-time-limited", "actual", "quadratic", "point_mass"):
+        assert f"  {name} " in text
+
+
+def test_a_broken_gl_loses_the_video_and_nothing_else(tmp_path: Path) -> None:
+    """With a MUJOCO_GL that is no backend, `bench` still writes all results; `video` says what to set."""
+    environment = {**os.environ, "MUJOCO_GL": "nothing"}
+    quick = ["--supervisors", "scripted", "--controllers", "pd", "--no-figures", "--duration", "0.5"]
+    command = [sys.executable, "-m", "marlbc_mj", "bench", *quick, "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    assert "MUJOCO_GL" in done.stderr
+    assert (tmp_path / "out" / "index.html").exists()
+    video = [sys.executable, "-m", "marlbc_mj", "video", str(tmp_path / "out" / "logs" / "scripted+pd.mcap")]
+    failed = subprocess.run(video, env=environment, capture_output=True, text=True, timeout=120)
+    assert failed.returncode == 2
+    assert "choose from: egl, osmesa" in failed.stderr
+    assert len(failed.stderr.strip().splitlines()) == 1
