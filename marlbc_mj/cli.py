@@ -405,18 +405,12 @@ def _print_results(results: list[Any]) -> None:
     from rich.console import Console
     from rich.table import Column, Table
 
-    table = Table(
-        Column("method", no_wrap=True),
-        "return",
-        Column("switches", no_wrap=True),
-        "violation s",
-        "clearance m",
-        Column("effort N s", no_wrap=True),
-    )
+    names = ("method", "return", "switches", "violation s", "clearance m", "effort N s")
+    table = Table(*(Column(name, no_wrap=True) for name in names))
     for result in results:
         key = result.key
         if result.metrics is None:
-            table.add_row(key, f"failed: {result.failure}")
+            table.add_row(key, "failed")
             continue
         agents, team = result.metrics["agents"], result.metrics["team"]
         table.add_row(
@@ -425,6 +419,9 @@ def _print_results(results: list[Any]) -> None:
             "/".join(str(a["switches"]) for a in agents),
             f"{sum(a['violation_time'] for a in agents):.2f}",
             f"{min(a['clearance_min'] for a in agents):.3f}",
-            "/".join(f"{a['effort_integral']:.0f}" for a in agents),
+            f"{sum(a['effort_integral'] for a in agents):.0f}",
         )
     Console().print(table)
+    for result in results:
+        if result.failure is not None:
+            print(f"{result.key} failed: {result.failure}")

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from marlbc_mj.ablation import _compare, gain_sweep, half_mission, markdown, variants  # noqa: PLC2701
+from marlbc_mj.ablation import _compare, gain_sweep, half_mission, markdown, variants
 from marlbc_mj.disturbances import PaperDrag
 from marlbc_mj.scenarios import cruise, paper
 

@@ -1,4 +1,4 @@
-"""The measuring command measures: a smoke run with small bursts; its figures are the machine's, its ratios are checked by hand."""
+"""The measuring command measures: a smoke run with small bursts. The figures themselves are the machine's."""
 
 import numpy as np
 import pytest
