@@ -37,6 +37,21 @@ def nearest_obstacle(p: np.ndarray, obstacles: np.ndarray, normal: np.ndarray) -
     return clearance
 
 
+@laws.compiled
+def _fill_clearances(positions, obstacles, out):  # type: ignore[no-untyped-def]
+    normal = np.empty(2)
+    for k in range(positions.shape[0]):
+        out[k] = nearest_obstacle(positions[k], obstacles, normal)
+
+
+def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+    """:func:`nearest_obstacle`'s clearance [m] at every one of ``positions`` (..., 2) [m], (...,)."""
+    flat = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, 2)
+    out = np.empty(len(flat))
+    _fill_clearances(flat, np.ascontiguousarray(obstacles, dtype=np.float64), out)
+    return out.reshape(np.shape(positions)[:-1])
+
+
 @laws.behavior
 def obstacle_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
     """OA (9): v = n Lambda max(0, d_OA - d), J = n^T; ``params`` = Lambda [1/s], d_OA [m], two-sided (0 or 1).

@@ -16,7 +16,9 @@ from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.report.bundle import write_report
 from marlbc_mj.report.results import Result, method_key
+from marlbc_mj.report.seeds import write_seed_report
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.seeds import SeedResults, perturbed, run_seeds, seed_range
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 
 Progress = Callable[[str, float, float], None]
@@ -27,13 +29,15 @@ Progress = Callable[[str, float, float], None]
 class BenchConfig:
     """What one benchmark run does."""
 
-    supervisors: tuple[str, ...] = tuple(SUPERVISORS)
+    supervisors: tuple[str, ...] = ("scripted", "fsams", "fsams-hysteresis")
     controllers: tuple[str, ...] = ("sorlc", "pd")
     seed: int = 0
     figures: bool = True
     logs: bool = True
     video: Literal["first", "all", "none"] = "first"
     overwrite: bool = False
+    seeds: int | None = None  # this many draws around the scenario, from ``seed`` on, instead of one
+    workers: int = 1  # processes that share the methods of ``seeds``
 
     def __post_init__(self) -> None:
         for kind, names, known in (
@@ -41,6 +45,8 @@ class BenchConfig:
             ("controller", self.controllers, CONTROLLERS),
         ):
             _check_names(kind, names, known)
+        if self.seeds is not None:
+            seed_range(self.seeds, self.seed)
         if self.seed < 0:
             raise ConfigurationError(f"seed must not be negative, got {self.seed}")
         if self.video != "none" and not self.logs:
@@ -80,6 +86,20 @@ def run_bench(
     return results, problems
 
 
+def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
+    """The whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
+
+    Raises:
+        ConfigurationError: a setting or the output folder; nothing is written then.
+    """
+    scenario, seeds = perturbed(scenario), seed_range(config.seeds or 0, config.seed)
+    with staged_folder(out, overwrite=config.overwrite) as folder:
+        write_json(folder / "config.json", _config(scenario, config))
+        results = run_seeds(scenario, config.supervisors, config.controllers, seeds, progress, workers=config.workers)
+        write_seed_report(results, folder, config=_config(scenario, config), figures=config.figures, progress=progress)
+    return results
+
+
 def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
     return {
         **provenance(),
@@ -94,7 +114,7 @@ def run_method(scenario: Scenario, supervisor: str, controller: str, seed: int, 
     """One episode of one method, logged to ``folder/logs`` if there is a folder."""
     key = method_key(supervisor, controller)
     law = make_controller(controller)
-    chief = make_supervisor(supervisor)
+    chief = make_supervisor(supervisor, controller)
     chief.start(scenario)  # a supervisor that does not suit the scenario is a wrong setting, not a failed run
     world = World(scenario, law, record=True)
 
@@ -124,7 +144,7 @@ def open_log(
     path: Path, scenario: Scenario, law: Controller, *, supervisor: str, controller: str, seed: int, overwrite: bool = False
 ) -> LogWriter:
     """A log writer for one method, with everything that defines the run in its configuration."""
-    config = {"scenario": scenario, "controller": law, "supervisor": make_supervisor(supervisor), "seed": seed}
+    config = {"scenario": scenario, "controller": law, "supervisor": make_supervisor(supervisor, controller), "seed": seed}
     return LogWriter(
         path,
         scenario,
@@ -178,7 +198,7 @@ def run_single(
     """
     config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
-    make_supervisor(supervisor).start(scenario)
+    make_supervisor(supervisor, controller).start(scenario)
     say = progress or (lambda what, done, total: None)
     result = run_method(scenario, supervisor, controller, seed, out, say)
     if result.metrics is None:

@@ -1,9 +1,6 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
-import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -11,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.errors import ConfigurationError, MarlbcError
+from marlbc_mj.errors import MarlbcError
+from marlbc_mj.terminal import prepare_gl, print_results, progress_bars
 
 if TYPE_CHECKING:
     from marlbc_mj.scenarios import Scenario
@@ -65,6 +63,10 @@ class Bench:
     """Folder of the results."""
     seed: int = 0
     """Draw of the scenario; every seed is the same where nothing is perturbed."""
+    seeds: int | None = None
+    """Number of draws around the scenario, from --seed on: tables with intervals instead of logs and videos."""
+    workers: int = 1
+    """Processes that share the methods of --seeds."""
     video: Literal["first", "all", "none"] = "first"
     """Which methods get a video."""
     figures: bool = True
@@ -77,7 +79,7 @@ class Bench:
 
     def run(self) -> None:
         """Run the matrix, then say where the results are and what they are."""
-        from marlbc_mj.bench import BenchConfig, run_bench
+        from marlbc_mj.bench import BenchConfig, run_bench, run_bench_seeds
 
         config = BenchConfig(
             supervisors=self.supervisors,
@@ -87,10 +89,17 @@ class Bench:
             logs=self.logs,
             video=self.video,
             overwrite=self.overwrite,
+            seeds=self.seeds,
+            workers=self.workers,
         )
-        with _progress() as progress:
+        if self.seeds is not None:
+            with progress_bars() as progress:
+                run_bench_seeds(self.options.build(self.scenario), config, self.out, progress=progress)
+            print(f"{self.out / 'index.html'} shows it all")
+            return
+        with progress_bars() as progress:
             results, problems = run_bench(self.options.build(self.scenario), config, self.out, progress=progress)
-        _print_results(results)
+        print_results(results)
         for problem in problems:
             print(f"marlbc: {problem}", file=sys.stderr)
         print(f"{self.out / 'index.html'} shows it all")
@@ -118,7 +127,7 @@ class Run:
         """One episode, its log and its metrics."""
         from marlbc_mj.bench import run_single
 
-        with _progress() as progress:
+        with progress_bars() as progress:
             result = run_single(
                 self.options.build(self.scenario),
                 self.supervisor,
@@ -128,7 +137,7 @@ class Run:
                 overwrite=self.overwrite,
                 progress=progress,
             )
-        _print_results([result])
+        print_results([result])
         print(f"{self.out} holds the log, the metrics and the configuration")
 
 
@@ -165,7 +174,7 @@ class Video:
         from marlbc_mj.recording.video import render_video
 
         out = self.out or self.log.with_suffix(".mp4")
-        with _progress() as progress:
+        with progress_bars() as progress:
             render_video(
                 read_log(self.log),
                 out,
@@ -320,12 +329,48 @@ class Ablation:
         from marlbc_mj.ablation import basis_study, gain_sweep, markdown
         from marlbc_mj.files import staged_file
 
-        with _progress() as progress:
+        with progress_bars() as progress:
             text = markdown(basis_study(progress)) + "\n\n" + markdown(gain_sweep(progress)) + "\n"
         print(text)
         if self.out is not None:
             with staged_file(self.out, overwrite=self.overwrite) as staging:
                 staging.write_text(text)
+
+
+@dataclass(frozen=True)
+class OracleSearch:
+    """Search the best safe switch times on the simulator, for the oracle supervisor; takes minutes."""
+
+    scenario: str = "paper"
+    """Scenario."""
+    controller: str = "sorlc"
+    """Controller that tracks the references."""
+    seed: int = 0
+    """Of the search."""
+    budget: int = 4096
+    """Episodes that may be simulated."""
+    threads: int = 2
+    """Worlds are shared out over this many."""
+    out: Path | None = None
+    """Cache to add the schedule to; the one that comes with the package by default."""
+
+    def run(self) -> None:
+        """Search, save, and say what was found."""
+        from marlbc_mj.scenarios import make_scenario
+        from marlbc_mj.supervisors.oracle import save, search
+
+        scenario = make_scenario(self.scenario)
+        with progress_bars() as progress:
+            found = search(
+                scenario,
+                self.controller,
+                seed=self.seed,
+                budget=self.budget,
+                threads=self.threads,
+                progress=lambda done, total: progress("search", done, self.budget),
+            )
+        save(found, scenario, self.controller, self.out)
+        print(f"return {found.total:.0f} after {found.episodes} episodes (scripted: {found.scripted})")
 
 
 Command = (
@@ -337,6 +382,7 @@ Command = (
     | Annotated[ListAll, subcommand("list")]
     | Annotated[Perf, subcommand("perf")]
     | Annotated[Ablation, subcommand("ablation")]
+    | Annotated[OracleSearch, subcommand("oracle")]
 )
 
 DESCRIPTION = "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper"
@@ -346,7 +392,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run."""
     command = tyro.cli(Command, prog="marlbc", description=DESCRIPTION, args=arguments)
     try:
-        _prepare_gl(strict=isinstance(command, Video))
+        prepare_gl(strict=isinstance(command, Video))
         command.run()
     except MarlbcError as error:
         print(f"marlbc: {error}", file=sys.stderr)
@@ -354,74 +400,3 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("marlbc: interrupted", file=sys.stderr)
         sys.exit(130)
-
-
-def _prepare_gl(strict: bool) -> None:
-    """See to it, before MuJoCo is imported, that a MUJOCO_GL that does not work stops only what renders."""
-    if not strict and "MUJOCO_GL" not in os.environ:
-        return
-    from marlbc_mj.recording.gl import choose_gl
-
-    try:
-        backend = choose_gl()
-    except ConfigurationError as error:
-        if strict:
-            raise
-        del os.environ["MUJOCO_GL"]  # with it, MuJoCo itself could not be imported
-        print(f"marlbc: {error}; going on without it", file=sys.stderr)
-    else:
-        print(f"marlbc: off-screen rendering with {backend}", file=sys.stderr)
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, float, float], None]]:
-    """A bar per stage, with rate and time left, on a terminal; silent elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    columns = (
-        TextColumn("{task.description:<28}"),
-        BarColumn(),
-        TextColumn("{task.percentage:>3.0f} %  {task.fields[rate]:>8}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
-        tasks: dict[str, Any] = {}
-
-        def update(what: str, done: float, total: float) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total, rate="")
-            task = bars.tasks[tasks[what]]
-            rate = f"{task.finished_speed or task.speed or 0.0:.3g} /s"
-            bars.update(tasks[what], completed=done, total=total, rate=rate)
-
-        yield update
-
-
-def _print_results(results: list[Any]) -> None:
-    from rich.console import Console
-    from rich.table import Column, Table
-
-    names = ("method", "return", "switches", "violation s", "clearance m", "effort N s")
-    table = Table(*(Column(name, no_wrap=True) for name in names))
-    for result in results:
-        key = result.key
-        if result.metrics is None:
-            table.add_row(key, "failed")
-            continue
-        agents, team = result.metrics["agents"], result.metrics["team"]
-        table.add_row(
-            key,
-            f"{team['return']:.0f}",
-            "/".join(str(a["switches"]) for a in agents),
-            f"{sum(a['violation_time'] for a in agents):.2f}",
-            f"{min(a['clearance_min'] for a in agents):.3f}",
-            f"{sum(a['effort_integral'] for a in agents):.0f}",
-        )
-    Console().print(table)
-    for result in results:
-        if result.failure is not None:
-            print(f"{result.key} failed: {result.failure}")

@@ -4,6 +4,7 @@ from typing import TypedDict
 
 import numpy as np
 
+from marlbc_mj.behaviors import clearances
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.scenarios import Scenario
 
@@ -43,14 +44,6 @@ class Metrics(TypedDict):
 
     agents: list[AgentMetrics]
     team: TeamMetrics
-
-
-def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-    """Distance to the nearest obstacle's surface [m] for positions (..., 2); infinite without obstacles."""
-    if not len(obstacles):
-        return np.full(positions.shape[:-1], np.inf)
-    gaps = np.linalg.norm(positions[..., None, :] - obstacles[:, :2], axis=-1) - obstacles[:, 2]
-    return np.asarray(gaps.min(axis=-1))
 
 
 def measure(trajectory: Trajectory) -> Metrics:

@@ -90,6 +90,7 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
         (["run", "--seed", "-1"], ("seed", "-1")),
         (["perf", "--rounds", "2"], ("rounds", "2")),
         (["bench", "--no-logs"], ("video", "logs")),
+        (["bench", "--seeds", "0"], ("seeds", "0")),
     ],
 )
 def test_wrong_settings_are_one_line(
@@ -121,6 +122,18 @@ def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.Captu
     summary = json.loads((tmp_path / "bench" / "summary.json").read_text())
     assert "agent 1, t = 1.31" in summary["methods"]["scripted+pd"]["failure"]
     assert "1.31" in (tmp_path / "bench" / "tables.md").read_text()
+
+
+def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:
+    """`bench --seeds` writes every method's draws, and medians with their intervals, and no log."""
+    quick = ["--supervisors", "scripted", "fsams", "--controllers", "pd", "--seeds", "3", "--no-figures"]
+    main(["bench", *quick, "--out", str(tmp_path / "out"), "--duration", "2.0"])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    team = summary["methods"]["fsams+pd"]["team"]
+    assert team["return_ci"][0] <= team["return"] <= team["return_ci"][1]
+    rows = (tmp_path / "out" / "episodes.csv").read_text().splitlines()
+    assert len(rows) == 1 + 2 * 3 * 4
+    assert not (tmp_path / "out" / "logs").exists()
 
 
 def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

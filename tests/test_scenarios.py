@@ -5,12 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from marlbc_mj.behaviors import Formation
+from marlbc_mj.behaviors import Formation, clearances
 from marlbc_mj.controllers import PD, SORLC
 from marlbc_mj.disturbances import make_disturbance
 from marlbc_mj.engine.world import World
 from marlbc_mj.errors import ConfigurationError, MarlbcError
-from marlbc_mj.metrics import clearances
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Obstacle, Perturbation, make_scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import make_supervisor

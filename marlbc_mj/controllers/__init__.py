@@ -8,15 +8,19 @@ from marlbc_mj.controllers.base import Controller, largest_stable_substep
 from marlbc_mj.controllers.homogeneous import FiniteTime, FixedTime
 from marlbc_mj.controllers.lqr import LQR
 from marlbc_mj.controllers.pd import PD
+from marlbc_mj.controllers.predefined_time import PredefinedTime
 from marlbc_mj.controllers.rlc import RLC
 from marlbc_mj.controllers.sorlc import SORLC
+from marlbc_mj.controllers.terminal_sliding import TerminalSliding
 from marlbc_mj.errors import unknown
 
-_UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR], str]] = {
+_UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR | TerminalSliding | PredefinedTime], str]] = {
     "rlc": (RLC, "single-agent RL controller: SORLC's networks, next to no damping, no limit"),
     "finite-time": (FiniteTime, "finite-time law, no limit, true drag known"),
     "fixed-time": (FixedTime, "fixed-time law, no limit, true drag known"),
     "lqr": (LQR, "Riccati gains of the paper's own cost, no limit, true drag known"),
+    "terminal-sliding": (TerminalSliding, "non-singular terminal sliding mode, no limit, true drag known"),
+    "predefined-time": (PredefinedTime, "nested predefined-time terms, no limit, true drag known"),
 }
 
 CONTROLLERS: dict[str, tuple[Callable[[], Controller], str]] = {
@@ -52,6 +56,8 @@ __all__ = [
     "Controller",
     "FiniteTime",
     "FixedTime",
+    "PredefinedTime",
+    "TerminalSliding",
     "largest_stable_substep",
     "make_controller",
 ]

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from marlbc_mj.behaviors import clearances
 from marlbc_mj.episode import Trajectory
-from marlbc_mj.metrics import clearances
 from marlbc_mj.orders import SEPARATOR
 from marlbc_mj.palette import command_color
 from marlbc_mj.report import plotting as pl

@@ -4,7 +4,10 @@ from collections.abc import Callable
 
 from marlbc_mj.errors import unknown
 from marlbc_mj.supervisors.base import Situation, Supervisor, situation
+from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.fsams import FSAMS
+from marlbc_mj.supervisors.mpcms import MPCMS
+from marlbc_mj.supervisors.oracle import Oracle
 from marlbc_mj.supervisors.scripted import Scripted
 
 SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
@@ -14,19 +17,33 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
         lambda: FSAMS(hysteresis=0.3, dwell=0.5),
         "the same with 0.3 m hysteresis and 0.5 s dwell: the fair baseline",
     ),
+    "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known that never violates"),
+    "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
+    "mpcms": (MPCMS, "model predictive: the cheapest order sequence over a 2 s horizon of the kinematic reference"),
 }
 """Factory and one line of description by name."""
 
 
-def make_supervisor(name: str) -> Supervisor:
-    """A supervisor with its default settings, by name.
+def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
+    """A supervisor with its default settings, by name; the oracle's schedule belongs to a ``controller``.
 
     Raises:
         ConfigurationError: unknown name.
     """
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, SUPERVISORS)
-    return SUPERVISORS[name][0]()
+    return Oracle(controller) if name == "oracle" else SUPERVISORS[name][0]()
 
 
-__all__ = ["FSAMS", "SUPERVISORS", "Scripted", "Situation", "Supervisor", "make_supervisor", "situation"]
+__all__ = [
+    "FMS",
+    "FSAMS",
+    "MPCMS",
+    "SUPERVISORS",
+    "Oracle",
+    "Scripted",
+    "Situation",
+    "Supervisor",
+    "make_supervisor",
+    "situation",
+]

@@ -1,0 +1,87 @@
+"""Predefined-time control: J. D. Sanchez-Torres, E. N. Sanchez, A. G. Loukianov, American Control Conference 2015, 5842-5846,
+and J. D. Sanchez-Torres et al., IMA Journal of Mathematical Control and Information 35, i1-i29, 2018.
+
+x' = -Phi(x; m, T), Phi = exp(|x|^m) sig(x)^(1 - m) / (m T), 0 < m <= 1, reaches zero within T from anywhere: its settling time
+T (1 - exp(-|x(0)|^m)) is bounded by T. For a second-order system two are nested: the velocity error is to follow
+-Phi(e_p; m, T_p), so sigma = e_v + Phi(e_p; m, T_p), and u = -f^ - Phi(sigma; m, T_s).
+
+Three departures keep it finite at the 96 m/s by which v_r jumps when an order switches, where exp(|x|^m) would not be: errors
+are measured in units of ``position_scale`` and ``velocity_scale``; the exponent stops at ``exponent_limit``; and below
+``layer`` (in those units) Phi goes on linearly, since sig(x)^(1 - m) has no largest gain near zero. The derivative of the inner
+term, singular at zero, is left out. So the bound T is the source's only between the two limits, and no theorem is claimed here.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.controllers.base import model_weight, require_gains
+from marlbc_mj.errors import ConfigurationError
+
+
+@laws.allocation_free
+def predefined(x, power, time, exponent_limit, layer):  # type: ignore[no-untyped-def]
+    """Phi(x) = exp(min(|x|^m, limit)) sig(x)^(1 - m) / (m T), linear through zero for |x| below the layer."""
+    size = abs(x) if abs(x) > layer else layer
+    exponent = size**power
+    if exponent > exponent_limit:
+        exponent = exponent_limit
+    return np.exp(exponent) * size ** (-power) * x / (power * time)
+
+
+@laws.controller
+def predefined_time(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
+    """u = -w f - b Phi(sigma / b; m, T_s), sigma = e_v + a Phi(e_p / a; m, T_p), then the limit; no state.
+
+    ``params`` = w, T_p [s], T_s [s], m, a [m], b [m/s], largest exponent, layer, limit [N].
+    """
+    power, top, layer = params[3], params[6], params[7]
+    for axis in range(2):
+        e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
+        sigma = e_v + params[4] * predefined(e_p / params[4], power, params[1], top, layer)
+        wish = -params[0] * drag[axis] - params[5] * predefined(sigma / params[5], power, params[2], top, layer)
+        force_out[axis] = laws.clip(wish, params[8])
+
+
+@dataclass(frozen=True)
+class PredefinedTime:
+    """Nested predefined-time terms; gains chosen on the case study, not taken from a source."""
+
+    position_time: float = 2.0  # T_p [s]
+    velocity_time: float = 0.5  # T_s [s]
+    power: float = 0.3  # m of both terms
+    position_scale: float = 12.0  # a [m]: the longest way between two slots
+    velocity_scale: float = 96.0  # b [m/s]: the largest jump of v_r
+    exponent_limit: float = 1.5  # beyond it Phi grows as sig(x)^(1 - m)
+    layer: float = 1e-3  # relative error below which Phi is linear
+    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    limited: bool = False
+    law = staticmethod(predefined_time)
+
+    def __post_init__(self) -> None:
+        model_weight(self.model)
+        positive = ("position_time", "velocity_time", "position_scale", "velocity_scale", "exponent_limit", "layer")
+        require_gains(self, positive)
+        if not 0.0 < self.power <= 1.0:
+            raise ConfigurationError(f"PredefinedTime.power must be above 0 and at most 1, got {self.power}")
+
+    @property
+    def linear_gains(self) -> tuple[float, float]:
+        """Slopes of the outer term and of both, nested, in the linear layer, where they are largest."""
+        outer, inner = self._slope(self.velocity_time), self._slope(self.position_time)
+        return outer * inner, outer
+
+    def _slope(self, time: float) -> float:
+        """Largest of Phi(x) / x: exp(x^m) / (m T x^m) falls until x^m = 1, and the exponent's limit bounds what follows."""
+        at = self.layer**self.power
+        end = max(self.exponent_limit, at)
+        return float(max(np.exp(min(at, end)) / at, np.exp(end) / end) / (self.power * time))
+
+    def params(self, agent: int, limit: float) -> tuple[float, ...]:
+        scales = self.position_scale, self.velocity_scale, self.exponent_limit, self.layer, limit
+        return model_weight(self.model), self.position_time, self.velocity_time, self.power, *scales
+
+    def initial_state(self, agent: int) -> np.ndarray:
+        return np.zeros(0)

@@ -1,0 +1,64 @@
+"""Non-singular terminal sliding-mode control: Y. Feng, X. Yu, Z. Man, Automatica 38(12), 2159-2167, 2002, equations (8), (9).
+
+Axis by axis s = e_p + (1/beta) sig(e_v)^gamma with 1 < gamma = p/q < 2, and u = -f^ - (beta/gamma) sig(e_v)^(2 - gamma)
+- k sat(s/phi): on s = 0 the error reaches zero in finite time, and no power of the law is negative, so it has no singularity. The
+sign function of the original is a saturation with boundary layer phi, as usual, since it would chatter in sampled time.
+
+As gamma > 1, s is blind to small velocity errors: inside the layer the damping is (beta/gamma) |e_v|^(1 - gamma) alone, which
+grows without bound near zero, so a sampled loop ends in a small limit cycle instead of exactly at zero.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.controllers.base import model_weight, require_gains
+from marlbc_mj.controllers.homogeneous import sig
+from marlbc_mj.errors import ConfigurationError
+
+
+@laws.controller
+def terminal_sliding(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
+    """u = -w f - (beta/gamma) sig(e_v)^(2 - gamma) - k sat(s/phi), s = e_p + sig(e_v)^gamma / beta, then the limit; no state.
+
+    ``params`` = w, beta, gamma, k [N], phi [m], limit [N].
+    """
+    beta, gamma = params[1], params[2]
+    for axis in range(2):
+        e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
+        s = e_p + sig(e_v, gamma) / beta
+        wish = -params[0] * drag[axis] - beta / gamma * sig(e_v, 2.0 - gamma) - params[3] * laws.clip(s / params[4], 1.0)
+        force_out[axis] = laws.clip(wish, params[5])
+
+
+@dataclass(frozen=True)
+class TerminalSliding:
+    """The textbook law with a boundary layer; gains chosen on the case study, not taken from a source."""
+
+    surface_gain: float = 4.0  # beta
+    power: float = 1.25  # gamma = p/q
+    reaching_gain: float = 150.0  # k [N]
+    boundary_layer: float = 1.0  # phi [m]
+    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    limited: bool = False
+    law = staticmethod(terminal_sliding)
+
+    def __post_init__(self) -> None:
+        model_weight(self.model)
+        require_gains(self, ("surface_gain", "reaching_gain", "boundary_layer"))
+        if not 1.0 < self.power < 2.0:
+            raise ConfigurationError(f"TerminalSliding.power must be between 1 and 2, both excluded, got {self.power}")
+
+    @property
+    def linear_gains(self) -> None:
+        """Unbounded near zero: powers below 1 have no largest gain."""
+        return
+
+    def params(self, agent: int, limit: float) -> tuple[float, ...]:
+        gains = self.surface_gain, self.power, self.reaching_gain, self.boundary_layer
+        return model_weight(self.model), *gains, limit
+
+    def initial_state(self, agent: int) -> np.ndarray:
+        return np.zeros(0)

@@ -1,0 +1,315 @@
+"""Every method on the same draws around a scenario, and the statistics of it. Keeps scalars only, so memory stays flat."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from multiprocessing import get_context
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Trajectory, run_episode
+from marlbc_mj.errors import ConfigurationError, SimulationError
+from marlbc_mj.metrics import Metrics, measure
+from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS, method_key
+from marlbc_mj.scenarios import Perturbation, Scenario
+from marlbc_mj.statistics import Estimate, Statistic, bootstrap, iqm, mean, median, paired_improvement, rate
+from marlbc_mj.supervisors import make_supervisor
+
+CASE_STUDY_PERTURBATION = Perturbation(start_spread=1.0, obstacle_spread=0.5, drag_scale=(0.0, 2.0))
+"""Starts within 1 m, obstacles within 0.5 m per axis, drag from none to twice the printed: for scenarios that name no own.
+
+A slot of the case study passes its points at 1 m and the gate is 8 m wide, so 0.5 m moves when a supervisor has to act, not
+whether the mission can be done. A schedule fixed in time may violate then; that is an outcome.
+"""
+
+STUCK = 0.1
+"""A limited law whose force is at its limit throughout this last share of an episode has failed: saturated forever."""
+
+Progress = Callable[[str, float, float], None]
+
+
+class Instance(NamedTuple):
+    """What a seed drew: one instance of the scenario, the same for every method."""
+
+    starts: np.ndarray  # (N, 2) [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
+    disturbance_scale: float  # the scenario's, times the draw
+
+
+@dataclass(frozen=True)
+class SeedRun:
+    """One episode's scalars, or the reason why there are none."""
+
+    seed: int
+    instance: Instance
+    metrics: Metrics | None = None
+    failure: str | None = None
+
+    @property
+    def violated(self) -> bool:
+        """Whether any agent came within the safe distance; a run that failed counts as one that did."""
+        return self.metrics is None or any(agent["violation_time"] > 0.0 for agent in self.metrics["agents"])
+
+
+@dataclass(frozen=True)
+class MethodRuns:
+    """One method on every seed, in the order of the seeds."""
+
+    supervisor: str
+    controller: str
+    runs: tuple[SeedRun, ...]
+
+    @property
+    def key(self) -> str:
+        """The method's name in every file."""
+        return method_key(self.supervisor, self.controller)
+
+    @property
+    def failed(self) -> tuple[SeedRun, ...]:
+        """The runs that failed."""
+        return tuple(run for run in self.runs if run.metrics is None)
+
+    def values(self, read: Callable[[Metrics], float], failure: float | None = None) -> np.ndarray:
+        """One scalar of every run; a failed run is left out, or is ``failure`` where that is given."""
+        numbers = (failure if run.metrics is None else float(read(run.metrics)) for run in self.runs)
+        return np.array([number for number in numbers if number is not None], dtype=float)
+
+
+@dataclass(frozen=True)
+class SeedResults:
+    """The whole matrix."""
+
+    scenario: Scenario  # with the perturbation that was drawn from
+    seeds: tuple[int, ...]
+    methods: tuple[MethodRuns, ...]
+    reference: str  # the method that others are compared with
+
+
+def seed_range(count: int, first: int = 0) -> tuple[int, ...]:
+    """``count`` seeds from ``first`` on.
+
+    Raises:
+        ConfigurationError: fewer than one, or a negative seed.
+    """
+    if count < 1:
+        raise ConfigurationError(f"seeds must be at least 1, got {count}")
+    if first < 0:
+        raise ConfigurationError(f"seed must not be negative, got {first}")
+    return tuple(range(first, first + count))
+
+
+def perturbed(scenario: Scenario) -> Scenario:
+    """The scenario, with the case study's perturbation if it has none of its own."""
+    if scenario.perturbation != Perturbation():
+        return scenario
+    return replace(scenario, perturbation=CASE_STUDY_PERTURBATION)
+
+
+def run_seeds(
+    scenario: Scenario,
+    supervisors: Sequence[str],
+    controllers: Sequence[str],
+    seeds: Sequence[int],
+    progress: Progress | None = None,
+    *,
+    reference: str | None = None,
+    workers: int = 1,
+) -> SeedResults:
+    """Run every supervisor with every controller on every seed; one world per method is reset from seed to seed.
+
+    A run that fails is kept with its reason. What a method does depends on neither the other methods nor their order.
+
+    Args:
+        scenario: drawn from as :func:`perturbed` says.
+        progress: called with the method, how many seeds of it are done and how many there are.
+        reference: the key of the method that others are compared with; by default the first.
+        workers: processes that share the methods; decision times are best measured with one.
+
+    Raises:
+        ConfigurationError: names, seeds or a supervisor that does not suit the scenario; nothing has been run then.
+    """
+    scenario, methods = perturbed(scenario), list(product(supervisors, controllers))
+    keys = [method_key(*method) for method in methods]
+    _check(keys, seeds, workers)
+    if reference is not None and reference not in keys:
+        raise ConfigurationError(f"reference method {reference!r} is not run; choose from: {', '.join(keys)}")
+    for supervisor, controller in methods:
+        make_supervisor(supervisor, controller).start(scenario)
+    for controller in controllers:
+        World(scenario, make_controller(controller))
+    say = progress or (lambda what, done, total: None)
+    results = _run_all(scenario, methods, tuple(seeds), say, workers)
+    return SeedResults(scenario, tuple(seeds), results, reference or keys[0])
+
+
+def _check(keys: Sequence[str], seeds: Sequence[int], workers: int) -> None:
+    if not keys:
+        raise ConfigurationError("name at least one supervisor and one controller")
+    if len(set(keys)) != len(keys):
+        raise ConfigurationError(f"a method is named twice: {', '.join(keys)}")
+    if not len(seeds):
+        raise ConfigurationError("name at least one seed")
+    if len(set(seeds)) != len(seeds) or min(seeds) < 0:
+        raise ConfigurationError(f"seeds must differ and not be negative, got {list(seeds)}")
+    if workers < 1:
+        raise ConfigurationError(f"workers must be at least 1, got {workers}")
+
+
+def _run_all(
+    scenario: Scenario, methods: Sequence[tuple[str, str]], seeds: tuple[int, ...], say: Progress, workers: int
+) -> tuple[MethodRuns, ...]:
+    if workers == 1:
+        return tuple(run_method(scenario, supervisor, controller, seeds, say) for supervisor, controller in methods)
+    results = []
+    with ProcessPoolExecutor(min(workers, len(methods)), mp_context=get_context("spawn")) as pool:
+        run = partial(run_method, scenario, seeds=seeds)
+        for method in pool.map(run, *zip(*methods, strict=True)):
+            results.append(method)
+            say(method.key, len(seeds), len(seeds))
+    return tuple(results)
+
+
+def run_method(
+    scenario: Scenario, supervisor: str, controller: str, seeds: Sequence[int], say: Progress | None = None
+) -> MethodRuns:
+    """One method on every seed."""
+    law = make_controller(controller)
+    world = World(scenario, law, record=True)
+    runs = []
+    for done, seed in enumerate(seeds):
+        runs.append(run_seed(world, law, supervisor, controller, seed))
+        if say is not None:
+            say(method_key(supervisor, controller), done + 1, len(seeds))
+    return MethodRuns(supervisor, controller, tuple(runs))
+
+
+def run_seed(world: World, law: Controller, supervisor: str, controller: str, seed: int) -> SeedRun:
+    """One episode in a world made with ``record=True``; its trajectory is measured and let go."""
+    world.reset(seed)
+    state = world.state
+    instance = Instance(state.position[0].copy(), state.obstacles[0].copy(), float(state.disturbance_params[0, 0]))
+    try:
+        trajectory = run_episode(world, make_supervisor(supervisor, controller), seed=seed, names=(supervisor, controller))
+        if law.limited:
+            _check_free(trajectory)
+        return SeedRun(seed, instance, metrics=measure(trajectory))
+    except SimulationError as error:
+        return SeedRun(seed, instance, failure=str(error))
+
+
+def _check_free(trajectory: Trajectory) -> None:
+    """Raise SimulationError for an agent that was at its force limit throughout the end of the episode."""
+    scenario = trajectory.scenario
+    last = max(1, round(STUCK * len(trajectory.force)))
+    at_limit = (np.abs(trajectory.force[-last:]) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).all(axis=0)
+    if at_limit.any():
+        agents = ", ".join(str(i + 1) for i in np.flatnonzero(at_limit))
+        raise SimulationError(
+            f"saturated forever: agent {agents} at the force limit of {scenario.force_limit:g} N "
+            f"throughout the last {last * scenario.substep:g} s"
+        )
+
+
+class Score(NamedTuple):
+    """One number that sums up a whole team's episode."""
+
+    group: str  # first line of a header
+    label: str  # second line, with the unit
+    digits: int
+    read: Callable[[Metrics], float]
+
+
+SCORES = {
+    "return": Score("return", "sum", 0, lambda m: m["team"]["return"]),
+    "violation_time": Score("violation", "worst [s]", 2, lambda m: max(a["violation_time"] for a in m["agents"])),
+    "clearance": Score("clearance", "least [m]", 2, lambda m: min(a["clearance_min"] for a in m["agents"])),
+    "agent_distance": Score("distance", "least [m]", 2, lambda m: m["team"]["agent_distance_min"]),
+    "formation_error": Score("formation", "mean [m]", 2, lambda m: m["team"]["formation_error"]),
+    "effort": Score("effort", "sum [N s]", 0, lambda m: sum(a["effort_integral"] for a in m["agents"])),
+    "cost": Score("cost", "sum [10⁴]", 1, lambda m: 1e-4 * sum(a["cost_integral"] for a in m["agents"])),
+    "saturation_duty": Score("at limit", "worst [%]", 1, lambda m: 100 * max(a["saturation_duty"] for a in m["agents"])),
+}
+"""Worst, least, mean and sum are over agents."""
+
+_GROUP_SCORES = ("return", "violation_time")
+
+
+@dataclass(frozen=True)
+class MethodStatistics:
+    """What the tables, the files and the figure say about one method; estimates are over the runs that finished."""
+
+    runs: MethodRuns
+    agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS
+    team: Mapping[str, Estimate]  # medians of TEAM_KEYS
+    medians: Mapping[str, Estimate]  # of SCORES
+    iqms: Mapping[str, Estimate]  # of SCORES
+    violation: Estimate  # rate of runs with a violation or a failure, Wilson's interval
+    improvement: Estimate  # probability of a higher return than the reference's on the same draw; a failure loses
+
+
+@dataclass(frozen=True)
+class GroupStatistics:
+    """One supervisor over all controllers, or the reverse: each method is a stratum, draws are common to all of them."""
+
+    name: str
+    methods: int
+    draws: int  # on which all of them finished
+    iqms: Mapping[str, Estimate]  # of return and violation_time
+    violation: Estimate  # rate over all their runs
+
+
+def analyse(results: SeedResults) -> list[MethodStatistics]:
+    """Statistics of every method, in their order."""
+    reference = next(method for method in results.methods if method.key == results.reference)
+    against = reference.values(SCORES["return"].read, failure=-np.inf)
+    return [_method_statistics(method, results.scenario.agents, against) for method in results.methods]
+
+
+def _method_statistics(method: MethodRuns, agents: int, against: np.ndarray) -> MethodStatistics:
+    def over(read: Callable[[Metrics], Any], statistic: Statistic = median) -> Estimate:
+        return bootstrap([method.values(read)], statistic)
+
+    return MethodStatistics(
+        method,
+        tuple({key: over(lambda m, i=i, key=key: m["agents"][i][key]) for key in AGENT_KEYS} for i in range(agents)),  # type: ignore[misc]
+        {key: over(lambda m, key=key: m["team"][key]) for key in TEAM_KEYS},  # type: ignore[misc]
+        {name: over(score.read) for name, score in SCORES.items()},
+        {name: over(score.read, iqm) for name, score in SCORES.items()},
+        rate([run.violated for run in method.runs]),
+        paired_improvement(method.values(SCORES["return"].read, failure=-np.inf), against),
+    )
+
+
+def group(results: SeedResults, by: Callable[[MethodRuns], str]) -> list[GroupStatistics]:
+    """Statistics of every supervisor or controller (``by``) that has more than one method."""
+    names = dict.fromkeys(map(by, results.methods))
+    members = {name: [method for method in results.methods if by(method) == name] for name in names}
+    return [_group_statistics(name, methods) for name, methods in members.items() if len(methods) > 1]
+
+
+def _group_statistics(name: str, methods: Sequence[MethodRuns]) -> GroupStatistics:
+    finished = np.array([[run.metrics is not None for run in method.runs] for method in methods]).all(axis=0)
+    strata = {k: [method.values(SCORES[k].read, failure=np.nan)[finished] for method in methods] for k in _GROUP_SCORES}
+    violated = [np.array([float(run.violated) for run in method.runs]) for method in methods]
+    return GroupStatistics(
+        name,
+        len(methods),
+        int(finished.sum()),
+        {key: bootstrap(values, iqm, joint=True) for key, values in strata.items()},
+        bootstrap(violated, mean, joint=True),
+    )
+
+
+def by_supervisor(method: MethodRuns) -> str:
+    """For :func:`group`."""
+    return method.supervisor
+
+
+def by_controller(method: MethodRuns) -> str:
+    """For :func:`group`."""
+    return method.controller

@@ -1,0 +1,93 @@
+"""FMS, the fuzzy mission supervisor (after Marino et al. 2009): a zero-order Sugeno rule base on each agent's own clearance.
+
+Reconstructed: the source prints neither its sets nor its rules. Chosen here are the product as "and", a keep rule that speaks
+for the order in force, and the clearance rate from two successive mission steps.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.base import Situation
+
+_FM, _FR, _OA = 0, 1, 2
+
+
+class Membership(NamedTuple):
+    """Degrees in [0, 1] to which each agent's clearance x = d / d_OA and its rate d' belong to the fuzzy sets."""
+
+    near: np.ndarray  # (N,) trapezoid (0, 0, 1, 1.3) of x, 1 inside an obstacle
+    mid: np.ndarray  # (N,) trapezoid (1, 1.3, 2, 2.6)
+    far: np.ndarray  # (N,) trapezoid (2, 2.6, inf, inf)
+    closing: np.ndarray  # (N,) 1 / (1 + exp(2 d')), d' in m/s
+    opening: np.ndarray  # (N,) 1 / (1 + exp(-2 d')) = 1 - closing
+
+
+def memberships(clearance: np.ndarray, rate: np.ndarray, safe_distance: float) -> Membership:
+    """Fuzzy sets of FMS; near + mid + far = 1 and closing + opening = 1.
+
+    Args:
+        clearance: (N,) d [m], infinite without obstacles.
+        rate: (N,) d' [m/s].
+        safe_distance: d_OA [m].
+    """
+    x = np.asarray(clearance) / safe_distance
+    near = np.clip((1.3 - x) / 0.3, 0.0, 1.0)
+    far = np.clip((x - 2.0) / 0.6, 0.0, 1.0)
+    opening = 0.5 * (1.0 + np.tanh(np.asarray(rate)))  # the logistic function of 2 d', without its overflow
+    return Membership(near, 1.0 - near - far, far, 1.0 - opening, opening)
+
+
+class FuzzyMemory(NamedTuple):
+    """One team between two mission steps."""
+
+    state: np.ndarray  # (N,) 0: FM, 1: FR, 2: OA on top
+    clearance: np.ndarray | None  # (N,) at the mission step before [m]
+    orders: np.ndarray  # (3,) the order of each state
+    safe_distance: float  # [m]
+    mission_step: float  # [s]
+
+
+@dataclass(frozen=True)
+class FMS:
+    """near -> OA on top; mid and closing -> FR; mid and opening -> keep; far -> FM.
+
+    An agent switches when the strongest rule leads that of its order in force by ``lead``. The first mission step has no rate:
+    d' = 0.
+    """
+
+    lead: float = 0.1  # firing strength, which lies in [0, 1]
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.lead <= 1:
+            raise ConfigurationError(f"FMS lead must be between 0 and 1, got {self.lead}")
+
+    def start(self, scenario: Scenario) -> FuzzyMemory:
+        """Every agent in formation."""
+        orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
+        state = np.zeros(scenario.agents, dtype=np.int64)
+        return FuzzyMemory(state, None, orders, scenario.safe_distance, scenario.mission_step)
+
+    def decide(self, situation: Situation, memory: FuzzyMemory) -> tuple[np.ndarray, FuzzyMemory]:
+        """One rule base per agent, on its own clearance."""
+        clearance = situation.clearance
+        sets = memberships(clearance, _rate(clearance, memory), memory.safe_distance)
+        strength = np.stack([sets.far, sets.mid * sets.closing, sets.near])  # (3, N) by state
+        agents = np.arange(len(clearance))
+        strength[memory.state, agents] += sets.mid * sets.opening
+        winner = strength.argmax(axis=0)
+        ahead = strength[winner, agents] - strength[memory.state, agents]
+        state = np.where((ahead >= self.lead) & (winner != memory.state), winner, memory.state)
+        return memory.orders[state], memory._replace(state=state, clearance=clearance.copy())
+
+
+def _rate(clearance: np.ndarray, memory: FuzzyMemory) -> np.ndarray:
+    """(N,) clearance rate [m/s], 0 where there is no earlier clearance or no obstacle."""
+    if memory.clearance is None:
+        return np.zeros(len(clearance))
+    known = np.isfinite(clearance) & np.isfinite(memory.clearance)
+    change = np.subtract(clearance, memory.clearance, out=np.zeros(len(clearance)), where=known)
+    return np.asarray(change / memory.mission_step)

@@ -1,0 +1,291 @@
+"""The oracle: switch times found by search on the simulator itself, for one scenario under one controller.
+
+It is the reference that every supervisor's regret is measured by: it knows the future, never violates the safe distance at any
+substep, and within that has the highest return (13) that the search found. Schedules are cached with seed and budget.
+
+The search is an evolution strategy on the table of commands (mission steps, agents). Changes of command come in clusters, and the
+rewards between two clusters depend on the first of them only, nearly; so every candidate mutates all segments at once, and the
+next incumbent is put together from the best segment of each. What counts is its own simulation, never the sum.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.behaviors import clearances
+from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.files import write_json
+from marlbc_mj.provenance import config_hash, versions
+from marlbc_mj.scenarios import Perturbation, Scenario, Window
+from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.supervisors.scripted import Scripted
+
+POPULATION = 64  # candidates simulated at a time
+APART = 4.0  # [s] changes of command further apart than this are in different segments
+LEAD = 1.0  # [s] a segment begins this long before its first change
+MEAN_SHIFT = 4.0  # [mission steps] by which a mutation moves a change of command
+MEAN_RUN = 5.0  # [mission steps] for which a mutation holds a new command
+SPREAD = 1.5  # [s] standard deviation of a new command's start around a change
+
+
+class Found(NamedTuple):
+    """A schedule and how it was found: one entry of the cache."""
+
+    windows: tuple[Window, ...]
+    total: float  # the return
+    scripted: float | None  # the return of the scenario's own schedule; None if that violates
+    seed: int
+    budget: int  # episodes allowed
+    episodes: int  # episodes simulated
+    start: tuple[Window, ...] | None = None  # where the search started; None: at the scenario's own schedule
+
+
+class Evaluation(NamedTuple):
+    """Candidates' episodes."""
+
+    reward: np.ndarray  # (B, M)
+    violated: np.ndarray  # (B, M) bool: d <= d_OA for any agent after any substep of the mission step
+
+
+def shipped() -> Path:
+    """The cache that comes with the package."""
+    return Path(str(files("marlbc_mj") / "supervisors" / "oracle_schedules.json"))
+
+
+def cache_key(scenario: Scenario, controller: Controller) -> str:
+    """Hash of all that decides a schedule's return; names, descriptions and the scripted schedule do not."""
+    bare = replace(scenario, name="", description="", schedule=())
+    return config_hash({"scenario": bare, "controller": controller})
+
+
+def read_cache(path: Path) -> dict[str, Any]:
+    """Entries by key; empty where there is no file yet.
+
+    Raises:
+        ConfigurationError: the file cannot be read.
+    """
+    try:
+        entries = json.loads(path.read_text()) if path.exists() else {}
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"cannot read the oracle's schedules {path}: {error}") from error
+    if not isinstance(entries, dict):
+        raise ConfigurationError(f"{path} does not hold the oracle's schedules")
+    return entries
+
+
+def save(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
+    """Add a schedule to the cache (the shipped one by default), in the place of a former one with the same key."""
+    path = path or shipped()
+    entry = {"scenario": scenario.name, "controller": controller, **found._asdict(), "versions": versions()}
+    write_json(path, read_cache(path) | {cache_key(scenario, make_controller(controller)): entry})
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Plays the cached schedule of this scenario under this controller."""
+
+    controller: str = "sorlc"  # name of the controller that the schedule was found with
+    cache: Path | None = None  # None: the one that comes with the package
+
+    def start(self, scenario: Scenario) -> Any:
+        """Memory: the schedule's.
+
+        Raises:
+            ConfigurationError: no schedule was found yet for this scenario and controller.
+        """
+        return self.schedule(scenario).start(scenario)
+
+    def decide(self, situation: Situation, memory: Any) -> tuple[np.ndarray, Any]:
+        return Scripted().decide(situation, memory)
+
+    def schedule(self, scenario: Scenario) -> Scripted:
+        """The cached schedule as a scripted supervisor."""
+        entry = self.entry(scenario)
+        return Scripted(tuple(Window(*w) for w in entry["windows"]), scenario.formation_names[0])
+
+    def entry(self, scenario: Scenario) -> dict[str, Any]:
+        """The cache's entry: windows, total (return), seed, budget, episodes, versions."""
+        entries = read_cache(self.cache or shipped())
+        key = cache_key(scenario, make_controller(self.controller))
+        if key not in entries:
+            raise ConfigurationError(
+                f"the oracle has no schedule for scenario {scenario.name!r} under {self.controller!r} with these settings; "
+                f"find one with: marlbc oracle --scenario {scenario.name} --controller {self.controller}"
+            )
+        entry: dict[str, Any] = entries[key]
+        return entry
+
+
+def search(
+    scenario: Scenario,
+    controller: str = "sorlc",
+    *,
+    seed: int = 0,
+    budget: int = 4096,
+    population: int = POPULATION,
+    threads: int = 1,
+    start: tuple[Window, ...] | None = None,
+    progress: Callable[[int, float], None] | None = None,
+) -> Found:
+    """Find a safe schedule of high return. The same seed and budget give the same schedule, on any number of threads.
+
+    Args:
+        controller: name of the controller.
+        budget: episodes that may be simulated; rounded down to whole populations, at least one.
+        population: candidates simulated at a time.
+        start: schedule to start from; the scenario's by default.
+        progress: called with the episodes simulated so far and the best safe return (-inf before there is one).
+
+    Raises:
+        ConfigurationError: a perturbed scenario, no schedule to start from, too small a budget, or no safe schedule found.
+    """
+    if scenario.perturbation != Perturbation():
+        raise ConfigurationError("the oracle's schedule is for one draw; search on a scenario without perturbation")
+    if population < 2 or budget < population:
+        raise ConfigurationError(f"budget must be at least the population, and that at least 2, got {budget} and {population}")
+    world = World(scenario, make_controller(controller), worlds=population, threads=threads, record=True)
+    best = command_table(scenario, scenario.schedule if start is None else start)
+    rng = np.random.default_rng(seed)
+    hope = command_table(scenario, scenario.schedule or start or ())
+    best_score, scripted, episodes = (-np.inf, -np.inf), None, 0
+    while episodes + population <= budget:
+        tables = np.stack([hope, best, *(_mutate(best, scenario, rng) for _ in range(population - 2))])
+        result = evaluate(world, tables)
+        scores = [_score(result, b) for b in range(population)]
+        if episodes == 0 and not result.violated[0].any():
+            scripted = float(result.reward[0].sum())
+        winner = max(range(population), key=lambda b: scores[b])
+        hope = _assemble(tables, result, segments(best, scenario), 1)
+        if scores[winner] > best_score:
+            best, best_score = tables[winner], scores[winner]
+        episodes += population
+        if progress is not None:
+            progress(episodes, best_score[1] if best_score[0] == 0 else -np.inf)
+    if best_score[0] < 0:
+        raise ConfigurationError(f"no safe schedule found in {episodes} episodes; raise the budget")
+    return Found(windows_of(best, scenario), best_score[1], scripted, seed, budget, episodes, start)
+
+
+def evaluate(world: World, tables: np.ndarray) -> Evaluation:
+    """Simulate one episode per table of commands; ``tables`` (B, M, N), ``world`` with B worlds and ``record=True``."""
+    scenario, obstacles = world.scenario, world.state.obstacles[0]
+    orders = scenario.orders.representative[tables]
+    reward, violated = np.zeros(tables.shape[:2]), np.zeros(tables.shape[:2], dtype=bool)
+    world.reset(0)
+    for k in range(tables.shape[1]):
+        step = world.step(orders[:, k])
+        assert step.record is not None, "evaluate needs World(record=True)"
+        after = np.concatenate([step.record.position[:, 1:], step.observation.position[:, None]], axis=1)  # (B, substeps, N, 2)
+        reward[:, k] = step.reward
+        violated[:, k] = (clearances(after, obstacles) <= scenario.safe_distance).any(axis=(1, 2))
+    return Evaluation(reward, violated)
+
+
+def command_table(scenario: Scenario, windows: tuple[Window, ...]) -> np.ndarray:
+    """(M, N) index into ``scenario.orders.commands`` at every mission step, as the scripted supervisor gives them."""
+    script = Scripted(windows, scenario.formation_names[0])
+    memory = script.start(scenario)
+    nothing = np.zeros(0)
+    rows = []
+    for k in range(scenario.mission_steps):
+        now = Situation(k, k * scenario.mission_step, nothing, nothing, nothing, 0, nothing, nothing)
+        rows.append(scenario.orders.command_of[script.decide(now, memory)[0]])
+    return np.array(rows)
+
+
+def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:
+    """The schedule that gives this table, default outside: bounds halfway between mission steps, -1 where all agents agree."""
+    default = scenario.orders.commands.index(scenario.formation_names[0])
+    runs: dict[tuple[int, int, int], list[int]] = {}
+    for i in range(scenario.agents):
+        for first, last, command in _runs(table[:, i]):
+            if command != default:
+                runs.setdefault((first, last, command), []).append(i)
+    windows = []
+    for (first, last, command), agents in sorted(runs.items()):
+        bounds = (round((k - 0.5) * scenario.mission_step, 9) for k in (first, last))
+        start, end = bounds
+        for agent in [-1] if len(agents) == scenario.agents else agents:
+            windows.append(Window(start, end, agent, scenario.orders.commands[command]))
+    return tuple(windows) or (Window(0.0, 0.0, -1, scenario.formation_names[0]),)
+
+
+def segments(table: np.ndarray, scenario: Scenario) -> list[slice]:
+    """Mission steps cut shortly before every cluster of changes, so that what a cluster leads to is in its own segment."""
+    changes = np.flatnonzero((np.diff(table, axis=0) != 0).any(axis=1)) + 1
+    apart, lead = (round(t / scenario.mission_step) for t in (APART, LEAD))
+    firsts = [c for k, c in enumerate(changes) if k == 0 or c - changes[k - 1] > apart]
+    cuts = [0, *(int(c) - lead for c in firsts if c > lead), len(table)]
+    return [slice(a, b) for a, b in pairwise(cuts)]
+
+
+def _runs(commands: np.ndarray) -> list[tuple[int, int, int]]:
+    """(first, one past the last, command) of every stretch of equal commands (M,)."""
+    cuts = [0, *(np.flatnonzero(np.diff(commands)) + 1).tolist(), len(commands)]
+    return [(a, b, int(commands[a])) for a, b in pairwise(cuts)]
+
+
+def _score(result: Evaluation, b: int) -> tuple[float, float]:
+    """Safety first: minus the mission steps in violation, then the return."""
+    return -float(result.violated[b].sum()), float(result.reward[b].sum())
+
+
+def _assemble(tables: np.ndarray, result: Evaluation, cuts: list[slice], incumbent: int) -> np.ndarray:
+    """Every segment from the candidate that did best in it, the incumbent where none did better."""
+    table: np.ndarray = tables[incumbent].copy()
+    for cut in cuts:
+        score = result.reward[:, cut].sum(axis=1) - 1e6 * result.violated[:, cut].sum(axis=1)
+        if score.max() > score[incumbent]:
+            table[cut] = tables[int(score.argmax()), cut]
+    return table
+
+
+def _mutate(table: np.ndarray, scenario: Scenario, rng: np.random.Generator) -> np.ndarray:
+    """A copy with one or two mutations in most segments."""
+    table = table.copy()
+    for cut in segments(table, scenario):
+        for _ in range(rng.choice(3, p=(0.2, 0.5, 0.3))):
+            if rng.random() < 0.6:
+                _shift(table, cut, rng)
+            else:
+                _overwrite(table, cut, scenario, rng)
+    return table
+
+
+def _shift(table: np.ndarray, cut: slice, rng: np.random.Generator) -> None:
+    """Move a change of command within ``cut`` to another time, for one agent or for all that change with it."""
+    changed = np.diff(table[cut], axis=0) != 0
+    if not changed.any():
+        return
+    at = int(rng.choice(np.flatnonzero(changed.any(axis=1)))) + 1 + cut.start
+    movers = np.flatnonzero(changed[at - 1 - cut.start])
+    if rng.random() < 0.3:
+        movers = rng.choice(movers, 1)
+    to = int(np.clip(at + rng.choice((-1, 1)) * rng.geometric(1.0 / MEAN_SHIFT), cut.start + 1, cut.stop - 1))
+    for i in movers:
+        if to > at:
+            table[at:to, i] = table[at - 1, i]
+        else:
+            table[to:at, i] = table[at, i]
+
+
+def _overwrite(table: np.ndarray, cut: slice, scenario: Scenario, rng: np.random.Generator) -> None:
+    """Hold some command for a few steps, near a change or anywhere in ``cut``, for some agents or all."""
+    changes = np.flatnonzero((np.diff(table[cut], axis=0) != 0).any(axis=1)) + 1 + cut.start
+    if len(changes) and rng.random() < 0.9:
+        first = int(rng.normal(rng.choice(changes), SPREAD / scenario.mission_step))
+    else:
+        first = int(rng.integers(cut.start, cut.stop))
+    first = int(np.clip(first, cut.start, cut.stop - 1))
+    last = min(cut.stop, first + int(rng.geometric(1.0 / MEAN_RUN)))
+    who = rng.random(scenario.agents) < rng.choice((0.3, 1.0))
+    command = rng.integers(len(scenario.orders.commands)) if rng.random() < 0.5 else table[max(first - 1, 0)]
+    table[first:last, who] = np.broadcast_to(command, (scenario.agents,))[who]

@@ -1,0 +1,142 @@
+"""What candidate order sequences lead to: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
+
+Both predictions fill the same *trails* (C, H, N, 2): the position of every agent at the end of every predicted mission step, for
+each of C candidates. One cost judges them. Candidates are shared out over threads; results do not depend on how many.
+"""
+
+import numba
+import numpy as np
+
+from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.engine.loop import path_at, set_references
+from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.world import World
+from marlbc_mj.laws import allocation_free, compiled
+from marlbc_mj.supervisors.base import Situation
+
+SCRATCH = 9
+"""Rows of two that one candidate needs: desired path, what ``set_references`` asks for, and a normal."""
+
+
+@allocation_free
+def roll_out(  # type: ignore[no-untyped-def]
+    start, first, mission_step, orders, behavior_laws, behavior_params, table, path, obstacles, scratch, v_r, trail
+):
+    """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
+
+    Args:
+        start: (N, 2) [m] at mission step ``first``.
+        orders: (H, N) int64, indices into ``table``.
+        path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3).
+        scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
+        trail: (H, N, 2) [m], written in place.
+    """
+    now = scratch[:2]
+    before = start
+    for k in range(orders.shape[0]):
+        path_at((first + k) * mission_step, path, now)
+        set_references(
+            behavior_laws, behavior_params, table, orders[k], before, now, obstacles, scratch[2:7], v_r
+        )  # fmt: skip
+        for i in range(start.shape[0]):
+            for axis in range(2):
+                trail[k, i, axis] = before[i, axis] + mission_step * v_r[i, axis]
+        before = trail[k]
+
+
+@allocation_free
+def trail_cost(trail, first, mission_step, path, formations, obstacles, weights, scratch):  # type: ignore[no-untyped-def]
+    """Sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
+
+    Slots are those of the desired centroid. ``weights`` (5,): w_F, w_R, w_slack [1/m], d_min [m], scale [m];
+    ``formations`` (2, N, 2) [m]; ``scratch`` (SCRATCH, 2).
+    """
+    now, normal = scratch[:2], scratch[7]
+    cost = 0.0
+    for k in range(trail.shape[0]):
+        path_at((first + k + 1) * mission_step, path, now)
+        for i in range(trail.shape[1]):
+            for which in range(2):
+                x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
+                y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
+                cost += weights[which] * min(1.0, np.sqrt(x * x + y * y) / weights[4])
+            cost += weights[2] * max(0.0, weights[3] - nearest_obstacle(trail[k, i], obstacles, normal))
+    return cost
+
+
+@allocation_free
+def judge_candidate(  # type: ignore[no-untyped-def]
+    c, kinematic, start, first, mission_step, orders, behavior_laws, behavior_params, table, path, formations, obstacles,
+    weights, scratch, v_r, trails, costs,
+):  # fmt: skip
+    """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
+    if kinematic:
+        roll_out(
+            start, first, mission_step, orders[c], behavior_laws, behavior_params, table, path, obstacles, scratch[c], v_r[c],
+            trails[c],
+        )  # fmt: skip
+    costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, weights, scratch[c])
+
+
+@compiled
+def judge_serial(candidates, *args):  # type: ignore[no-untyped-def]
+    """:func:`judge_candidate` of every candidate, one after the other."""
+    for c in range(candidates):
+        judge_candidate(c, *args)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def judge_parallel(candidates, *args):  # type: ignore[no-untyped-def]
+    """:func:`judge_candidate` of every candidate, shared out over numba's threads; the same numbers as in series."""
+    for c in numba.prange(candidates):
+        judge_candidate(c, *args)
+
+
+def judge(
+    plan: Plan, start: np.ndarray, first: int, orders: np.ndarray, obstacles: np.ndarray, weights: np.ndarray, *,
+    threads: int = 1, trails: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) from positions ``start`` (N, 2) at step ``first``.
+
+    ``weights`` as in :func:`trail_cost`; ``trails`` given are judged as they are, else the kinematic reference is rolled out.
+    """
+    candidates, scenario = len(orders), plan.scenario
+    kinematic = trails is None
+    if trails is None:
+        trails = np.empty((*orders.shape, 2))
+    costs = np.empty(candidates)
+    arguments = (
+        kinematic, np.ascontiguousarray(start), first, scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params,
+        scenario.orders.table, plan.path, scenario.formations, obstacles, weights, np.zeros((candidates, SCRATCH, 2)),
+        np.zeros((candidates, scenario.agents, 2)), trails, costs,
+    )  # fmt: skip
+    if threads == 1 or candidates == 1:
+        judge_serial(candidates, *arguments)
+    else:
+        numba.set_num_threads(threads)
+        judge_parallel(candidates, *arguments)
+    return costs, trails
+
+
+def follow(twin: World, situation: Situation) -> None:
+    """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
+    state, model = twin.state, twin.plan
+    state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
+    twin.data[0].qpos[model.indices[0]] = situation.position
+    twin.data[0].qvel[model.indices[1]] = situation.velocity
+
+
+def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:
+    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) through MuJoCo: measured positions, from the twin's state on.
+
+    ``worlds`` holds at least C worlds; those left over repeat the first candidate. A world that diverges stays where it did.
+    """
+    candidates, horizon = orders.shape[:2]
+    every = np.concatenate([orders, np.repeat(orders[:1], worlds.worlds - candidates, axis=0)])
+    for c in range(worlds.worlds):
+        worlds.copy_world(twin, 0, c)
+    trails = np.empty((*orders.shape, 2))
+    for k in range(horizon):
+        worlds.advance(np.ascontiguousarray(every[:, k]))
+        trails[:, k] = worlds.state.position[:candidates]
+    return trails

@@ -1,0 +1,193 @@
+"""MPCMS: its prediction is the mission's own reference, its cost is hand arithmetic, and it flies the case study."""
+
+import numpy as np
+import pytest
+
+from marlbc_mj.controllers import PD, SORLC
+from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.laws import plain
+from marlbc_mj.metrics import measure
+from marlbc_mj.scenarios import Perturbation, paper
+from marlbc_mj.supervisors import Situation, situation
+from marlbc_mj.supervisors.mpcms import MPCMS, Joint
+from marlbc_mj.supervisors.prediction import judge
+
+PAPER = paper()
+PLAN = make_plan(PAPER, SORLC())
+FM, FR, OA_FM, OA_FR = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM", "OA>FR"))
+FREE = np.array([1.0, 0.3, 0.0, 0.0, 0.5])  # weights without a clearance term
+
+
+def at(positions, step: int = 0, obstacles=None) -> Situation:
+    """A situation with the team at rest at ``positions``; clearance, formation and command are not read by MPCMS."""
+    positions = np.array(positions, dtype=float)
+    obstacles = PAPER.obstacle_array() if obstacles is None else np.array(obstacles, dtype=float).reshape(-1, 3)
+    unread = np.zeros(4), 0, np.zeros(4, dtype=np.int64)
+    return Situation(step, step * 0.05, positions, np.zeros((4, 2)), *unread, obstacles)
+
+
+def in_formation(step: int, which: int = 0) -> np.ndarray:
+    """(4, 2) slots of FM (0) or FR (1) at a mission step [m]."""
+    return np.array([-2.5 + 0.05 * step, 0.0]) + PAPER.formations[which]
+
+
+def decided(supervisor: MPCMS, now: Situation, joint: Joint | None = None) -> np.ndarray:
+    memory = supervisor.start(PAPER)
+    return supervisor.decide(now, memory._replace(joint=joint or memory.joint))[0]
+
+
+def test_the_prediction_is_the_worlds_reference():
+    """From the same p_r and orders, the kinematic trail is the ``virtual`` reference of World: FM, OA, FR and the start."""
+    horizon, rng = 40, np.random.default_rng(0)
+    orders = np.repeat(rng.choice([FM, FR, OA_FM, OA_FR], (5, 4)), 8, axis=0)
+    world = World(PAPER)
+    start, expected = world.state.reference[0].copy(), []
+    for k in range(horizon):
+        world.step(orders[k][None])
+        expected.append(world.state.reference[0].copy())
+    _, trails = judge(PLAN, start, 0, orders[None], PAPER.obstacle_array(), FREE)
+    np.testing.assert_allclose(trails[0], expected, rtol=0, atol=1e-11)
+
+
+def test_the_prediction_does_not_depend_on_the_number_of_threads():
+    rng = np.random.default_rng(1)
+    orders = rng.choice([FM, FR, OA_FM, OA_FR], (17, 40, 4))
+    one, two = (judge(PLAN, in_formation(1000), 1000, orders, PAPER.obstacle_array(), FREE, threads=t) for t in (1, 2))
+    np.testing.assert_array_equal(one[0], two[0])
+    np.testing.assert_array_equal(one[1], two[1])
+
+
+def test_the_cost_of_two_steps_by_hand():
+    """Two steps in formation, but agent 1 is half a tolerance off its slot in the first and 0.15 m too close in the second.
+
+    All four are far from the column: 2 · 4 · 0.3 + 0.5 + 10 000 · 0.15.
+    """
+    trail = np.stack([in_formation(1), in_formation(2)])
+    trail[0, 0, 0] -= 0.25
+    x, y = trail[1, 0]
+    obstacle = np.array([[x + 3.9, y, 2.0]])  # 1.9 m ahead in the second step, 2.2 m in the first
+    weights = np.array([1.0, 0.3, 1e4, 2.05, 0.5])
+    costs, _ = judge(PLAN, trail[0], 0, np.zeros((1, 2, 4), dtype=np.int64), obstacle, weights, trails=trail[None])
+    assert costs[0] == pytest.approx(2.4 + 0.5 + 1500.0, rel=1e-12)
+
+
+def test_a_free_path_is_held_in_formation_and_a_column_left():
+    """Nothing in the way: FM stays FM, FR becomes FM at once: w_F > w_R, and the gain outweighs one switch."""
+    open_field = at(in_formation(0), obstacles=[])
+    assert (decided(MPCMS(), open_field) == FM).all()
+    column = at(in_formation(0, 1), obstacles=[])
+    assert (decided(MPCMS(), column, Joint(1, (False,) * 4)) == FM).all()
+    assert (decided(MPCMS(w_switch=1e6), column, Joint(1, (False,) * 4)) == FR).all()
+
+
+def test_one_agents_obstacle_is_dodged_and_the_gate_makes_a_column():
+    """Point O1 just ahead of agent 1: OA for it alone; the discs just ahead of agents 1 and 2: FR for all."""
+    assert decided(MPCMS(), at(in_formation(362), 362)).tolist() == [OA_FM, FM, FM, FM]
+    assert (decided(MPCMS(), at(in_formation(1070), 1070)) == FR).all()
+
+
+def test_switching_is_put_off_while_the_path_is_clear():
+    """A second before the point comes within the safe distance, holding is still the best plan."""
+    assert (decided(MPCMS(), at(in_formation(340), 340)) == FM).all()
+
+
+def test_candidates_are_holding_and_every_change_at_every_instant():
+    """N = 4 in FM: hold + 8 instants · (FR or one of four agents' avoidance); pairs add six."""
+    free = Joint(0, (False,) * 4)
+    assert len(MPCMS()._candidates(PAPER, free).orders) == 1 + 8 * 5
+    assert len(MPCMS(together=2)._candidates(PAPER, free).orders) == 1 + 8 * 11
+    held = MPCMS(instants=(3,))._candidates(PAPER, Joint(1, (True, False, False, False)))
+    assert held.orders[0].tolist() == [[OA_FR, FR, FR, FR]] * 40
+    assert (held.orders[1:, :3] == held.orders[0, 0]).all()
+    last = {tuple(row) for row in held.orders[1:, 3].tolist()}
+    pairs = {(OA_FR, OA_FR, FR, FR), (OA_FR, FR, OA_FR, FR), (OA_FR, FR, FR, OA_FR)}
+    assert last == {(FM,) * 4, (FR,) * 4} | pairs
+    assert held.switches.tolist() == [0.0] + [1.0] * 5
+
+
+def test_the_case_study_without_violation_with_the_fewest_switches():
+    """What the project promises: no violation, switches at most 4/2/2/4, at least the scripted supervisor's 15 017."""
+    metrics = measure(run_episode(World(PAPER, record=True), MPCMS()))
+    assert [agent["violation_time"] for agent in metrics["agents"]] == [0.0] * 4
+    assert all(agent["switches"] <= most for agent, most in zip(metrics["agents"], (4, 2, 2, 4), strict=True))
+    assert metrics["team"]["return"] >= 15_017
+    assert metrics["team"]["decision_ms_median"] < 20.0
+
+
+def test_episodes_are_deterministic_and_the_memory_is_not_changed_by_a_decision():
+    first, second = (run_episode(World(paper(duration=22.0), record=True), MPCMS()) for _ in range(2))
+    assert (np.diff(first.command[:, 0]) != 0).sum() == 2
+    np.testing.assert_array_equal(first.command, second.command)
+    supervisor = MPCMS()
+    memory, now = supervisor.start(PAPER), at(in_formation(362), 362)
+    np.testing.assert_array_equal(supervisor.decide(now, memory)[0], supervisor.decide(now, memory)[0])
+
+
+def test_a_drawn_case_study_is_safe_too():
+    """Other starts, obstacles and drag, of which the prediction knows the obstacles: past both points and into the gate."""
+    scenario = paper(perturbation=Perturbation(1.0, 0.5, (0.0, 2.0)), duration=60.0)
+    metrics = measure(run_episode(World(scenario, record=True), MPCMS(), seed=1))
+    assert [agent["violation_time"] for agent in metrics["agents"]] == [0.0] * 4
+
+
+def test_without_a_feasible_candidate_the_least_violation_is_chosen():
+    """Agent 1 inside a disc: a decision all the same."""
+    positions = in_formation(1200)
+    positions[0] = 60.0, 9.0
+    assert decided(MPCMS(), at(positions, 1200)).shape == (4,)
+
+
+def test_both_starts_agree_while_the_reference_is_tracked():
+    """The first decision of an episode is the same, and its own copy of p_r is the world's."""
+    world, supervisor = World(PAPER), MPCMS(start_from="reference")
+    memory, observation = supervisor.start(PAPER), world.observe()
+    for _ in range(30):
+        orders, memory = supervisor.decide(situation(observation, PAPER.obstacle_array(), 0.05), memory)
+        observation = world.step(orders[None]).observation
+    np.testing.assert_allclose(memory.reference, world.state.reference[0], rtol=0, atol=1e-11)
+
+
+def test_mujoco_prediction_simulates_what_the_world_does():
+    """With the nominal drag the twin is the world: the chosen candidate's first position is what comes, to rounding."""
+    world, supervisor = World(PAPER), MPCMS(horizon=3, instants=(0,), prediction="mujoco")
+    memory, observation = supervisor.start(PAPER), world.observe()
+    for _ in range(20):
+        orders, memory = supervisor.decide(situation(observation, PAPER.obstacle_array(), 0.05), memory)
+        observation = world.step(orders[None]).observation
+        np.testing.assert_allclose(memory.reference, observation.position[0], rtol=0, atol=1e-12)
+
+
+def test_mujoco_prediction_needs_a_compiled_controller():
+    with pytest.raises(ConfigurationError, match="compiled"):
+        MPCMS(prediction="mujoco", controller=PythonPD()).start(PAPER)
+
+
+class PythonPD(PD):
+    """The PD law as plain Python."""
+
+    law = staticmethod(plain(PD.law))
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"horizon": -3}, "horizon must be a whole number, at least 1, got -3"),
+        ({"horizon": 0}, "horizon .* got 0"),
+        ({"instants": ()}, "candidate set is empty"),
+        ({"instants": (0, 40)}, r"between 0 and horizon - 1 = 39, got \(0, 40\)"),
+        ({"w_switch": -1.0}, "w_switch must be non-negative and finite, got -1.0"),
+        ({"w_formation": float("nan")}, "w_formation .* got nan"),
+        ({"slack": float("inf")}, "slack .* got inf"),
+        ({"margin": -0.1}, "margin .* got -0.1"),
+        ({"together": 0}, "together .* got 0"),
+        ({"threads": 1000}, "threads must be between 1 and .* got 1000"),
+        ({"prediction": "crystal"}, "unknown MPCMS prediction 'crystal'; choose from: kinematic, mujoco"),
+        ({"start_from": "slot"}, "unknown MPCMS start_from 'slot'"),
+    ],
+)
+def test_settings_that_cannot_be_run_are_refused(settings, message):
+    with pytest.raises(ConfigurationError, match=message):
+        MPCMS(**settings)
