@@ -595,3 +595,23 @@ def test_a_scenario_without_avoidance_runs():
     scenario = paper(behaviors=(fm, fr))
     assert scenario.orders.commands == ("FM", "FR")
     advance(World(scenario), 2, "FR")
+
+
+@pytest.mark.parametrize(("worlds", "threads"), [(1, 1), (3, 2)])
+def test_a_rollout_is_its_steps(worlds, threads):
+    """Orders known beforehand give, in one call, the states and returns of as many single steps, bit for bit."""
+    scenario = paper(duration=3.0, perturbation=Perturbation(start_spread=1.0))
+    orders = np.random.default_rng(5).integers(0, 6, (60, worlds, 4))
+    stepped, rolled = World(scenario, worlds=worlds), World(scenario, worlds=worlds, threads=threads)
+    total = sum(stepped.step(row).reward for row in orders)
+    np.testing.assert_array_equal(rolled.rollout(orders), total)
+    for one, other in zip(stepped.observe(), rolled.observe(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_rollout_that_diverges_or_is_no_order_says_so():
+    """The same errors as single steps: world, agent and time; the index that is no order."""
+    with pytest.raises(SimulationError, match=r"world 0, agent 1, t = 1\.310 s"):
+        World(paper(disturbance=PaperDrag(20.0))).rollout(np.full((60, 1, 4), 2))
+    with pytest.raises(ConfigurationError, match="from 0 to 5"):
+        World(paper()).rollout(np.full((2, 1, 4), 6))

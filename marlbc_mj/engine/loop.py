@@ -235,3 +235,32 @@ def step_parallel(worlds, *args):  # type: ignore[no-untyped-def]
     for b in numba.prange(worlds):
         failed += mission_step(b, *args)
     return failed
+
+
+@compiled
+def roll_out(b, sequence, orders, reward, *args):  # type: ignore[no-untyped-def]
+    """One mission step after the other of world ``b``, with the orders ``sequence`` (M, B, N); ``orders`` and ``reward`` are
+    the arrays inside ``args``. Returns the sum of rewards, up to the step that failed if one did.
+    """
+    total = 0.0
+    for m in range(sequence.shape[0]):
+        orders[b] = sequence[m, b]
+        failed = mission_step(b, *args)
+        if failed:
+            break
+        total += reward[b]
+    return total
+
+
+@compiled
+def rollout_serial(worlds, returns, *args):  # type: ignore[no-untyped-def]
+    """:func:`roll_out` of every world, one after the other."""
+    for b in range(worlds):
+        returns[b] = roll_out(b, *args)
+
+
+@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+def rollout_parallel(worlds, returns, *args):  # type: ignore[no-untyped-def]
+    """:func:`roll_out` of every world, worlds shared out over numba's threads; the same numbers as in series."""
+    for b in numba.prange(worlds):
+        returns[b] = roll_out(b, *args)

@@ -128,10 +128,40 @@ class World:
         orders = self._checked(orders)
         failed = self.advance(orders) if self.native else self._advance_in_python(orders)
         if failed:
-            b = int(np.flatnonzero(self._status)[0])
-            raise self.state.diverged(b, int(self._status[b]))
+            self._raise_if_diverged()
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
+
+    def rollout(self, orders: np.ndarray) -> np.ndarray:
+        """Many mission steps with orders known beforehand, in one compiled call: a schedule, or candidates of a search.
+
+        Args:
+            orders: (M, B, N) integers, indices into ``scenario.orders``.
+
+        Returns:
+            (B,) sum of rewards over the M mission steps; the state afterwards is as after M calls of :meth:`step`.
+
+        Raises:
+            ConfigurationError: wrong shape, an index that is no order, or a controller that is not compiled.
+            SimulationError: a number left the physical range or is NaN; names world, agent and time.
+        """
+        if not self.native:
+            raise ConfigurationError("rollout needs compiled laws; use step")
+        sequence = np.stack([self._checked(row) for row in np.asarray(orders)])
+        buffer, returns = np.zeros_like(sequence[0]), np.zeros(self.worlds)
+        args = (*self._fixed, self._addresses, *self.state.rows(buffer), self._status, self._record, self.state.scratch)
+        if self.threads == 1 or self.worlds == 1:
+            loop.rollout_serial(self.worlds, returns, sequence, buffer, self.state.reward, *args)
+        else:
+            numba.set_num_threads(self.threads)
+            loop.rollout_parallel(self.worlds, returns, sequence, buffer, self.state.reward, *args)
+        self._raise_if_diverged()
+        return returns
+
+    def _raise_if_diverged(self) -> None:
+        if self._status.any():
+            b = int(np.flatnonzero(self._status)[0])
+            raise self.state.diverged(b, int(self._status[b]))
 
     def advance(self, orders: np.ndarray) -> int:
         """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64: no checks, no copies; how many worlds failed."""
