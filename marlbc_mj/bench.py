@@ -110,7 +110,15 @@ def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
     }
 
 
-def run_method(scenario: Scenario, supervisor: str, controller: str, seed: int, folder: Path | None, say: Progress) -> Result:
+def run_method(
+    scenario: Scenario,
+    supervisor: str,
+    controller: str,
+    seed: int,
+    folder: Path | None,
+    say: Progress,
+    overwrite: bool = False,
+) -> Result:
     """One episode of one method, logged to ``folder/logs`` if there is a folder."""
     key = method_key(supervisor, controller)
     law = make_controller(controller)
@@ -127,7 +135,9 @@ def run_method(scenario: Scenario, supervisor: str, controller: str, seed: int, 
             trajectory = run_episode(world, chief, seed=seed, names=(supervisor, controller), on_frame=step_done)
         else:
             path = folder / "logs" / f"{key}.mcap"
-            with open_log(path, scenario, law, supervisor=supervisor, controller=controller, seed=seed) as log:
+            with open_log(
+                path, scenario, law, supervisor=supervisor, controller=controller, seed=seed, overwrite=overwrite
+            ) as log:
 
                 def record(frame: Frame) -> None:
                     log.write(frame)
@@ -200,7 +210,7 @@ def run_single(
     check_folder(out, overwrite=overwrite)
     make_supervisor(supervisor, controller).start(scenario)
     say = progress or (lambda what, done, total: None)
-    result = run_method(scenario, supervisor, controller, seed, out, say)
+    result = run_method(scenario, supervisor, controller, seed, out, say, overwrite)
     if result.metrics is None:
         raise SimulationError(result.failure)
     write_json(out / "config.json", _config(scenario, config))

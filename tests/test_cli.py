@@ -140,6 +140,9 @@ def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.Captur
     """And the log's commands: info, export, video; a truncated log is one line, and recover brings it back."""
     out = tmp_path / "run"
     main(["run", "--out", str(out), *SHORT])
+    capsys.readouterr()
+    assert "--overwrite" in refused(["run", "--out", str(out), *SHORT], capsys)
+    main(["run", "--out", str(out), *SHORT, "--overwrite"])
     log = out / "logs" / "scripted+sorlc.mcap"
     assert {p.name for p in out.iterdir()} == {"logs", "metrics.json", "config.json"}
     capsys.readouterr()
