@@ -30,7 +30,7 @@ class ScenarioOptions:
     drag_scale: float | None = None
     """Multiplies the disturbance."""
     force_limit: float | None = None
-    """Actuator limit per axis [N]."""
+    """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
     duration: float | None = None
     """Mission time [s]."""
 

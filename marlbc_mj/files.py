@@ -77,7 +77,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
     if path.is_dir():
         raise ConfigurationError(f"cannot write {path}: it is a folder")
     if path.exists() and not overwrite:
-        raise ConfigurationError(f"{path} exists; choose another name, or overwrite it")
+        raise ConfigurationError(f"{path} exists; choose another name or add --overwrite")
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -53,9 +53,25 @@ TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
 """A disturbance for every agent in turn: the arguments of :data:`DISTURBANCE`, one row an agent."""
 
 
+def _jit(function: Law, **options: Any) -> Law:
+    """Compile, and keep the result on disk where there is a place for it: not for a function typed at a prompt, nor without a
+    writable folder.
+    """
+    options = {"error_model": "numpy", "nogil": True, **options}
+    try:
+        return numba.njit(cache=True, **options)(function)  # type: ignore[no-any-return]
+    except RuntimeError:
+        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+
+
+def threaded(function: Law) -> Law:
+    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads."""
+    return _jit(function, parallel=True)
+
+
 def compiled(function: Law) -> Law:
     """Compile a helper: cached on disk, IEEE division, the GIL released."""
-    return numba.njit(cache=True, error_model="numpy", nogil=True)(function)  # type: ignore[no-any-return]
+    return _jit(function)
 
 
 def inlined(function: Law) -> Law:
@@ -77,13 +93,9 @@ def allocation_free(function: Law) -> Law:
     """Compile a law, or a helper that laws call: as :func:`compiled`, and without reference counting.
 
     Counting the arguments of one call costs more than the arithmetic of most laws. The price: the function cannot create arrays;
-    scratch belongs in a controller's ``state``. A function typed at a prompt has no file, and is compiled anew in every session.
+    scratch belongs in a controller's ``state``.
     """
-    options = {"error_model": "numpy", "nogil": True, "_nrt": False}
-    try:
-        return numba.njit(cache=True, **options)(function)  # type: ignore[no-any-return]
-    except RuntimeError:  # no file to keep the cache beside
-        return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    return _jit(function, _nrt=False)
 
 
 def _controller_team(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]

@@ -16,7 +16,7 @@ from marlbc_mj.engine.native import call_step, step_address
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, run_episode
 from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.laws import plain
+from marlbc_mj.laws import compiled, plain, threaded
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, paper
 from marlbc_mj.supervisors import Scripted, situation
@@ -33,7 +33,7 @@ class _PlainSORLC(SORLC):
     law = staticmethod(plain(SORLC.law))
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled
 def _bare_serial(step, model, data, substeps):  # type: ignore[no-untyped-def]
     """A mission step of bare physics: every world its substeps, one world after the other, as the closed loop does."""
     for b in range(data.shape[0]):
@@ -41,7 +41,7 @@ def _bare_serial(step, model, data, substeps):  # type: ignore[no-untyped-def]
             call_step(step, model, data[b])
 
 
-@numba.njit(cache=True, nogil=True, parallel=True)
+@threaded
 def _bare_parallel(step, model, data, substeps):  # type: ignore[no-untyped-def]
     for b in numba.prange(data.shape[0]):
         for _ in range(substeps):

@@ -14,7 +14,7 @@ from numba.extending import register_jitable
 
 from marlbc_mj.behaviors import nearest_obstacle
 from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
-from marlbc_mj.laws import allocation_free, compiled
+from marlbc_mj.laws import allocation_free, compiled, threaded
 from marlbc_mj.nullspace import add_behavior
 
 DIVERGED = 1e9
@@ -228,7 +228,7 @@ def step_serial(worlds, *args):  # type: ignore[no-untyped-def]
     return failed
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@threaded
 def step_parallel(worlds, *args):  # type: ignore[no-untyped-def]
     """:func:`mission_step` of every world, worlds shared out over numba's threads; the same numbers as in series."""
     failed = 0
@@ -259,7 +259,7 @@ def rollout_serial(worlds, returns, *args):  # type: ignore[no-untyped-def]
         returns[b] = roll_out(b, *args)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
+@threaded
 def rollout_parallel(worlds, returns, *args):  # type: ignore[no-untyped-def]
     """:func:`roll_out` of every world, worlds shared out over numba's threads; the same numbers as in series."""
     for b in numba.prange(worlds):

@@ -17,6 +17,7 @@ from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
 
 LEAST, MOST = 64, 4096  # pixels, either side
+MOST_SAMPLES = 16  # per pixel
 COLORS = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
 ENCODING = ["-vf", COLORS, "-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
 """Colors as players expect them of a high-definition picture, constant quality, and an index at the file's beginning."""
@@ -56,6 +57,8 @@ def render_video(
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise ConfigurationError(f"a video's name must end in .mp4, got {path.name!r}")
+    if not 0 <= samples <= MOST_SAMPLES:
+        raise ConfigurationError(f"samples must be from 0 to {MOST_SAMPLES}, got {samples}")
     times = frame_times(log, speed=speed, fps=fps, start=start, end=end)
     pictures = _frames(log, times, width=width, height=height, camera=camera, samples=samples, speed=speed)
     with staged_file(path, overwrite=overwrite) as partial, closing(pictures):

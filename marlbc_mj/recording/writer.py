@@ -218,7 +218,7 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
             raise ConfigurationError(f"cannot write {path}: {error.filename} is not a folder") from error
         raise ConfigurationError(
             f"{partial} exists: a run in progress, or a torn log that `marlbc log recover {partial} OUT` salvages; "
-            "choose another name, or overwrite it"
+            "choose another name or add --overwrite"
         ) from error
     except OSError as error:
         raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error

@@ -12,6 +12,7 @@ from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.orders import Orders
 
 Point = tuple[float, float]
+MOST_SUBSTEPS = 10_000  # in one mission step
 REFERENCE_MODES = ("virtual", "actual")
 
 
@@ -200,6 +201,10 @@ class Scenario:
                     )
 
     def _check_clocks(self) -> None:
+        if self.mission_step / self.substep > MOST_SUBSTEPS:
+            raise ConfigurationError(
+                f"substep {self.substep} s makes more than {MOST_SUBSTEPS} of a mission step of {self.mission_step} s"
+            )
         for long, short in (("mission_step", "substep"), ("duration", "mission_step")):
             ratio = getattr(self, long) / getattr(self, short)
             if ratio < 1 - 1e-9 or abs(ratio - round(ratio)) > 1e-9 * max(1.0, ratio):

@@ -116,9 +116,10 @@ class Oracle:
         entries = read_cache(self.cache or shipped())
         key = cache_key(scenario, make_controller(self.controller))
         if key not in entries:
+            command = f"marlbc oracle --scenario {scenario.name} --controller {self.controller}"
             raise ConfigurationError(
                 f"the oracle has no schedule for scenario {scenario.name!r} under {self.controller!r} with these settings; "
-                f"find one with: marlbc oracle --scenario {scenario.name} --controller {self.controller}"
+                f"for the scenario as it is named, find one with: {command}; for any other, with marlbc_mj.supervisors.oracle.search"
             )
         entry: dict[str, Any] = entries[key]
         return entry
