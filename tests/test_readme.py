@@ -1,25 +1,24 @@
 """What the README shows runs as shown."""
 
+import importlib
 import re
+import sys
 from pathlib import Path
+
+import pytest
 
 README = Path(__file__).parent.parent / "README.md"
 
 
-def test_python_blocks_run_in_order() -> None:
-    """Every Python block of the README runs, each with what the ones before it defined."""
+def test_python_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The README's Python blocks, one after the other as one module, run; the user's laws among them run compiled."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(blocks) >= 5
-    names: dict[str, object] = {"__name__": "readme"}
-    folder = README.parent / ".cache" / "readme"
-    folder.mkdir(parents=True, exist_ok=True)
-    for k, block in enumerate(blocks):
-        path = folder / f"block{k}.py"  # numba caches by file, so the blocks need one
-        if not path.exists() or path.read_text() != block:
-            path.write_text(block)
-        exec(compile(block, str(path), "exec"), names)
-    world = names["world"]
-    assert world.native  # type: ignore[attr-defined]
+    (tmp_path / "readme_blocks.py").write_text("\n".join(blocks))
+    monkeypatch.syspath_prepend(tmp_path)
+    module = importlib.import_module("readme_blocks")
+    monkeypatch.delitem(sys.modules, "readme_blocks")
+    assert module.world.native
 
 
 def test_commands_exist() -> None:
