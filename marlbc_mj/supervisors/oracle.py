@@ -119,7 +119,7 @@ class Oracle:
             command = f"marlbc oracle --scenario {scenario.name} --controller {self.controller}"
             raise ConfigurationError(
                 f"the oracle has no schedule for scenario {scenario.name!r} under {self.controller!r} with these settings; "
-                f"for the scenario as it is named, find one with: {command}; for another, with marlbc_mj.supervisors.oracle.search"
+                f"for the scenario as it is named, find one with: {command}; for others: marlbc_mj.supervisors.oracle.search"
             )
         entry: dict[str, Any] = entries[key]
         return entry
