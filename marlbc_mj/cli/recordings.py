@@ -1,0 +1,146 @@
+"""``marlbc video``, ``view`` and ``log``: what is made from an MCAP log."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+
+from marlbc_mj.terminal import progress_bars
+
+
+@dataclass(frozen=True)
+class Video:
+    """Render a video from a log, off-screen."""
+
+    log: Positional[Path]
+    """MCAP log."""
+    out: Path | None = None
+    """Video file; the log's name with .mp4 by default."""
+    speed: float = 4.0
+    """Mission seconds per video second."""
+    fps: int = 30
+    """Frames per second."""
+    camera: str = "track"
+    """Camera: track or top."""
+    start: float | None = None
+    """First mission time shown [s]."""
+    end: float | None = None
+    """Last mission time shown [s]."""
+    width: int = 1280
+    """Picture width [pixel]."""
+    height: int = 720
+    """Picture height [pixel]."""
+    samples: int = 0
+    """Multisampling of edges: 0 is fast, 4 is smoother and takes about twice as long."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+    def run(self) -> None:
+        """Render, with progress."""
+        from marlbc_mj.recording.reader import read_log
+        from marlbc_mj.recording.video import render_video
+
+        out = self.out or self.log.with_suffix(".mp4")
+        with progress_bars() as progress:
+            render_video(
+                read_log(self.log),
+                out,
+                speed=self.speed,
+                fps=self.fps,
+                width=self.width,
+                height=self.height,
+                camera=self.camera,
+                start=self.start,
+                end=self.end,
+                samples=self.samples,
+                overwrite=self.overwrite,
+                progress=lambda done, total: progress("video", done, total),
+            )
+        print(out)
+
+
+@dataclass(frozen=True)
+class View:
+    """Play a log in MuJoCo's interactive viewer."""
+
+    log: Positional[Path]
+    """MCAP log."""
+    speed: float = 4.0
+    """Mission seconds per second."""
+
+    def run(self) -> None:
+        """Open the viewer; needs a display."""
+        from marlbc_mj.recording.reader import read_log
+        from marlbc_mj.recording.view import view
+
+        view(read_log(self.log), speed=self.speed)
+
+
+@dataclass(frozen=True)
+class LogInfo:
+    """Say what a log holds."""
+
+    log: Positional[Path]
+    """MCAP log."""
+
+    def run(self) -> None:
+        """Metadata, topics, attachments."""
+        import json
+
+        from marlbc_mj.recording.reader import log_info
+
+        print(json.dumps(log_info(self.log), indent=2))
+
+
+@dataclass(frozen=True)
+class LogRecover:
+    """Salvage a log that was torn: all whole chunks of it."""
+
+    log: Positional[Path]
+    """The torn file, *.mcap.partial for example."""
+    out: Positional[Path]
+    """Where the salvaged log goes."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+    def run(self) -> None:
+        """Recover and count."""
+        from marlbc_mj.recording.reader import recover_log
+
+        saved = recover_log(self.log, self.out, overwrite=self.overwrite)
+        print(f"{self.out}: {saved} messages")
+
+
+@dataclass(frozen=True)
+class LogExport:
+    """Write a log as .csv (a row per mission step and agent) or .npz (arrays)."""
+
+    log: Positional[Path]
+    """MCAP log."""
+    out: Positional[Path]
+    """File to write; its ending chooses the format."""
+    overwrite: bool = False
+    """Replace an existing file."""
+
+    def run(self) -> None:
+        """Export."""
+        from marlbc_mj.recording.reader import export_log
+
+        export_log(self.log, self.out, overwrite=self.overwrite)
+        print(self.out)
+
+
+@dataclass(frozen=True)
+class Log:
+    """Look into, salvage or convert MCAP logs."""
+
+    action: OmitSubcommandPrefixes[
+        Annotated[LogInfo, subcommand("info")]
+        | Annotated[LogRecover, subcommand("recover")]
+        | Annotated[LogExport, subcommand("export")]
+    ]
+
+    def run(self) -> None:
+        """Hand over to the action."""
+        self.action.run()
