@@ -1,10 +1,13 @@
-"""The benchmark: every supervisor with every controller on one scenario, and the folder of results it leaves."""
+"""The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it leaves."""
 
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
+
+import numpy as np
 
 from marlbc_mj.controllers import CONTROLLERS, Controller, make_controller
 from marlbc_mj.engine.world import World
@@ -16,10 +19,10 @@ from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.report.bundle import write_report
 from marlbc_mj.report.results import Result, method_key
-from marlbc_mj.report.seeds import write_seed_report
+from marlbc_mj.report.seed_page import write_seed_report
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.seeds import SeedResults, perturbed, run_seeds, seed_range
-from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
+from marlbc_mj.seeds import SeedResults, check_free, perturbed, run_methods, seed_range
+from marlbc_mj.supervisors import SLOW, SUPERVISORS, Decision, Situation, Supervisor, make_supervisor
 
 Progress = Callable[[str, float, float], None]
 """Called with what is being done, how much of it is done and how much there is."""
@@ -29,8 +32,8 @@ Progress = Callable[[str, float, float], None]
 class BenchConfig:
     """What one benchmark run does."""
 
-    supervisors: tuple[str, ...] = ("scripted", "fsams", "fsams-hysteresis")
-    controllers: tuple[str, ...] = ("sorlc", "pd")
+    supervisors: tuple[str, ...] | None = None  # None: see matrix
+    controllers: tuple[str, ...] | None = None
     seed: int = 0
     figures: bool = True
     logs: bool = True
@@ -44,13 +47,36 @@ class BenchConfig:
             ("supervisor", self.supervisors, SUPERVISORS),
             ("controller", self.controllers, CONTROLLERS),
         ):
-            _check_names(kind, names, known)
+            if names is not None:
+                _check_names(kind, names, known)
         if self.seeds is not None:
             seed_range(self.seeds, self.seed)
         if self.seed < 0:
             raise ConfigurationError(f"seed must not be negative, got {self.seed}")
+        if self.workers < 1:
+            raise ConfigurationError(f"workers must be at least 1, got {self.workers}")
         if self.video != "none" and not self.logs:
             raise ConfigurationError("videos are rendered from logs; use --video none together with --no-logs")
+
+    @property
+    def methods(self) -> list[tuple[str, str]]:
+        """Names of supervisor and controller of every method, in order."""
+        return matrix(self.supervisors, self.controllers)
+
+
+def matrix(supervisors: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> list[tuple[str, str]]:
+    """The methods of a benchmark, as names of supervisor and controller.
+
+    Without names: every registered supervisor but those of ``SLOW`` with ``sorlc``, then ``scripted`` with every other
+    controller; ``scripted`` with ``sorlc`` comes first. With names: every named supervisor with every named controller, where
+    ``sorlc`` stands for controllers and ``scripted`` for supervisors that are not named.
+    """
+    if supervisors is None and controllers is None:
+        first = sorted((name for name in SUPERVISORS if name not in SLOW), key=lambda name: name != "scripted")
+        return [(name, "sorlc") for name in first] + [("scripted", name) for name in CONTROLLERS if name != "sorlc"]
+    return list(
+        product(("scripted",) if supervisors is None else supervisors, ("sorlc",) if controllers is None else controllers)
+    )
 
 
 def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None:
@@ -68,7 +94,7 @@ def run_bench(
 ) -> tuple[list[Result], list[str]]:
     """Run the whole matrix and write ``out``; returns the results and what could not be written (a video without GL).
 
-    A method that fails is a reported outcome, not a missing row.
+    A method that fails, or cannot start in this scenario, is a reported outcome, not a missing row.
 
     Raises:
         ConfigurationError: a setting or the output folder; nothing is written then.
@@ -78,8 +104,7 @@ def run_bench(
         write_json(folder / "config.json", _config(scenario, config))
         results = [
             run_method(scenario, supervisor, controller, config.seed, folder if config.logs else None, say)
-            for supervisor in config.supervisors
-            for controller in config.controllers
+            for supervisor, controller in config.methods
         ]
         videos, problems = _render_videos(results, config, folder, say)
         write_report(results, folder, config=_config(scenario, config), videos=videos, figures=config.figures, progress=say)
@@ -95,7 +120,7 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
     scenario, seeds = perturbed(scenario), seed_range(config.seeds or 0, config.seed)
     with staged_folder(out, overwrite=config.overwrite) as folder:
         write_json(folder / "config.json", _config(scenario, config))
-        results = run_seeds(scenario, config.supervisors, config.controllers, seeds, progress, workers=config.workers)
+        results = run_methods(scenario, config.methods, seeds, progress, workers=config.workers)
         write_seed_report(results, folder, config=_config(scenario, config), figures=config.figures, progress=progress)
     return results
 
@@ -110,6 +135,30 @@ def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
     }
 
 
+class Stopwatch:
+    """A supervisor whose memory may tell, as ``solver_ms``, how long its network or solver took in the last decision [ms]."""
+
+    def __init__(self, supervisor: Supervisor) -> None:
+        self.supervisor = supervisor
+        self.solver_ms: list[float] = []
+
+    def start(self, scenario: Scenario) -> Any:
+        """The supervisor's memory."""
+        return self.supervisor.start(scenario)
+
+    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
+        """The supervisor's orders."""
+        orders, memory = self.supervisor.decide(situation, memory)
+        spent = getattr(memory, "solver_ms", None)
+        if spent is not None:
+            self.solver_ms.append(float(spent))
+        return orders, memory
+
+    def share(self, decision_ms: np.ndarray) -> float | None:
+        """Solver's time over the whole decisions' (M,); None where the supervisor did not tell."""
+        return sum(self.solver_ms) / float(decision_ms.sum()) if self.solver_ms else None
+
+
 def run_method(
     scenario: Scenario,
     supervisor: str,
@@ -119,12 +168,18 @@ def run_method(
     say: Progress,
     overwrite: bool = False,
 ) -> Result:
-    """One episode of one method, logged to ``folder/logs`` if there is a folder."""
-    key = method_key(supervisor, controller)
-    law = make_controller(controller)
-    chief = make_supervisor(supervisor, controller)
-    chief.start(scenario)  # a supervisor that does not suit the scenario is a wrong setting, not a failed run
-    world = World(scenario, law, record=True)
+    """One episode of one method, logged to ``folder/logs`` if there is a folder; a method that cannot start has failed.
+
+    Raises:
+        ConfigurationError: unknown names, or a log that may not be written.
+    """
+    key, names = method_key(supervisor, controller), (supervisor, controller)
+    law, chief = make_controller(controller), Stopwatch(make_supervisor(supervisor, controller))
+    try:
+        world = World(scenario, law, record=True)
+        chief.start(scenario)
+    except MarlbcError as error:
+        return Result.failed(*names, f"cannot start: {error}")
 
     def step_done(frame: Frame) -> None:
         if round(frame.time / scenario.mission_step) % 50 == 0:
@@ -132,7 +187,7 @@ def run_method(
 
     try:
         if folder is None:
-            trajectory = run_episode(world, chief, seed=seed, names=(supervisor, controller), on_frame=step_done)
+            trajectory = run_episode(world, chief, seed=seed, names=names, on_frame=step_done)
         else:
             path = folder / "logs" / f"{key}.mcap"
             with open_log(
@@ -143,11 +198,12 @@ def run_method(
                     log.write(frame)
                     step_done(frame)
 
-                trajectory = run_episode(world, chief, seed=seed, names=(supervisor, controller), on_frame=record)
+                trajectory = run_episode(world, chief, seed=seed, names=names, on_frame=record)
+        check_free(trajectory, law)
     except SimulationError as error:
-        return Result.failed(supervisor, controller, str(error))
+        return Result.failed(*names, str(error))
     say(key, scenario.duration, scenario.duration)
-    return Result.of(trajectory)
+    return Result.of(trajectory, chief.share(trajectory.decision_ms))
 
 
 def open_log(
@@ -208,7 +264,8 @@ def run_single(
     """
     config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
-    make_supervisor(supervisor, controller).start(scenario)
+    World(scenario, make_controller(controller))
+    make_supervisor(supervisor, controller).start(scenario)  # a method that cannot start is a wrong setting here
     say = progress or (lambda what, done, total: None)
     result = run_method(scenario, supervisor, controller, seed, out, say, overwrite)
     if result.metrics is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import Supervisor, situation
+from marlbc_mj.supervisors import Blend, Supervisor, situation
 
 
 class Frame(NamedTuple):
@@ -79,10 +79,13 @@ def run_episode(
     done = False
     while not done:
         began = perf_counter()
-        orders, memory = supervisor.decide(situation(observation, obstacles, scenario.mission_step), memory)
+        decision, memory = supervisor.decide(situation(observation, obstacles, scenario.mission_step), memory)
         decision_ms = 1e3 * (perf_counter() - began)
         controller_state = world.state.controller[0].copy()
-        step = world.step(orders[None])
+        if isinstance(decision, Blend):
+            step = world.step(decision.orders[None], decision.velocity[None])
+        else:
+            step = world.step(decision[None])
         assert step.record is not None, "run_episode needs World(record=True)"
         record = np.stack([field[0] for field in step.record])  # (5, substeps, N, 2)
         frames.append(

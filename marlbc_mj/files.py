@@ -3,7 +3,7 @@
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,7 @@ def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     check_folder(out, overwrite=overwrite)
     staging = out.with_name(f"{out.name}.partial-{os.getpid()}")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        staging.mkdir()
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {out}: {error.strerror}") from error
+    _begin(out, staging.mkdir)
     try:
         yield staging
     except BaseException:
@@ -40,6 +36,15 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
         raise ConfigurationError(f"output folder {out} is a file")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
         raise ConfigurationError(f"output folder {out} is not empty; choose another or add --overwrite")
+
+
+def _begin(out: Path, create: Callable[[], None]) -> None:
+    """Make the folder of ``out``, then what stands in for it; ConfigurationError where that cannot be done."""
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        create()
+    except OSError as error:
+        raise ConfigurationError(f"cannot write {out}: {error.strerror}") from error
 
 
 def _replace(out: Path, staging: Path) -> None:
@@ -60,11 +65,7 @@ def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     check_target(path, overwrite=overwrite)
     staging = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        staging.touch()
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
+    _begin(path, staging.touch)
     try:
         yield staging
         staging.replace(path)

@@ -17,9 +17,14 @@ disturbance    ``(params, t, p, v, force_out)``
 Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or for coverage.
 """
 
+import os
 from collections.abc import Callable
 from types import FunctionType
 from typing import Any, cast
+
+# Read once, when the first OpenMP library loads. Threads that spin while they wait would take the cores from torch's (and from
+# other processes'): with both at work the same training step took 4 to 6 times longer.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
 from numba import types

@@ -95,6 +95,21 @@ def _team(trajectory: Trajectory) -> TeamMetrics:
     }
 
 
+def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: float = 0.02) -> np.ndarray:
+    """Time after which the velocity error's norm stays below ``share`` of its largest value in the first ``window`` [s].
+
+    The paper's Figs. 6c and 7c: 0.7 s for SORLC, 3.4 s for RLC. The window ends before the case study's first switch.
+
+    Returns:
+        (N,) [s]; NaN for an agent whose error is above that share at the window's end.
+    """
+    inside = trajectory.time < window
+    error = np.linalg.norm(trajectory.velocity[:-1][inside] - trajectory.reference_velocity[inside], axis=-1)
+    above = error > share * error.max(axis=0)
+    after = np.array([np.flatnonzero(column)[-1] + 1 if column.any() else 0 for column in above.T])
+    return np.where(after < len(above), after * trajectory.scenario.substep, np.nan)
+
+
 def _closest_pair(positions: np.ndarray) -> float:
     """Smallest distance between two agents over (T, N, 2) [m]."""
     first, second = np.triu_indices(positions.shape[1], 1)

@@ -1,12 +1,12 @@
-"""Every method on the same draws around a scenario, and the statistics of it. Keeps scalars only, so memory stays flat."""
+"""Every method on the same draws around a scenario. Keeps scalars only, so memory stays flat; report/ has the statistics."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from multiprocessing import get_context
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,8 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.metrics import Metrics, measure
-from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS, method_key
+from marlbc_mj.report.results import method_key
 from marlbc_mj.scenarios import Perturbation, Scenario
-from marlbc_mj.statistics import Estimate, Statistic, bootstrap, iqm, mean, median, paired_improvement, rate
 from marlbc_mj.supervisors import make_supervisor
 
 CASE_STUDY_PERTURBATION = Perturbation(start_spread=1.0, obstacle_spread=0.5, drag_scale=(0.0, 2.0))
@@ -46,7 +45,7 @@ class SeedRun:
     """One episode's scalars, or the reason why there are none."""
 
     seed: int
-    instance: Instance
+    instance: Instance | None  # None where the controller cannot run in this scenario
     metrics: Metrics | None = None
     failure: str | None = None
 
@@ -120,28 +119,43 @@ def run_seeds(
     reference: str | None = None,
     workers: int = 1,
 ) -> SeedResults:
-    """Run every supervisor with every controller on every seed; one world per method is reset from seed to seed.
+    """:func:`run_methods` for every supervisor with every controller."""
+    methods = list(product(supervisors, controllers))
+    return run_methods(scenario, methods, seeds, progress, reference=reference, workers=workers)
 
-    A run that fails is kept with its reason. What a method does depends on neither the other methods nor their order.
+
+def run_methods(
+    scenario: Scenario,
+    methods: Sequence[tuple[str, str]],
+    seeds: Sequence[int],
+    progress: Progress | None = None,
+    *,
+    reference: str | None = None,
+    workers: int = 1,
+) -> SeedResults:
+    """Run every method on every seed; one world per method is reset from seed to seed.
+
+    A run that fails, or a method that cannot start in this scenario, is kept with its reason. What a method does depends on
+    neither the other methods nor their order.
 
     Args:
         scenario: drawn from as :func:`perturbed` says.
+        methods: names of supervisor and controller.
         progress: called with the method, how many seeds of it are done and how many there are.
         reference: the key of the method that others are compared with; by default the first.
         workers: processes that share the methods; decision times are best measured with one.
 
     Raises:
-        ConfigurationError: names, seeds or a supervisor that does not suit the scenario; nothing has been run then.
+        ConfigurationError: unknown names, no or repeated methods or seeds; nothing has been run then.
     """
-    scenario, methods = perturbed(scenario), list(product(supervisors, controllers))
+    scenario = perturbed(scenario)
     keys = [method_key(*method) for method in methods]
     _check(keys, seeds, workers)
     if reference is not None and reference not in keys:
         raise ConfigurationError(f"reference method {reference!r} is not run; choose from: {', '.join(keys)}")
     for supervisor, controller in methods:
-        make_supervisor(supervisor, controller).start(scenario)
-    for controller in controllers:
-        World(scenario, make_controller(controller))
+        make_supervisor(supervisor, controller)
+        make_controller(controller)
     say = progress or (lambda what, done, total: None)
     results = _run_all(scenario, methods, tuple(seeds), say, workers)
     return SeedResults(scenario, tuple(seeds), results, reference or keys[0])
@@ -179,7 +193,10 @@ def run_method(
 ) -> MethodRuns:
     """One method on every seed."""
     law = make_controller(controller)
-    world = World(scenario, law, record=True)
+    try:
+        world = World(scenario, law, record=True)
+    except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
+        return MethodRuns(supervisor, controller, tuple(SeedRun(seed, None, failure=str(error)) for seed in seeds))
     runs = []
     for done, seed in enumerate(seeds):
         runs.append(run_seed(world, law, supervisor, controller, seed))
@@ -195,16 +212,17 @@ def run_seed(world: World, law: Controller, supervisor: str, controller: str, se
     instance = Instance(state.position[0].copy(), state.obstacles[0].copy(), float(state.disturbance_params[0, 0]))
     try:
         trajectory = run_episode(world, make_supervisor(supervisor, controller), seed=seed, names=(supervisor, controller))
-        if law.limited:
-            _check_free(trajectory)
+        check_free(trajectory, law)
         return SeedRun(seed, instance, metrics=measure(trajectory))
-    except SimulationError as error:
+    except (ConfigurationError, SimulationError) as error:  # a supervisor that cannot start here is an outcome too
         return SeedRun(seed, instance, failure=str(error))
 
 
-def _check_free(trajectory: Trajectory) -> None:
-    """Raise SimulationError for an agent that was at its force limit throughout the end of the episode."""
+def check_free(trajectory: Trajectory, law: Controller) -> None:
+    """Raise SimulationError for an agent of a limited law that was at its force limit throughout the end of the episode."""
     scenario = trajectory.scenario
+    if not law.limited:
+        return
     last = max(1, round(STUCK * len(trajectory.force)))
     at_limit = (np.abs(trajectory.force[-last:]) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).all(axis=0)
     if at_limit.any():
@@ -213,103 +231,3 @@ def _check_free(trajectory: Trajectory) -> None:
             f"saturated forever: agent {agents} at the force limit of {scenario.force_limit:g} N "
             f"throughout the last {last * scenario.substep:g} s"
         )
-
-
-class Score(NamedTuple):
-    """One number that sums up a whole team's episode."""
-
-    group: str  # first line of a header
-    label: str  # second line, with the unit
-    digits: int
-    read: Callable[[Metrics], float]
-
-
-SCORES = {
-    "return": Score("return", "sum", 0, lambda m: m["team"]["return"]),
-    "violation_time": Score("violation", "worst [s]", 2, lambda m: max(a["violation_time"] for a in m["agents"])),
-    "clearance": Score("clearance", "least [m]", 2, lambda m: min(a["clearance_min"] for a in m["agents"])),
-    "agent_distance": Score("distance", "least [m]", 2, lambda m: m["team"]["agent_distance_min"]),
-    "formation_error": Score("formation", "mean [m]", 2, lambda m: m["team"]["formation_error"]),
-    "effort": Score("effort", "sum [N s]", 0, lambda m: sum(a["effort_integral"] for a in m["agents"])),
-    "cost": Score("cost", "sum [10⁴]", 1, lambda m: 1e-4 * sum(a["cost_integral"] for a in m["agents"])),
-    "saturation_duty": Score("at limit", "worst [%]", 1, lambda m: 100 * max(a["saturation_duty"] for a in m["agents"])),
-}
-"""Worst, least, mean and sum are over agents."""
-
-_GROUP_SCORES = ("return", "violation_time")
-
-
-@dataclass(frozen=True)
-class MethodStatistics:
-    """What the tables, the files and the figure say about one method; estimates are over the runs that finished."""
-
-    runs: MethodRuns
-    agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS
-    team: Mapping[str, Estimate]  # medians of TEAM_KEYS
-    medians: Mapping[str, Estimate]  # of SCORES
-    iqms: Mapping[str, Estimate]  # of SCORES
-    violation: Estimate  # rate of runs with a violation or a failure, Wilson's interval
-    improvement: Estimate  # probability of a higher return than the reference's on the same draw; a failure loses
-
-
-@dataclass(frozen=True)
-class GroupStatistics:
-    """One supervisor over all controllers, or the reverse: each method is a stratum, draws are common to all of them."""
-
-    name: str
-    methods: int
-    draws: int  # on which all of them finished
-    iqms: Mapping[str, Estimate]  # of return and violation_time
-    violation: Estimate  # rate over all their runs
-
-
-def analyse(results: SeedResults) -> list[MethodStatistics]:
-    """Statistics of every method, in their order."""
-    reference = next(method for method in results.methods if method.key == results.reference)
-    against = reference.values(SCORES["return"].read, failure=-np.inf)
-    return [_method_statistics(method, results.scenario.agents, against) for method in results.methods]
-
-
-def _method_statistics(method: MethodRuns, agents: int, against: np.ndarray) -> MethodStatistics:
-    def over(read: Callable[[Metrics], Any], statistic: Statistic = median) -> Estimate:
-        return bootstrap([method.values(read)], statistic)
-
-    return MethodStatistics(
-        method,
-        tuple({key: over(lambda m, i=i, key=key: m["agents"][i][key]) for key in AGENT_KEYS} for i in range(agents)),  # type: ignore[misc]
-        {key: over(lambda m, key=key: m["team"][key]) for key in TEAM_KEYS},  # type: ignore[misc]
-        {name: over(score.read) for name, score in SCORES.items()},
-        {name: over(score.read, iqm) for name, score in SCORES.items()},
-        rate([run.violated for run in method.runs]),
-        paired_improvement(method.values(SCORES["return"].read, failure=-np.inf), against),
-    )
-
-
-def group(results: SeedResults, by: Callable[[MethodRuns], str]) -> list[GroupStatistics]:
-    """Statistics of every supervisor or controller (``by``) that has more than one method."""
-    names = dict.fromkeys(map(by, results.methods))
-    members = {name: [method for method in results.methods if by(method) == name] for name in names}
-    return [_group_statistics(name, methods) for name, methods in members.items() if len(methods) > 1]
-
-
-def _group_statistics(name: str, methods: Sequence[MethodRuns]) -> GroupStatistics:
-    finished = np.array([[run.metrics is not None for run in method.runs] for method in methods]).all(axis=0)
-    strata = {k: [method.values(SCORES[k].read, failure=np.nan)[finished] for method in methods] for k in _GROUP_SCORES}
-    violated = [np.array([float(run.violated) for run in method.runs]) for method in methods]
-    return GroupStatistics(
-        name,
-        len(methods),
-        int(finished.sum()),
-        {key: bootstrap(values, iqm, joint=True) for key, values in strata.items()},
-        bootstrap(violated, mean, joint=True),
-    )
-
-
-def by_supervisor(method: MethodRuns) -> str:
-    """For :func:`group`."""
-    return method.supervisor
-
-
-def by_controller(method: MethodRuns) -> str:
-    """For :func:`group`."""
-    return method.controller

@@ -8,7 +8,7 @@ from typing import Any
 
 from marlbc_mj.errors import ConfigurationError
 
-LEAST_WIDTH = 96  # of the table of results [characters]
+LEAST_WIDTH = 112  # of the table of results [characters]
 
 
 def prepare_gl(strict: bool) -> None:
@@ -18,14 +18,12 @@ def prepare_gl(strict: bool) -> None:
     from marlbc_mj.recording.gl import choose_gl
 
     try:
-        backend = choose_gl()
+        choose_gl()
     except ConfigurationError as error:
         if strict:
             raise
         del os.environ["MUJOCO_GL"]  # with it, MuJoCo itself could not be imported
         print(f"marlbc: {error}; going on without it", file=sys.stderr)
-    else:
-        print(f"marlbc: off-screen rendering with {backend}", file=sys.stderr)
 
 
 @contextmanager
@@ -82,3 +80,35 @@ def print_results(results: list[Any]) -> None:
     for result in results:
         if result.failure is not None:
             print(f"{result.key} failed: {result.failure}")
+
+
+@contextmanager
+def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
+    """Progress of a training run: mission steps, rate, time left and the last evaluation; a line an evaluation elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (
+        BarColumn(20),
+        TextColumn("{task.percentage:>3.0f} %  {task.fields[rate]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[last]}"),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+        task = bars.add_task("training", rate="", last="")
+        seen = -1.0
+
+        def update(trainer: Any, row: dict[str, float]) -> None:
+            nonlocal seen
+            switches = "/".join(f"{value:.0f}" for name, value in row.items() if name.startswith("switches_"))
+            last = f"return {row['return']:.0f}  switches {switches}  violation {row['violation_time']:.2f} s"
+            if row["mission_steps"] != seen:
+                seen = row["mission_steps"]
+                console.print(f"{seen / 1e6:6.2f} M steps {row['wall_s']:6.0f} s  {last}", highlight=False)
+            rate = f"{(bars.tasks[task].speed or 0.0):.0f} steps/s"
+            bars.update(task, completed=trainer.steps, total=trainer.config.budget, rate=rate, last=last)
+
+        yield update

@@ -1,8 +1,9 @@
-"""Views of the benchmark for other people's tools: dm_control environments."""
+"""Views of the benchmark for other people's tools: dm_control, Gymnasium and PettingZoo environments."""
 
 from typing import Any
 
 import dm_env
+import gymnasium
 import numpy as np
 
 from marlbc_mj.controllers import Controller
@@ -10,6 +11,12 @@ from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios import make_scenario
 
 DOMAINS = ("formation",)
+
+gymnasium.register(
+    "marlbc_mj/PaperFormation-v0",
+    entry_point="marlbc_mj.tasks.gymnasium_env:PaperFormation",
+    vector_entry_point="marlbc_mj.tasks.gymnasium_env:PaperFormationVector",
+)
 
 
 def load(

@@ -5,12 +5,17 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 
+from marlbc_mj.bench import Stopwatch, matrix
 from marlbc_mj.cli import main
+from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
+from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.supervisors import MPCMS, SLOW, SUPERVISORS, make_supervisor
 
 SHORT = ("--duration", "1.0")
 
@@ -91,6 +96,10 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
         (["perf", "--rounds", "2"], ("rounds", "2")),
         (["bench", "--no-logs"], ("video", "logs")),
         (["bench", "--seeds", "0"], ("seeds", "0")),
+        (["bench", "--workers", "0"], ("workers", "0")),
+        (["bench", "--supervisors"], ("at least one supervisor", "scripted")),
+        (["bench", "--controllers"], ("at least one controller", "sorlc")),
+        (["run", "--supervisor", "oracle", "--duration", "3"], ("no schedule", "marlbc oracle")),
     ],
 )
 def test_wrong_settings_are_one_line(
@@ -122,6 +131,58 @@ def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.Captu
     summary = json.loads((tmp_path / "bench" / "summary.json").read_text())
     assert "agent 1, t = 1.31" in summary["methods"]["scripted+pd"]["failure"]
     assert "1.31" in (tmp_path / "bench" / "tables.md").read_text()
+
+
+def test_the_matrix_is_all_supervisors_and_all_controllers() -> None:
+    """Each once, the video's method first; names make a cross product, and what is not named is sorlc or scripted."""
+    methods, usual = matrix(), set(SUPERVISORS) - set(SLOW)
+    assert methods[0] == ("scripted", "sorlc") and len(set(methods)) == len(methods) == len(usual) + len(CONTROLLERS) - 1
+    assert {s for s, c in methods if c == "sorlc"} == usual
+    assert {c for s, c in methods if s == "scripted"} == set(CONTROLLERS)
+    assert matrix(("fsams", "fms")) == [("fsams", "sorlc"), ("fms", "sorlc")]
+    assert matrix(None, ("pd", "lqr")) == [("scripted", "pd"), ("scripted", "lqr")]
+    assert matrix(("fsams", "fms"), ("pd",)) == [("fsams", "pd"), ("fms", "pd")]
+
+
+def test_slow_supervisors_run_where_they_are_named() -> None:
+    """MPCMS that simulates its candidates takes minutes an episode: no part of the default matrix."""
+    assert SLOW == ("mpcms-mujoco",) and "mpcms-mujoco" not in {s for s, _ in matrix()}
+    assert matrix(("mpcms", "mpcms-mujoco")) == [("mpcms", "sorlc"), ("mpcms-mujoco", "sorlc")]
+    slow = make_supervisor("mpcms-mujoco")
+    assert isinstance(slow, MPCMS) and slow.prediction == "mujoco"
+    assert slow.start(paper(duration=1.0)).worlds is not None
+
+
+@pytest.mark.parametrize("seeds", [[], ["--seeds", "2"]], ids=["one", "seeds"])
+def test_a_method_that_cannot_start_is_a_row(seeds: list[str], tmp_path: Path) -> None:
+    """The oracle has no schedule for this mission: the others are reported beside its reason."""
+    quick = ["--supervisors", "scripted", "oracle", "--controllers", "pd", "--video", "none", "--no-figures", "--no-logs"]
+    main(["bench", *quick, "--out", str(tmp_path / "out"), *seeds, *SHORT])
+    methods = json.loads((tmp_path / "out" / "summary.json").read_text())["methods"]
+    assert "no schedule" in methods["oracle+pd"]["failure"] and "team" in methods["scripted+pd"]
+    for name in ("tables.md", "index.html", "episodes.csv"):
+        assert "no schedule" in (tmp_path / "out" / name).read_text()
+
+
+def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
+    """The share of its solver's time in all decisions; nothing where the memory says nothing."""
+
+    class Memory(NamedTuple):
+        solver_ms: float
+
+    class Solver:
+        def start(self, scenario: Scenario) -> Memory:
+            return Memory(0.0)
+
+        def decide(self, situation: Any, memory: Memory) -> tuple[np.ndarray, Memory]:
+            return np.zeros(4, dtype=int), Memory(3.0)
+
+    watch = Stopwatch(Solver())
+    memory = watch.start(paper())
+    for _ in range(2):
+        _, memory = watch.decide(None, memory)  # type: ignore[arg-type]
+    assert watch.share(np.array([4.0, 8.0])) == 0.5
+    assert Stopwatch(make_supervisor("scripted")).share(np.ones(2)) is None
 
 
 def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:

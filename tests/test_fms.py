@@ -25,7 +25,9 @@ def run(clearance, supervisor=None) -> np.ndarray:
     memory, out = supervisor.start(PAPER), []
     zeros = np.zeros((4, 2))
     for step, d in enumerate(clearance):
-        now = Situation(step, step * 0.05, zeros, zeros, np.full(4, d), 0, np.zeros(4, dtype=np.int64), PAPER.obstacle_array())
+        now = Situation(
+            step, step * 0.05, zeros, zeros, np.full(4, d), 0, np.zeros(4, dtype=np.int64), PAPER.obstacle_array(), zeros
+        )
         orders, memory = supervisor.decide(now, memory)
         out.append(orders)
     return np.array(out)

@@ -8,7 +8,7 @@ import pytest
 from marlbc_mj.behaviors import clearances
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.metrics import measure
+from marlbc_mj.metrics import convergence_time, measure
 from marlbc_mj.scenarios import Obstacle, Scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import make_supervisor
 
@@ -196,3 +196,28 @@ def test_frames_show_the_state_in_which_orders_were_given():
         assert (frame.command == trajectory.command[k]).all() and frame.reward == trajectory.reward[k]
         assert (frame.controller_state == trajectory.controller_state[k]).all() and frame.decision_ms >= 0.0
         assert k == 0 or frame.formation == trajectory.formation[k - 1]
+
+
+def decaying(rate: float, late: float = 0.0) -> Trajectory:
+    """One second in which the first agent's velocity error decays as exp(-rate t), the second's is ``late`` at the very end."""
+    trajectory = straight(pair())
+    velocity = trajectory.velocity.copy()
+    velocity[:-1, 0, 1] = np.exp(-rate * trajectory.time)
+    velocity[0, 1, 1], velocity[T - 1, 1, 1] = 1.0, late
+    return replace(trajectory, velocity=velocity)
+
+
+@pytest.mark.parametrize("rate", [10.0, 20.0, 40.0])
+def test_convergence_time_of_an_exponential(rate):
+    """ln(50) / rate, up to one substep; an error that is there for one substep only has converged after it."""
+    times = convergence_time(decaying(rate))
+    assert 0.0 <= times[0] - np.log(50) / rate <= H
+    assert times[1] == H
+
+
+def test_convergence_time_has_a_window_and_may_not_be_reached():
+    """An error above the share at the window's end is NaN, one beyond the window is not seen, no error is converged at once."""
+    assert np.isnan(convergence_time(decaying(10.0, late=0.5))[1])
+    assert convergence_time(decaying(10.0, late=0.5), window=0.9)[1] == H
+    assert np.isnan(convergence_time(decaying(1.0))[0])
+    assert (convergence_time(straight(pair())) == 0.0).all()

@@ -26,7 +26,7 @@ def at(positions, step: int = 0, obstacles=None) -> Situation:
     positions = np.array(positions, dtype=float)
     obstacles = PAPER.obstacle_array() if obstacles is None else np.array(obstacles, dtype=float).reshape(-1, 3)
     unread = np.zeros(4), 0, np.zeros(4, dtype=np.int64)
-    return Situation(step, step * 0.05, positions, np.zeros((4, 2)), *unread, obstacles)
+    return Situation(step, step * 0.05, positions, np.zeros((4, 2)), *unread, obstacles, positions)
 
 
 def in_formation(step: int, which: int = 0) -> np.ndarray:
@@ -178,7 +178,13 @@ class PythonPD(PD):
         ({"horizon": 0}, "horizon .* got 0"),
         ({"instants": ()}, "candidate set is empty"),
         ({"instants": (0, 40)}, r"between 0 and horizon - 1 = 39, got \(0, 40\)"),
+        ({"horizon": 2.5}, "horizon .* got 2.5"),
+        ({"horizon": 20}, r"instants must lie between 0 and horizon - 1 = 19, got \(0, 5, "),
+        ({"instants": (-1,)}, r"instants must lie .* got \(-1,\)"),
         ({"w_switch": -1.0}, "w_switch must be non-negative and finite, got -1.0"),
+        ({"w_formation": -0.5}, "w_formation must be non-negative and finite, got -0.5"),
+        ({"w_reconstruction": -0.3}, "w_reconstruction must be non-negative and finite, got -0.3"),
+        ({"slack": -1e4}, "slack must be non-negative and finite, got -10000.0"),
         ({"w_formation": float("nan")}, "w_formation .* got nan"),
         ({"slack": float("inf")}, "slack .* got inf"),
         ({"margin": -0.1}, "margin .* got -0.1"),

@@ -4,11 +4,13 @@ import csv
 import json
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from marlbc_mj.cli import main
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
@@ -272,6 +275,16 @@ def chunked(tmp_path_factory) -> Path:
     return path
 
 
+def recovered(path: Path, out: Path) -> int:
+    """Messages that were recovered; 0 where there was nothing to recover."""
+    try:
+        return recover_log(path, out)
+    except ConfigurationError as error:
+        if not str(error).endswith("holds no whole message, so there is nothing to recover"):
+            raise
+        return 0
+
+
 @settings(max_examples=25)
 @given(share=st.floats(0.0, 1.0, exclude_max=True))
 def test_torn_anywhere(chunked, share):
@@ -281,17 +294,18 @@ def test_torn_anywhere(chunked, share):
         torn, out = Path(folder) / "torn.mcap.partial", Path(folder) / "out.mcap"
         torn.write_bytes(data[: int(share * len(data))])
         for read in (read_log, log_info):
-            with pytest.raises(ConfigurationError, match=r"is truncated; `marlbc log recover .*` salvages it"):
+            with pytest.raises(ConfigurationError, match=r"is truncated; `marlbc log recover .*` salvages what is whole"):
                 read(torn)
-        saved = recover_log(torn, out)
-        info = log_info(out)
-        assert info["messages"] == saved
+        saved = recovered(torn, out)
+        if not saved:
+            assert [path.name for path in Path(folder).iterdir()] == [torn.name]
+            return
+        info, log = log_info(out), read_log(out)
+        assert info["messages"] == saved > 0
         assert saved % 8 == 0
-        if saved:
-            log = read_log(out)
-            np.testing.assert_array_equal(log.position, whole.position[: saved // 8])
-            assert log.mjcf == whole.mjcf
-            assert len(info["attachments"]) == 3
+        np.testing.assert_array_equal(log.position, whole.position[: saved // 8])
+        assert log.mjcf == whole.mjcf
+        assert len(info["attachments"]) == 3
 
 
 @settings(max_examples=25)
@@ -309,8 +323,77 @@ def test_damaged_anywhere(chunked, share, flip):
         if place < 8:
             with pytest.raises(ConfigurationError, match="not an MCAP"):
                 recover_log(path, out)
-        elif recover_log(path, out):
-            assert np.isin(read_log(out).position, whole.position).all()
+            return
+        if recovered(path, out):
+            with suppress(ConfigurationError):  # the model or metadata was hit: the log is refused
+                assert np.isin(read_log(out).position, whole.position).all()
+
+
+def test_a_damaged_attachment_is_left_out(chunked, tmp_path):
+    """Its checksum says so; the rest is recovered, and the log is refused because its model is gone."""
+    data, damaged, out = chunked.read_bytes(), tmp_path / "damaged.mcap", tmp_path / "out.mcap"
+    before = len(log_info(chunked)["attachments"])
+    place = data.index(b"<mujoco") + 1
+    damaged.write_bytes(data[:place] + b"N" + data[place + 1 :])
+    assert recover_log(damaged, out) == log_info(chunked)["messages"]
+    assert len(log_info(out)["attachments"]) == before - 1
+    with pytest.raises(ConfigurationError, match="has no attachment .*; it was damaged, or not written by marlbc"):
+        read_log(out)
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_a_file_with_nothing_to_recover_is_refused(chunked, tmp_path, capsys, overwrite):
+    """An empty file and a log torn before its first whole chunk: one line, and what was there stays as it was."""
+    out = tmp_path / "out.mcap"
+    for data in (b"", chunked.read_bytes()[:40]):
+        torn = tmp_path / "torn.mcap.partial"
+        torn.write_bytes(data)
+        if overwrite:
+            out.write_bytes(b"precious")
+        with pytest.raises(SystemExit) as stopped:
+            main(["log", "recover", str(torn), str(out), *(["--overwrite"] if overwrite else [])])
+        assert stopped.value.code == 2
+        said = capsys.readouterr()
+        assert said.err == f"marlbc: {torn} holds no whole message, so there is nothing to recover\n"
+        assert said.out == ""
+        assert sorted(p.name for p in tmp_path.iterdir()) == (["out.mcap"] if overwrite else []) + [torn.name]
+        assert not overwrite or out.read_bytes() == b"precious"
+
+
+def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
+    """A wrong argument is one line on its own."""
+    with pytest.raises(SystemExit):
+        main(["video", str(short[0]), "--speed", "0"])
+    assert capsys.readouterr().err == "marlbc: speed must be positive, got 0.0\n"
+    small = ["--width", "128", "--height", "96", "--fps", "2", "--end", "1"]
+    main(["video", str(short[0]), "--out", str(tmp_path / "a.mp4"), *small])
+    assert capsys.readouterr().err.startswith("marlbc: off-screen rendering with ")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["bnch"], r"Unrecognized options: bnch; Available subcommands: bench, run, .*; see `marlbc --help`"),
+        (["log", "rec"], r"Unrecognized options: rec; Available subcommands: info, recover, export; see `marlbc --help`"),
+        (["run", "--sed", "1"], r"Unrecognized options: --sed, 1; perhaps --seed, .*; see `marlbc --help`"),
+        (["run", "--seed", "x"], r"Error parsing --seed: invalid literal for int\(\) with base 10: 'x'; see `marlbc --help`"),
+        (["bench", "--video", "x"], r"invalid choice 'x' for argument '--video'.*'all', 'none'\); see `marlbc bench --help`"),
+        (["log", "recover", "a"], r"Missing from marlbc log recover: PATH .*; see `marlbc log recover --help`"),
+        ([], r"Expected one of \{bench, .*\}; see `marlbc --help`"),
+    ],
+)
+def test_arguments_that_cannot_be_parsed_are_one_line(arguments, said, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    assert re.fullmatch(f"marlbc: {said}\n", capsys.readouterr().err)
+
+
+def test_help_is_printed_as_it_is(capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["log", "--help"])
+    assert stopped.value.code == 0
+    assert capsys.readouterr().out.startswith("usage: marlbc log")
 
 
 def test_recovering_a_whole_log_changes_nothing(short, tmp_path):

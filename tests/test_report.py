@@ -3,6 +3,9 @@
 import csv
 import json
 import re
+import shutil
+import subprocess
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +17,16 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.metrics import AgentMetrics, TeamMetrics
-from marlbc_mj.report import figures, paper_values, plotting, write_report
+from marlbc_mj.report import curves, figures, paper_values, plotting, write_report
 from marlbc_mj.report.arena import trajectories
+from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actuator
+from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_page
 from marlbc_mj.report.paper_values import order_mark
-from marlbc_mj.report.pareto import pareto
+from marlbc_mj.report.pareto import coincident, pareto
 from marlbc_mj.report.results import Result, summary, write_csv
 from marlbc_mj.report.table import Column, Table, latex, to_html, to_markdown
-from marlbc_mj.report.tables import latex_document, make_tables, markdown, significant
+from marlbc_mj.report.tables import latex_document, make_tables, markdown
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
 
@@ -100,17 +105,18 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
     tables = {table.name: cells(to_markdown(table)) for table in make_tables(results, "paper")}
     ran = [result.metrics for result in results if result.metrics is not None]
     head, *rows = tables["switches"]
-    assert head[1:6] == ["scripted, here", "fsams, here", "fsams, paper", "mpcms, here", "mpcms, paper"]
-    assert [int(row[2]) for row in rows] == [agent["switches"] for agent in ran[2]["agents"]]
-    assert [int(row[3]) for row in rows] == list(paper_values.SWITCHES.values["fsams"])
-    assert {row[4] for row in rows} == {"failed"}
-    head, *rows = tables["control-cost"]
-    assert head[1:4] == ["sorlc, here", "sorlc, paper", "pd, here"]
+    assert head == ["supervisor", "agent 1", "agent 2", "agent 3", "agent 4"]
+    assert [row[0] for row in rows] == ["scripted", "fsams", "FSAMS, printed", "mpcms", "MPCMS, printed"]
+    assert [int(cell) for cell in rows[1][1:]] == [agent["switches"] for agent in ran[2]["agents"]]
+    assert [int(cell) for cell in rows[2][1:]] == list(paper_values.SWITCHES.values["fsams"])
+    assert rows[3][1] == "failed"
+    rows = tables["control-cost"][1:]
+    assert [row[0] for row in rows] == ["sorlc", "MARLBC, printed", "pd"]
     ours = [agent["cost_max"] for agent in ran[0]["agents"]] + [agent["cost_sum"] for agent in ran[0]["agents"]]
-    np.testing.assert_allclose([float(row[1]) for row in rows], np.array(ours) * 1e-4, atol=0.05)
-    assert rows[4][2] == "382†"
+    np.testing.assert_allclose([float(cell) for cell in rows[0][1:9]], np.array(ours) * 1e-4, atol=0.05)
+    assert rows[1][5] == "382†" and rows[0][9] == "1.00"
     rows = tables["control-input"][1:]
-    assert [float(row[1]) for row in rows[:4]] == [round(agent["force_max_inf"]) for agent in ran[0]["agents"]]
+    assert [float(cell) for cell in rows[0][1:5]] == [round(agent["force_max_inf"]) for agent in ran[0]["agents"]]
     rows = tables["decision-time"][1:]
     assert float(rows[0][1]) == float(significant(ran[0]["team"]["decision_ms_median"]))
     rows = tables["all-metrics"][1:]
@@ -119,10 +125,10 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
 
 
 def test_printed_values_belong_to_the_paper_scenario_only(results: list[Result]) -> None:
-    """Elsewhere there is one column a method and no mark."""
+    """Elsewhere there is one row a method and no mark."""
     switches = next(table for table in make_tables(results, "other") if table.name == "switches")
-    assert [column.group for column in switches.columns] == ["", "scripted", "fsams", "mpcms"]
-    assert not switches.grouped and not any("paper's" in note for note in switches.notes)
+    assert [row[0] for row in switches.rows] == ["scripted", "fsams", "mpcms"]
+    assert not any("rinted" in note for note in switches.notes)
 
 
 @pytest.mark.parametrize(
@@ -163,7 +169,7 @@ def test_latex_is_balanced_and_rectangular(results: list[Result]) -> None:
     assert text.isascii()
     bare = re.sub(r"\\[{}]", "", text)
     assert bare.count("{") == bare.count("}")
-    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 5
+    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 6
     for body in re.findall(r"\\begin{tabular}{@{}(l r*|lr*)@{}}(.*?)\\end{tabular}", text, re.DOTALL):
         rows = [line for line in body[1].splitlines() if line.endswith(r"\\")]
         for row in rows:
@@ -205,6 +211,129 @@ def test_failures_appear_in_every_form(results: list[Result]) -> None:
     assert make_tables([results[3]], "paper")[0].rows[0][:2] == ("mpcms+sorlc", "failed")
 
 
+def scaled(name: str, result: Result, cost: float, violation: float = 0.0) -> Result:
+    """The result under another controller's name, its numbers multiplied by ``cost`` and with this violation."""
+    metrics = json.loads(json.dumps(result.metrics))
+    for agent in metrics["agents"]:
+        for key in ("cost_max", "cost_sum", "cost_integral", "effort_sum", "force_max_inf"):
+            agent[key] *= cost
+        agent["violation_time"] = violation
+    supervisor, controller = name.split("+")
+    return Result(supervisor, controller, None, metrics)
+
+
+def test_orders_hold_and_differ_by_the_numbers(results: list[Result]) -> None:
+    """A rival made dearer keeps all printed orders of Tables 5 and 6, one made cheaper none; ties of the paper make none."""
+    sorlc = results[0]
+    for factor, holds in ((2.0, True), (0.5, False)):
+        found = claims([sorlc, scaled("scripted+finite-time", sorlc, factor)])
+        assert {(c.table, c.quantity) for c in found} == {
+            (5, "max cost"),
+            (5, "total cost"),
+            (6, "max input"),
+            (6, "total input"),
+        }
+        for claim in found:
+            assert (claim.lower, claim.higher) == ("sorlc", "finite-time")
+            assert (claim.holds, claim.differs) == (((1, 2, 3, 4), ()) if holds else ((), (1, 2, 3, 4)))
+    tables = {t.name: t for t in make_tables([sorlc, scaled("scripted+finite-time", sorlc, 0.5)], "paper")}
+    assert {row[1] for row in tables["orderings"].rows} == {"no"}
+    assert any("erratum 16" in note for note in tables["orderings"].notes)
+    assert tables["control-cost"].rows[-1][:2] == ("same order", "no (1 of 1)")
+    assert "orderings" not in {t.name for t in make_tables([sorlc], "paper")}
+
+
+def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
+    """With the same actuator a rival is cheaper or it is not, and LQR is safe or it is not."""
+    sorlc = results[0]
+    run = [sorlc, scaled("scripted+finite-time", sorlc, 2.0)]
+    cheap = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 0.25), scaled("scripted+lqr", sorlc, 0.125, 1.7)])
+    assert "every rival is cheaper: finite-time" in cheap and "(0.25 times)" in cheap
+    assert "LQR is the floor" in cheap and "violates the safe distance for 1.70 s" in cheap
+    assert "turns round for finite-time" in cheap
+    dear = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 1.5), scaled("scripted+lqr", sorlc, 3.0)])
+    assert "no rival is cheaper: finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
+    assert "turns round" not in dear and "stands" in dear
+    assert same_actuator(results) == ""
+
+
+def test_limited_rivals_and_lqr_are_a_block_of_their_own(results: list[Result]) -> None:
+    """Below the mark, in the order of the run, with their total over SORLC's."""
+    names = ("lqr", "finite-time", "finite-time-limited")
+    table = make_tables([results[0], *(scaled(f"scripted+{name}", results[0], 0.5) for name in names)], "paper")[3]
+    labels = [row[0] for row in table.rows]
+    assert labels == [
+        "sorlc",
+        "MARLBC, printed",
+        "finite-time",
+        "finite-time, printed",
+        "same order",
+        "lqr",
+        "finite-time-limited",
+    ]
+    assert table.rules == (4, 5) and table.rows[-1][-1] == "0.50"
+
+
+def test_gap_to_the_oracle(results: list[Result]) -> None:
+    """Per controller, a failure as a row, nothing without an oracle."""
+    assert oracle_gap(results) is None
+    best = scaled("oracle+sorlc", results[0], 1.0)
+    assert best.metrics is not None and results[2].metrics is not None
+    best.metrics["team"]["return"] = 1e4
+    table = oracle_gap([*results, best])
+    assert table is not None
+    assert [row[0] for row in table.rows] == ["scripted+sorlc", "fsams+sorlc", "mpcms+sorlc"]
+    assert table.rows[1][2] == f"{1e4 - results[2].metrics['team']['return']:.0f}" and table.rows[2][1] == "failed"
+
+
+def test_marks_that_coincide_are_named(results: list[Result]) -> None:
+    """Controllers whose cost, return, violation and formation error are the same; in a comparison of both, by method."""
+    sorlc = results[0]
+    twin, other = scaled("scripted+sorlc-off", sorlc, 1.0), scaled("scripted+lqr", sorlc, 0.1)
+    assert coincident([sorlc, other, twin]) == [["sorlc", "sorlc-off"]]
+    assert coincident([sorlc, other, scaled("fms+lqr", other, 1.0)]) == [["scripted+lqr", "fms+lqr"]]
+    (plot,) = [p for p in figures.plots([sorlc, other, twin]) if p.stem == "pareto_all"]
+    assert plot.caption.endswith("Marks of sorlc and sorlc-off coincide.")
+
+
+def test_spans_of_numbers() -> None:
+    """Three and more make a span."""
+    assert spans([7, 0, 2, 3, 4, 6]) == "0, 2 to 4, 6, 7" and spans([]) == ""
+
+
+def test_predictions_and_solver_share(results: list[Result]) -> None:
+    """Two kinds of MPCMS are compared; a supervisor that tells its solver's time has a share in Table 4 and the summary."""
+    kinds = [scaled(f"{name}+sorlc", results[0], 1.0) for name in ("mpcms", "mpcms-mujoco")]
+    table = predictions(kinds)
+    assert table is not None and [row[0] for row in table.rows] == ["mpcms+sorlc", "mpcms-mujoco+sorlc"]
+    assert predictions(kinds[:1]) is None
+    told = replace(kinds[0], solver_share=0.75)
+    times = make_tables([results[0], told], "paper")[2]
+    at = next(k for k, column in enumerate(times.columns) if "solver" in column.label)
+    assert [row[at] for row in times.rows[:2]] == ["–", "75"]
+    assert summary([told], "paper", {})["methods"]["mpcms+sorlc"]["solver_share"] == 0.75
+
+
+def test_bands_hold_every_sample() -> None:
+    """Extremes and means of bins, the last one shorter."""
+    time, values = np.arange(10.0), np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100.0])
+    starts, low, mean, high = plotting.bands(time, values, bins=3)
+    assert (starts.tolist(), low.tolist()) == ([0, 4, 8], [0, 4, 8])
+    assert (mean.tolist(), high.tolist()) == ([1.5, 5.5, 54.0], [3, 7, 100])
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
+def test_latex_compiles(results: list[Result], tmp_path: Path) -> None:
+    """tables.tex as it is, in a document that loads booktabs and nothing else."""
+    (tmp_path / "tables.tex").write_text(latex_document(make_tables(results, "paper"), "100 % of x_y."))
+    (tmp_path / "all.tex").write_text(
+        r"\documentclass[twocolumn]{article}\usepackage{booktabs}\begin{document}\input{tables}\end{document}"
+    )
+    command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout[-1000:]
+
+
 def test_envelope_keeps_peaks_and_ends() -> None:
     """Decimation loses no extreme value and stays in order."""
     time = np.arange(20_000) * 0.005
@@ -226,9 +355,9 @@ def test_runs_cover_the_sequence() -> None:
 def test_figures_are_written_at_their_size(drawn: tuple[Path, list[Path]]) -> None:
     """One column or two wide at 300 dpi; PDFs are small and embed TrueType (Type 42) fonts only."""
     folder, paths = drawn
-    assert {path.name for path in paths} == {
-        f"{kind}_scripted_sorlc{suffix}" for kind in figures.KINDS for suffix in (".pdf", ".png")
-    }
+    own = {f"{kind}_scripted_sorlc" for kind in ("trajectories", "priorities", "forces", "errors", "weights")}
+    papers = {"figure4_weights_sorlc", "figure5_weight_errors_sorlc", "figure6_tracking_sorlc"}
+    assert {path.stem for path in paths} == own | papers and len(paths) == 2 * len(own | papers)
     assert sorted(folder.iterdir()) == sorted(paths)
     for path in paths:
         if path.suffix == ".png":
@@ -247,10 +376,13 @@ def test_comparison_figures(results: list[Result]) -> None:
     figure = trajectories(episodes)
     assert figure.get_figwidth() == plotting.DOUBLE
     assert sum(axes.get_visible() for axes in figure.axes) == len(episodes)
-    assert len(pareto(results).axes) == 3
-    assert figures.has_weights(episodes[0]) and not figures.has_weights(episodes[1])
-    with pytest.raises(ValueError, match="'pd' has no network weights"):
-        figures.weight_norms(episodes[1])
+    assert len(pareto(results[:2]).axes) == 3 and len(pareto(results).axes) == 6  # supervisors above, controllers below
+    assert curves.has_weights(episodes[0]) and not curves.has_weights(episodes[1])
+    for draw in (curves.weight_norms, curves.weight_errors):
+        with pytest.raises(ValueError, match="'pd' has no network weights"):
+            draw(episodes[1])
+    assert len(curves.priorities(episodes).axes) == 4
+    assert len(curves.control(episodes, 3).axes) == 3 * 3
 
 
 def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]], tmp_path: Path) -> None:
@@ -272,7 +404,7 @@ def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]]
     ).read_text(encoding="utf-8")
     assert set(re.findall(r"https?://[^\s\"<]+", page)) == {paper_values.DOI}
     assert not re.search(r"(?:src|href)=\"?(?:/|\.\./|file:)|<script|@import|url\(", page)
-    assert page.count('src="data:image/png;base64,') == len(figures.KINDS)
+    assert page.count('src="data:image/png;base64,') == 5 + 3
     assert 'src="data:video/mp4;base64,' in page
     assert "$" not in re.sub(r"base64,[^\"]*", "", page)
     for text in ("mpcms+sorlc", "abc1234", "--out &lt;here&gt;", 'href="logs/a%20b.mcap"', "scripted+pd", "&lt;limit&gt;"):

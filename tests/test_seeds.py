@@ -14,7 +14,10 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.metrics import measure
 from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
-from marlbc_mj.report.seeds import make_tables, summary, write_csv, write_seed_report
+from marlbc_mj.report.seed_files import summary, write_csv
+from marlbc_mj.report.seed_page import write_seed_report
+from marlbc_mj.report.seed_statistics import analyse, by_supervisor, group
+from marlbc_mj.report.seed_tables import make_tables
 from marlbc_mj.report.table import to_html, to_latex, to_markdown
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
 from marlbc_mj.seeds import (
@@ -23,10 +26,8 @@ from marlbc_mj.seeds import (
     MethodRuns,
     SeedResults,
     SeedRun,
-    analyse,
-    by_supervisor,
-    group,
     perturbed,
+    run_methods,
     run_seeds,
     seed_range,
 )
@@ -134,7 +135,7 @@ def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
     assert set(content["methods"]["scripted+pd"]["failures"]) == {"0", "1", "2"}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     return_table, *_, failures = make_tables(results, methods)
-    assert return_table.rows[1][:2] == ("scripted+sorlc", "–")
+    assert return_table.rows[1][:2] == ("scripted+sorlc", "failed")
     assert failures.rows[0] == ("scripted+pd", "3/3", "0 to 2")
 
 
@@ -213,6 +214,32 @@ def test_report_without_figures(failing: SeedResults, tmp_path: Path) -> None:
     assert not (tmp_path / "figures").exists() and "Not drawn" in page.read_text(encoding="utf-8")
 
 
+def test_a_method_that_cannot_start_is_a_row_on_every_seed(tmp_path: Path) -> None:
+    """The oracle has no schedule for a draw, and a step of 25 ms is too long for some laws: the rest runs."""
+    methods = [("scripted", "lqr"), ("oracle", "lqr"), ("scripted", "pd")]
+    results = run_methods(paper(duration=0.5, substep=0.025), methods, (0, 1))
+    ran, oracle, unstable = results.methods
+    assert not ran.failed
+    assert all("no schedule" in str(run.failure) for run in oracle.runs) and len(oracle.runs) == 2
+    assert all("25 ms" in str(run.failure) and run.instance is None for run in unstable.runs)
+    statistics = analyse(results)
+    assert [row[:2] for row in make_tables(results, statistics)[-1].rows] == [("oracle+lqr", "2/2"), (unstable.key, "2/2")]
+    write_seed_report(results, tmp_path, config=CONFIG, figures=False)
+    assert "no schedule" in (tmp_path / "tables.md").read_text()
+
+
+def test_captions_flag_too_few_draws(results: SeedResults) -> None:
+    """Four draws have intervals that are too narrow, and every table says so."""
+    tables = make_tables(results, analyse(results))
+    assert all("(only 4 draws: intervals are too narrow)" in table.caption for table in tables)
+
+
+def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, failing: SeedResults) -> None:
+    """One supervisor with two controllers is one pooled row beside nothing."""
+    assert "seeds-groups" in [table.name for table in make_tables(results, analyse(results))]
+    assert "seeds-groups" not in [table.name for table in make_tables(failing, analyse(failing))]
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
@@ -226,7 +253,6 @@ def test_report_without_figures(failing: SeedResults, tmp_path: Path) -> None:
         (lambda: run_seeds(paper(), ("scripted",), ("nothing",), (0,)), "unknown controller 'nothing'"),
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), reference="a+b"), "'a\\+b' is not run; choose from: scripted"),
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), workers=0), "workers must be at least 1, got 0"),
-        (lambda: run_seeds(paper(schedule=()), ("scripted",), ("pd",), (0,)), "has no schedule"),
     ],
 )
 def test_bad_input_is_one_line(call, message: str) -> None:  # type: ignore[no-untyped-def]

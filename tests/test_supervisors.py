@@ -21,7 +21,9 @@ def at(step: int, clearance=(9.0, 9.0, 9.0, 9.0)) -> Situation:
     """A situation at a mission step; only time and clearance matter to these supervisors."""
     zeros = np.zeros((4, 2))
     obstacles = PAPER.obstacle_array()
-    return Situation(step, step * 0.05, zeros, zeros, np.array(clearance, dtype=float), 0, np.zeros(4, dtype=np.int64), obstacles)
+    return Situation(
+        step, step * 0.05, zeros, zeros, np.array(clearance, dtype=float), 0, np.zeros(4, dtype=np.int64), obstacles, zeros
+    )
 
 
 def run(supervisor, clearances) -> np.ndarray:

@@ -49,14 +49,17 @@ class ScenarioOptions:
 
 @dataclass(frozen=True)
 class Bench:
-    """Run every supervisor with every controller and write tables, figures, logs, a video and a page."""
+    """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
+
+    By default every supervisor runs with sorlc, and scripted with every controller.
+    """
 
     scenario: Positional[str] = "paper"
     """Scenario, see `marlbc list`."""
-    supervisors: tuple[str, ...] = ("scripted", "fsams", "fsams-hysteresis")
-    """Supervisors to run."""
-    controllers: tuple[str, ...] = ("sorlc", "pd")
-    """Controllers to run each of them with."""
+    supervisors: tuple[str, ...] | None = None
+    """Supervisors to run, each with every one of --controllers (scripted, if only those are named)."""
+    controllers: tuple[str, ...] | None = None
+    """Controllers to run each supervisor with (sorlc, if only supervisors are named)."""
     out: Path = Path("out/paper")
     """Folder of the results."""
     seed: int = 0

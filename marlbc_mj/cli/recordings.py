@@ -1,5 +1,6 @@
 """``marlbc video``, ``view`` and ``log``: what is made from an MCAP log."""
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -37,12 +38,19 @@ class Video:
     """Replace an existing file."""
 
     def run(self) -> None:
-        """Render, with progress."""
+        """Render, with progress; the backend is named once there is a first frame."""
+        from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
         from marlbc_mj.recording.video import render_video
 
         out = self.out or self.log.with_suffix(".mp4")
         with progress_bars() as progress:
+
+            def show(done: int, total: int) -> None:
+                if done == 1:
+                    print(f"marlbc: off-screen rendering with {choose_gl()}", file=sys.stderr)
+                progress("video", done, total)
+
             render_video(
                 read_log(self.log),
                 out,
@@ -55,7 +63,7 @@ class Video:
                 end=self.end,
                 samples=self.samples,
                 overwrite=self.overwrite,
-                progress=lambda done, total: progress("video", done, total),
+                progress=show,
             )
         print(out)
 

@@ -1,4 +1,4 @@
-"""``marlbc list``, ``perf``, ``ablation`` and ``oracle``: what there is, how fast it is, and the studies behind the numbers."""
+"""``marlbc list``, ``perf``, ``ablation``, ``calibrate`` and ``oracle``: what there is, how fast, and what is behind it."""
 
 import sys
 from dataclasses import dataclass
@@ -46,24 +46,56 @@ class Perf:
 
 @dataclass(frozen=True)
 class Ablation:
-    """Measure what SORLC's basis is worth: printed, scaled, off, the exact model, and the sweep of the scaled gains."""
+    """Measure what SORLC's basis, its gains and compensator, the reference mode, the avoidance and the substep are worth."""
 
+    study: tuple[str, ...] = ()
+    """Studies to run: basis, sweep, sorlc, reference, avoidance, substep; all of them by default."""
     out: Path | None = None
-    """Markdown file for the tables."""
+    """Folder for ablation.md, ablation.csv and index.html."""
     overwrite: bool = False
-    """Replace an existing file."""
+    """Replace what is in the output folder."""
 
     def run(self) -> None:
-        """Run the studies and print their tables."""
-        from marlbc_mj.ablation import basis_study, gain_sweep, markdown
-        from marlbc_mj.files import staged_file
+        """Run the studies, print their tables, and write the page if asked."""
+        from contextlib import nullcontext
 
-        with progress_bars() as progress:
-            text = markdown(basis_study(progress)) + "\n\n" + markdown(gain_sweep(progress)) + "\n"
-        print(text)
+        from marlbc_mj.ablation import run_study, select_studies, study_table, write_page
+        from marlbc_mj.files import staged_folder
+        from marlbc_mj.provenance import git_revision, versions
+        from marlbc_mj.report.table import to_markdown
+
+        studies = select_studies(self.study)
+        with nullcontext() if self.out is None else staged_folder(self.out, overwrite=self.overwrite) as folder:
+            with progress_bars() as progress:
+                results = {study.name: (study, run_study(study, progress)) for study in studies}
+            if folder is not None:
+                facts = {"revision": git_revision(), "versions": ", ".join(f"{k} {v}" for k, v in versions().items())}
+                write_page(results, folder, facts)
+        print("\n".join(to_markdown(study_table(study, rows)) for study, rows in results.values()))
         if self.out is not None:
-            with staged_file(self.out, overwrite=self.overwrite) as staging:
-                staging.write_text(text)
+            print(f"{self.out / 'index.html'} shows it all")
+
+
+@dataclass(frozen=True)
+class Calibrate:
+    """Find the velocity gains that give Table 6's printed maxima, and compare them with the shipped ones."""
+
+    controllers: tuple[str, ...] = ("finite-time", "fixed-time")
+    """Controllers to calibrate."""
+
+    def run(self) -> None:
+        """Search and print the table."""
+        from functools import partial
+
+        from marlbc_mj.calibration import CALIBRATED, calibrate, calibration_lines
+        from marlbc_mj.errors import unknown
+
+        for name in self.controllers:
+            if name not in CALIBRATED:
+                raise unknown("calibrated controller", name, CALIBRATED)
+        with progress_bars() as progress:
+            results = [calibrate(name, progress=partial(progress, name)) for name in self.controllers]
+        print("\n".join(calibration_lines(results)))
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 sig(x)^a = sign(x) |x|^a and phi_a(x) = sign(x) min(|x|, 1)^a, axis by axis. Their velocity gains are calibrated: at a switch
 between FM and FR v_r jumps by Lambda |dy| = 48 or 96 m/s, and Table 6's maxima are 8 times (finite-time) and 20 times
-(fixed-time) that. Totals are not fitted, and no convergence theorem is claimed. f^ is the true f by default, which is
-generous to them.
+(fixed-time) that, but for one agent's under fixed-time; ``marlbc calibrate`` repeats it. Totals are not fitted, and no
+convergence theorem is claimed. f^ is the true f by default, which is generous to them.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,11 @@ class _Homogeneous:
 
 @dataclass(frozen=True)
 class FiniteTime(_Homogeneous):
-    """u = -f^ - 8 e_v - 4 sig(e_p)^0.6 - phi_0.75(e_v)."""
+    """u = -f^ - 8 e_v - 4 sig(e_p)^0.6 - phi_0.75(e_v), with the default gains.
+
+    Source: Huang et al. 2019 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.calibration`);
+    ``position_gain`` and the powers are chosen here.
+    """
 
     velocity_gain: float = 8.0  # [1/s]
     position_gain: float = 4.0
@@ -71,7 +75,11 @@ class FiniteTime(_Homogeneous):
 
 @dataclass(frozen=True)
 class FixedTime(_Homogeneous):
-    """u = -f^ - 20 e_v - 10 sig(e_p)^0.6 - sig(e_p)^1.4 - phi_0.75(e_v) - 0.02 sig(e_v)^(7/6)."""
+    """u = -f^ - 20 e_v - 10 sig(e_p)^0.6 - sig(e_p)^1.4 - phi_0.75(e_v) - 0.02 sig(e_v)^(7/6), with the default gains.
+
+    Source: Zhou et al. 2022 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.calibration`); the other
+    gains and the powers are chosen here.
+    """
 
     velocity_gain: float = 20.0  # [1/s]
     position_gain: float = 10.0

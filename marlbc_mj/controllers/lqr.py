@@ -30,7 +30,7 @@ def riccati_gains(state_weight: float, control_weight: float) -> tuple[float, fl
 
 @dataclass(frozen=True)
 class LQR:
-    """Riccati gains for the cost (24) with alpha_V and beta_V."""
+    """Riccati gains for the cost (24); source: :func:`riccati_gains` of its weights alpha_V and beta_V, nothing is fitted."""
 
     state_weight: float = 1.0  # alpha_V
     control_weight: float = 1.0  # beta_V

@@ -4,6 +4,7 @@ The pieces (:func:`begin_step`, :func:`team_forces`, :func:`run_substeps`, :func
 dm_control task call, so there is one definition of a mission step. Its order of operations:
 
 1. at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p (``actual``), and held;
+   a v_r that is given takes the place of the one that the orders make;
 2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), MuJoCo's
    semi-implicit Euler step, then p_r += h v_r;
 3. at the end: clearances, formation identifier and reward from the measured positions.
@@ -176,14 +177,22 @@ _run_substeps_compiled = allocation_free(run_substeps)
 
 @allocation_free
 def begin_step(  # type: ignore[no-untyped-def]
-    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, obstacles, p, p_r, v_r, commands,
-    scratch,
+    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, given, obstacles, p, p_r, v_r,
+    commands, scratch,
 ):  # fmt: skip
-    """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15)."""
-    now = scratch[:2]
-    path_at(t, path, now)
-    at = p_r if virtual else p
-    set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch[2:7], v_r)
+    """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15).
+
+    ``given`` (N, 2) [m/s] is taken as v_r as it is; (0, 2) has the orders composed.
+    """
+    if given.shape[0] > 0:
+        for i in range(v_r.shape[0]):
+            for axis in range(2):
+                v_r[i, axis] = given[i, axis]
+    else:
+        now = scratch[:2]
+        path_at(t, path, now)
+        at = p_r if virtual else p
+        set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch[2:7], v_r)
     return count_switches(orders, command_of, commands, step)
 
 
@@ -194,16 +203,16 @@ def mission_step(  # type: ignore[no-untyped-def]
     step_function, model, indices, sizes, controller_law, controller_params, disturbance_law,
     behavior_laws, behavior_params, table, command_of, path, formations, settings,
     # one row a world
-    data, disturbance_params, obstacles, orders, commands, p, v, p_r, v_r, state, clearance, formation, reward, steps,
-    status, record, scratch,
+    data, disturbance_params, obstacles, orders, given, commands, p, v, p_r, v_r, state, clearance, formation, reward,
+    steps, status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
-    [m], safe distance [m], virtual (0/1).
+    [m], safe distance [m], virtual (0/1); ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders make it.
     """
     t = steps[b] * settings[0]
     r2 = begin_step(
-        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], obstacles[b],
-        p[b], p_r[b], v_r[b], commands[b], scratch[b],
+        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], given[b],
+        obstacles[b], p[b], p_r[b], v_r[b], commands[b], scratch[b],
     )  # fmt: skip
     agents = p.shape[1]
     drag, force = scratch[b, SCRATCH : SCRATCH + agents], scratch[b, SCRATCH + agents :]

@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from marlbc_mj import laws
+from marlbc_mj.behaviors import Behavior
 from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.native import step_address
@@ -82,7 +83,7 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
     xml = assemble(scenario, limit)
     model = mujoco.MjModel.from_xml_string(xml)
     agents = range(scenario.agents)
-    behaviors = [[b.params(i) for i in agents] for b in scenario.behaviors]
+    behavior_laws, behavior_params = behavior_arrays(scenario.behaviors, scenario.agents)
     return Plan(
         scenario=scenario,
         controller=controller,
@@ -90,8 +91,8 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         model=model,
         indices=find_indices(model, scenario),
         sizes=np.array([model.nq, model.nv, model.nu], dtype=np.int64),
-        behavior_laws=_behavior_laws(scenario),
-        behavior_params=_padded(behaviors),
+        behavior_laws=behavior_laws,
+        behavior_params=behavior_params,
         controller_params=_padded([[controller.params(i, limit) for i in agents]])[0],
         initial_state=np.array([controller.initial_state(i) for i in agents], dtype=np.float64),
         disturbance_params=np.array(scenario.disturbance.params(), dtype=np.float64),
@@ -122,10 +123,16 @@ def find_indices(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
     return indices
 
 
-def _behavior_laws(scenario: Scenario) -> np.ndarray:
+def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndarray, np.ndarray]:
+    """``behavior_laws`` (M,) and ``behavior_params`` (M, N, P) of a plan, for N ``agents``.
+
+    Raises:
+        ConfigurationError: a law that is not compiled, or not a behavior's.
+    """
+    params = _padded([[b.params(i) for i in range(agents)] for b in behaviors])
     if numba.config.DISABLE_JIT:
-        return np.array([b.law for b in scenario.behaviors], dtype=object)
-    return np.array([laws.address(b.law, laws.BEHAVIOR) for b in scenario.behaviors], dtype=np.uint64)
+        return np.array([b.law for b in behaviors], dtype=object), params
+    return np.array([laws.address(b.law, laws.BEHAVIOR) for b in behaviors], dtype=np.uint64), params
 
 
 def _padded(rows: Sequence[Sequence[Sequence[float]]]) -> np.ndarray:

@@ -18,6 +18,7 @@ class Observation(NamedTuple):
     clearance: np.ndarray  # (B, N) to the nearest obstacle's surface [m]
     formation: np.ndarray  # (B,) int64, G: 2 in formation, 1 in column, 0 neither
     command: np.ndarray  # (B, N) int64, index into scenario.orders.commands of the last order; 0 before the first
+    reference: np.ndarray  # (B, N, 2) p_r [m], where a ``virtual`` reference has its behaviors evaluated
 
     def state(self) -> np.ndarray:
         """The printed state s = (X, Pr, G), (B, (2n+1)N+1): positions and velocities agent by agent, priorities, G."""
@@ -47,6 +48,7 @@ class TeamState:
         self.reward = np.zeros(worlds)
         self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
         self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
+        self.composed = np.zeros((worlds, 0, 2))  # no velocities given: the orders make v_r
 
     def reset(self, b: int, rng: np.random.Generator) -> np.ndarray:
         """Put world ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m]."""
@@ -61,18 +63,33 @@ class TeamState:
         self._judge(b)
         return draw.starts
 
+    def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
+        """Put world ``b`` in the middle of a mission, as :meth:`World.place` says; controllers start anew."""
+        self.position[b] = self.reference[b] = position
+        self.velocity[b] = self.reference_velocity[b] = velocity
+        self.controller[b] = self.plan.initial_state
+        self.steps[b], self.command[b], self.reward[b] = step, command, 0.0
+        self._judge(b)
+
+    def arrays(self, *, copy: bool = False) -> dict[str, np.ndarray]:
+        """All arrays by name: the very ones, or copies."""
+        own = {name: array for name, array in vars(self).items() if isinstance(array, np.ndarray)}
+        return {name: array.copy() for name, array in own.items()} if copy else own
+
     def copy_row(self, source: "TeamState", source_world: int, world: int) -> None:
         """Make row ``world`` equal to another state's row."""
-        for name, array in vars(self).items():
-            if isinstance(array, np.ndarray):
-                array[world] = getattr(source, name)[source_world]
+        for name, array in self.arrays().items():
+            array[world] = getattr(source, name)[source_world]
 
     def time(self, b: int) -> float:
         """Mission time of world ``b`` [s]."""
         return float(self.steps[b] * self.plan.scenario.mission_step)
 
-    def begin(self, b: int, orders: np.ndarray) -> None:
-        """Start a mission step of world ``b``: orders (N,) become commands, reference velocities and r2."""
+    def begin(self, b: int, orders: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Start a mission step of world ``b``: orders (N,) become commands, reference velocities and r2.
+
+        ``velocity`` (N, 2) [m/s] is v_r in the place of what the orders make.
+        """
         plan = self.plan
         orders_of = plan.scenario.orders
         self.reward[b] = loop.begin_step(
@@ -85,6 +102,7 @@ class TeamState:
             orders_of.command_of,
             plan.path,
             orders,
+            self.composed[b] if velocity is None else velocity,
             self.obstacles[b],
             self.position[b],
             self.reference[b],
@@ -120,14 +138,16 @@ class TeamState:
             self.clearance.copy(),
             self.formation.copy(),
             self.command.copy(),
+            self.reference.copy(),
         )
 
-    def rows(self, orders: np.ndarray) -> tuple[np.ndarray, ...]:
+    def rows(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
         """The arguments of ``mission_step`` with one row a world, from disturbance_params to steps, in its order."""
         return (
             self.disturbance_params,
             self.obstacles,
             orders,
+            self.composed if velocity is None else velocity,
             self.command,
             self.position,
             self.velocity,

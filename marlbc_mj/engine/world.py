@@ -1,5 +1,6 @@
 """World: B simulated copies of one scenario, stepped together, one mission step at a time."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import mujoco
@@ -12,6 +13,9 @@ from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.engine.state import Observation, TeamState
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
+
+PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
+"""What of MuJoCo's data is a world's state."""
 
 
 class Record(NamedTuple):
@@ -106,29 +110,63 @@ class World:
         For starting many predictions from one state.
         """
         self.state.copy_row(source.state, source_world, world)
-        size = mujoco.mj_stateSize(self.plan.model, mujoco.mjtState.mjSTATE_INTEGRATION)
-        buffer = np.empty(size)
-        mujoco.mj_getState(self.plan.model, source.data[source_world], buffer, mujoco.mjtState.mjSTATE_INTEGRATION)
-        mujoco.mj_setState(self.plan.model, self.data[world], buffer, mujoco.mjtState.mjSTATE_INTEGRATION)
+        mujoco.mj_setState(self.plan.model, self.data[world], source.physics(source_world), PHYSICS)
+
+    def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
+        """Put world ``b`` in the middle of a mission: an episode that starts along the route.
+
+        Args:
+            b: the world; its obstacles and disturbance stay as they were drawn.
+            step: mission steps that count as made.
+            position, velocity: (N, 2) [m], [m/s] of the agents and of their references alike.
+            command: (N,) indices into ``scenario.orders.commands`` that count as given last.
+        """
+        self.state.place(b, step, position, velocity, command)
+        data, indices = self.data[b], self.plan.indices
+        mujoco.mj_resetData(self.plan.model, data)
+        data.time = step * self.scenario.mission_step
+        data.qpos[indices[0].ravel()] = np.ravel(position)
+        data.qvel[indices[1].ravel()] = np.ravel(velocity)
+
+    def physics(self, b: int) -> np.ndarray:
+        """MuJoCo's integration state of world ``b``."""
+        buffer = np.empty(mujoco.mj_stateSize(self.plan.model, PHYSICS))
+        mujoco.mj_getState(self.plan.model, self.data[b], buffer, PHYSICS)
+        return buffer
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of everything that changes while worlds run, by name; :meth:`restore` continues from it bit for bit."""
+        return {**self.state.arrays(copy=True), "physics": np.stack([self.physics(b) for b in range(self.worlds)])}
+
+    def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
+        """Go back to a :meth:`snapshot` of a World with the same plan and number of worlds."""
+        for name, array in self.state.arrays().items():
+            array[:] = snapshot[name]
+        for b in range(self.worlds):
+            mujoco.mj_setState(self.plan.model, self.data[b], snapshot["physics"][b], PHYSICS)
 
     def observe(self) -> Observation:
         """What a supervisor decides on, as copies."""
         return self.state.observe()
 
-    def step(self, orders: np.ndarray) -> Step:
+    def step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
         """One mission step of every world.
 
         Args:
             orders: (B, N) integers, indices into ``scenario.orders``.
+            velocity: (B, N, 2) reference velocities v_r [m/s] in the place of the composed ones (12); the orders then are only
+                the label under which the step is counted, priced by r2 and recorded.
 
         Raises:
-            ConfigurationError: wrong shape, or an index that is no order.
+            ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
             SimulationError: a number left the physical range or is NaN; names world, agent and time.
         """
         orders = self._checked(orders)
-        failed = self.advance(orders) if self.native else self._advance_in_python(orders)
+        if velocity is not None:
+            velocity = self._checked_velocity(velocity)
+        failed = self.advance(orders, velocity) if self.native else self._advance_in_python(orders, velocity)
         if failed:
-            self._raise_if_diverged()
+            self.raise_if_diverged()
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
 
@@ -149,27 +187,35 @@ class World:
             raise ConfigurationError("rollout needs compiled laws; use step")
         sequence = np.stack([self._checked(row) for row in np.asarray(orders)])
         buffer, returns = np.zeros_like(sequence[0]), np.zeros(self.worlds)
-        args = (*self._fixed, self._addresses, *self.state.rows(buffer), self._status, self._record, self.state.scratch)
+        args = self._arguments(buffer)
         if self.threads == 1 or self.worlds == 1:
             loop.rollout_serial(self.worlds, returns, sequence, buffer, self.state.reward, *args)
         else:
             numba.set_num_threads(self.threads)
             loop.rollout_parallel(self.worlds, returns, sequence, buffer, self.state.reward, *args)
-        self._raise_if_diverged()
+        self.raise_if_diverged()
         return returns
 
-    def _raise_if_diverged(self) -> None:
+    def raise_if_diverged(self) -> None:
+        """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
         if self._status.any():
             b = int(np.flatnonzero(self._status)[0])
             raise self.state.diverged(b, int(self._status[b]))
 
-    def advance(self, orders: np.ndarray) -> int:
-        """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64: no checks, no copies; how many worlds failed."""
-        rows = (self._addresses, *self.state.rows(orders), self._status, self._record, self.state.scratch)
+    def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
+        """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both
+        contiguous: no checks, no copies; how many worlds failed.
+        """
+        args = self._arguments(orders, velocity)
         if self.threads == 1 or self.worlds == 1:
-            return int(loop.step_serial(self.worlds, *self._fixed, *rows))
+            return int(loop.step_serial(self.worlds, *args))
         numba.set_num_threads(self.threads)
-        return int(loop.step_parallel(self.worlds, *self._fixed, *rows))
+        return int(loop.step_parallel(self.worlds, *args))
+
+    def _arguments(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[object, ...]:
+        """The arguments of ``mission_step`` after ``b``, in its order."""
+        state = self.state
+        return (*self._fixed, self._addresses, *state.rows(orders, velocity), self._status, self._record, state.scratch)
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         if getattr(orders, "dtype", np.dtype(np.int64)).kind not in "iu":
@@ -182,16 +228,31 @@ class World:
             raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
         return orders
 
-    def _advance_in_python(self, orders: np.ndarray) -> int:
-        return sum(self._python_step(b, orders[b]) for b in range(self.worlds))
+    def _checked_velocity(self, velocity: np.ndarray) -> np.ndarray:
+        velocity = np.asarray(velocity)
+        if velocity.dtype.kind not in "fiu":
+            raise ConfigurationError(f"velocity must be numbers [m/s], got {velocity.dtype}")
+        shape = (self.worlds, self.scenario.agents, 2)
+        if velocity.shape != shape:
+            raise ConfigurationError(f"velocity must have shape {shape} (worlds, agents, axes), got {velocity.shape}")
+        velocity = np.ascontiguousarray(velocity, dtype=np.float64)
+        bad = np.argwhere(~np.isfinite(velocity))
+        if len(bad):
+            b, i, axis = bad[0].tolist()
+            raise ConfigurationError(f"velocity must be finite, got {velocity[b, i, axis]} for world {b}, agent {i + 1}")
+        return velocity
 
-    def _python_step(self, b: int, orders: np.ndarray) -> bool:
+    def _advance_in_python(self, orders: np.ndarray, velocity: np.ndarray | None) -> int:
+        given = [None] * self.worlds if velocity is None else velocity
+        return sum(self._python_step(b, orders[b], given[b]) for b in range(self.worlds))
+
+    def _python_step(self, b: int, orders: np.ndarray, velocity: np.ndarray | None) -> bool:
         """The Python path: the same source as the compiled loop, with laws and ``mj_step`` called from Python; True if it
         failed.
         """
         plan, state = self.plan, self.state
         start = state.time(b)
-        state.begin(b, orders)
+        state.begin(b, orders, velocity)
         drag, force = np.split(state.scratch[b, loop.SCRATCH :], 2)
         self._status[b] = loop.run_substeps(
             mujoco.mj_step,

@@ -8,11 +8,13 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import fields
+from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 import zstandard
+from mcap.data_stream import RecordBuilder
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.reader import McapReader, make_reader
@@ -44,7 +46,7 @@ def read_log(path: str | Path) -> EpisodeLog:
         metadata = _marlbc_metadata(path, reader)
         model = next((a.data.decode() for a in reader.iter_attachments() if a.name == MODEL), None)
         if model is None:
-            raise ConfigurationError(f"{path} has no attachment {MODEL}; it was not written by marlbc")
+            raise ConfigurationError(f"{path} has no attachment {MODEL}; it was damaged, or not written by marlbc")
         columns = _columns(_messages(path, reader))
         return EpisodeLog(
             scenario=metadata["scenario"],
@@ -107,14 +109,15 @@ def _topics(summary: Summary, count: Statistics) -> dict[str, dict[str, Any]]:
 def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> int:
     """Copy everything whole out of a torn or damaged MCAP into a new one, which any reader opens.
 
-    Metadata and attachments stand at the start of a log and survive with its first chunk. A chunk that fails its checksum is
-    left out.
+    Metadata and attachments stand at the start of a log and survive with its first chunk. A chunk or an
+    attachment that fails its checksum is left out; metadata has none.
 
     Returns:
-        How many messages were saved: 0 if the file was torn before its first chunk ended.
+        How many messages were saved.
 
     Raises:
-        ConfigurationError: no such file, no MCAP, or an output that cannot or must not be written.
+        ConfigurationError: no such file, no MCAP, no whole message in it (it was torn before its first chunk ended, for
+            example), or an output that cannot or must not be written. Nothing is written then.
     """
     with _open_file(torn) as source, staged_file(Path(out), overwrite=overwrite) as staging, open(staging, "wb") as target:
         writer = Writer(target, enable_data_crcs=True)
@@ -123,6 +126,8 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
         header = first if isinstance(first, Header) else Header("", "")
         writer.start(header.profile, header.library)
         saved = _copy(records, writer)
+        if not saved:
+            raise ConfigurationError(f"{torn} holds no whole message, so there is nothing to recover")
         writer.finish()
     return saved
 
@@ -175,7 +180,7 @@ def _check_whole(path: str | Path, stream: BinaryIO) -> None:
     stream.seek(0)
     opcode, length, summary_start, _, summary_crc, magic = _END.unpack(data[-_END.size :].rjust(_END.size, b"\0"))
     if (opcode, length, magic) != (Opcode.FOOTER, 20, MCAP0_MAGIC):
-        raise ConfigurationError(f"{path} is truncated; `marlbc log recover {path} OUT` salvages it")
+        raise ConfigurationError(f"{path} is truncated; `marlbc log recover {path} OUT` salvages what is whole")
     if summary_crc and zlib.crc32(data[summary_start : -len(MCAP0_MAGIC) - 4]) != summary_crc:
         raise ValueError("wrong checksum of its summary")
     if summary_start:
@@ -243,8 +248,17 @@ def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
         if isinstance(record, Chunk):
             with suppress(*_DAMAGE):  # a damaged chunk between whole ones costs only itself
                 yield from breakup_chunk(record, validate_crc=True)
-        else:
+        elif not isinstance(record, Attachment) or _is_whole(record, source):
             yield record
+
+
+def _is_whole(attachment: Attachment, source: BinaryIO) -> bool:
+    """Whether the attachment just read from ``source`` fits its checksum, which the mcap package does not look at."""
+    source.seek(-4, SEEK_CUR)
+    stored = source.read(4)
+    record = RecordBuilder()
+    attachment.write(record)
+    return stored in (bytes(4), bytes(record.end()[-4:]))  # zero: none was written
 
 
 def _copy(records: Iterator[McapRecord], writer: Writer) -> int:

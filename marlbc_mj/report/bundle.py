@@ -6,6 +6,7 @@ from typing import Any
 
 from marlbc_mj.files import write_json
 from marlbc_mj.report.figures import write_figures
+from marlbc_mj.report.findings import same_actuator
 from marlbc_mj.report.page import write_page
 from marlbc_mj.report.results import Result, summary, write_csv
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
@@ -28,12 +29,12 @@ def write_report(
         figures: False leaves the figures out.
         progress: called with what is being done, how much of it is done and how much there is.
     """
-    scenario = config["scenario"]
+    scenario, paragraph = config["scenario"], same_actuator(results)
     tables = make_tables(results, scenario.name)
     write_json(folder / "summary.json", summary(results, scenario.name, config["versions"]))
     write_csv(results, folder / "episodes.csv")
-    (folder / "tables.md").write_text(markdown(tables), encoding="utf-8")
-    (folder / "tables.tex").write_text(latex_document(tables), encoding="utf-8")
+    (folder / "tables.md").write_text(markdown(tables, paragraph), encoding="utf-8")
+    (folder / "tables.tex").write_text(latex_document(tables, paragraph), encoding="utf-8")
     if figures:
         write_figures(results, folder / "figures", lambda done, total: progress("figures", done, total) if progress else None)
     return write_page(
@@ -45,13 +46,14 @@ def write_report(
         revision=config["git_revision"],
         command=config["command"],
         tables=tables,
+        paragraph=paragraph,
         figures=folder / "figures",
         video=videos[0] if videos else None,
-        links=_links(folder, videos[1:]),
+        links=files_beside(folder, videos[1:]),
     )
 
 
-def _links(folder: Path, videos: Sequence[Path]) -> list[Path]:
+def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
     """What lies beside the page and is worth a link."""
     names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
     files = [folder / name for name in names if (folder / name).exists()]

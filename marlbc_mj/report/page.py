@@ -13,21 +13,13 @@ from urllib.parse import quote
 from PIL import Image
 
 from marlbc_mj.report import paper_values
-from marlbc_mj.report.figures import COMPARISONS, KINDS, file_stem
+from marlbc_mj.report.figures import Plot, plots
 from marlbc_mj.report.results import Result
 from marlbc_mj.report.table import Table, to_html
 from marlbc_mj.scenarios import Scenario
 
 LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]
 _SINGLE_PIXELS = 1200  # PNGs narrower than this fill one column only
-_CAPTIONS = {
-    "trajectories": "Paths, colored by the highest behavior in force; black casing: inside the safe distance.",
-    "priorities": "Behavior priorities over time and the number of switches.",
-    "forces": "Applied force; each pixel column keeps its extremes.",
-    "errors": "Tracking errors, each pixel column its largest.",
-    "weights": "Frobenius norms of the network weights.",
-    "pareto": "Control cost against what it buys.",
-}
 _READING = """
 <p>Every method is a <em>supervisor</em>, which picks each agent's behavior priorities at every mission step, and a
 <em>controller</em>, which turns the resulting reference into a force at every physics step. Supervisors are compared under one
@@ -37,7 +29,7 @@ is a collision. Only among safe methods do return, switches and cost mean much: 
 unsafe, so no single column ranks the methods. The return does not see how deep or how long a violation is at one place;
 violation time does. Decision times depend on the machine, ratios between methods less so.</p>"""
 _PAPER_TEXT = (
-    "Our numbers stand beside the printed ones. Reconstructed rivals cannot match digit for digit, so the last column says "
+    "Our numbers stand beside the printed ones. Reconstructed rivals cannot match digit for digit, so one row of each table says "
     "whether the methods keep the printed order; values under an erratum are marked and compared by order only."
 )
 _OWN_TEXT = "This is not the paper's scenario, so no printed numbers are shown beside ours."
@@ -54,6 +46,7 @@ def write_page(
     command: str,
     tables: Sequence[Table],
     figures: Path,
+    paragraph: str = "",
     video: Path | None = None,
     links: Sequence[Path] = (),
 ) -> Path:
@@ -64,28 +57,63 @@ def write_page(
         revision: of the sources, as git names it.
         command: what makes this report again.
         tables: as :func:`marlbc_mj.report.tables.make_tables` gives them, the one of all metrics first.
+        paragraph: of plain text, shown above the tables.
         figures: folder that :func:`marlbc_mj.report.figures.write_figures` wrote to; figures that are not there are left out.
         video: an mp4 to embed, or to link to beyond 20 MB.
         links: files to list, linked relative to the page.
     """
-    printed = scenario.name == paper_values.SCENARIO
-    text = Template(files("marlbc_mj.report").joinpath("page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"Behavioral control benchmark: {scenario.name}"),
+    text = _PAPER_TEXT if scenario.name == paper_values.SCENARIO else _OWN_TEXT
+    drawn = plots(results)
+    overall = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in drawn if p.method is None)
+    return fill_page(
+        path,
+        title=f"Behavioral control benchmark: {scenario.name}",
         lead=_lead(results, scenario),
         facts=_facts(results, scenario, versions, seed, revision),
-        command=html.escape(command),
+        command=command,
         failures=_failures(results),
         overview=to_html(tables[0]) if tables else "",
-        paper_text=_PAPER_TEXT if printed else _OWN_TEXT,
-        tables="".join(map(to_html, tables[1:])),
-        comparisons="".join(_plot(figures / f"{file_stem(kind)}.png", _CAPTIONS[kind]) for kind in COMPARISONS)
-        or "<p>Not drawn: these figures need at least two methods that ran.</p>",
+        paper=f"<p>{text}</p>" + (f"<p>{html.escape(paragraph)}</p>" if paragraph else "") + "".join(map(to_html, tables[1:])),
+        comparisons=overall or "<p>Not drawn.</p>",
+        video=video,
+        methods="".join(_method(r, drawn, figures, " open" if k == 0 else "") for k, r in enumerate(results)),
+        reading=_READING,
+        links=links,
+    )
+
+
+def fill_page(
+    path: Path,
+    *,
+    title: str,
+    lead: str,
+    facts: Iterable[tuple[str, str]],
+    command: str,
+    overview: str,
+    paper: str,
+    comparisons: str,
+    methods: str,
+    reading: str,
+    links: Sequence[Path],
+    failures: str = "",
+    video: Path | None = None,
+) -> Path:
+    """Write one page; ``title``, ``lead``, ``facts`` and ``command`` are plain text, the other strings HTML."""
+    text = Template(files("marlbc_mj.report").joinpath("page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(title),
+        lead=html.escape(lead),
+        facts=pairs(facts),
+        command=html.escape(command),
+        failures=failures,
+        overview=overview,
+        paper=paper,
+        comparisons=comparisons,
         video_link='<a href="#video">Video</a>' if video else "",
         video=_video(video, path.parent) if video else "",
-        methods=_methods(results, figures),
-        reading=_READING,
-        errata=_pairs((str(n), text) for n, text in paper_values.ERRATA.items()),
-        files=_links(links, path.parent),
+        methods=methods,
+        reading=reading,
+        errata=pairs((str(n), text) for n, text in paper_values.ERRATA.items()),
+        files=_link_list(links, path.parent),
         citation=f'{html.escape(paper_values.CITATION)} <a href="{paper_values.DOI}">{paper_values.DOI}</a>',
     )
     path.write_text(text, encoding="utf-8")
@@ -95,33 +123,31 @@ def write_page(
 def _lead(results: Sequence[Result], scenario: Scenario) -> str:
     supervisors = len({result.supervisor for result in results})
     controllers = len({result.controller for result in results})
-    return html.escape(
+    return (
         f"{supervisors} mission supervisor{'s' * (supervisors != 1)} and {controllers} force "
         f"controller{'s' * (controllers != 1)} on {scenario.description or scenario.name}. Each method is one deterministic "
         "episode of MuJoCo physics."
     )
 
 
-def _facts(results: Sequence[Result], scenario: Scenario, versions: Mapping[str, str], seed: int, revision: str) -> str:
+def _facts(
+    results: Sequence[Result], scenario: Scenario, versions: Mapping[str, str], seed: int, revision: str
+) -> tuple[tuple[str, str], ...]:
     failed = sum(result.metrics is None for result in results)
-    return _pairs(
-        (
-            (
-                "Scenario",
-                f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}",
-            ),
-            ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
-            ("Limits", f"force {scenario.force_limit:g} N per axis, safe distance {scenario.safe_distance:g} m"),
-            ("Methods", f"{len(results) - failed} ran, {failed} failed"),
-            ("Seed", str(seed)),
-            ("Revision", revision),
-            ("Versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
-        )
+    return (
+        ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
+        ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
+        ("Limits", f"force {scenario.force_limit:g} N per axis, safe distance {scenario.safe_distance:g} m"),
+        ("Methods", f"{len(results) - failed} ran, {failed} failed"),
+        ("Seed", str(seed)),
+        ("Revision", revision),
+        ("Versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
     )
 
 
-def _pairs(pairs: Iterable[tuple[str, str]]) -> str:
-    return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in pairs)
+def pairs(items: Iterable[tuple[str, str]]) -> str:
+    """Items of a definition list."""
+    return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in items)
 
 
 def _failures(results: Sequence[Result]) -> str:
@@ -133,27 +159,25 @@ def _failures(results: Sequence[Result]) -> str:
     return f'<div class="failed"><p>Methods that failed:</p><ul>{"".join(lines)}</ul></div>' if lines else ""
 
 
-def _methods(results: Sequence[Result], figures: Path) -> str:
-    """One folding section a method, the first one open."""
-    return "".join(_method(result, figures, " open" if k == 0 else "") for k, result in enumerate(results))
-
-
-def _method(result: Result, figures: Path, state: str) -> str:
+def _method(result: Result, drawn: Sequence[Plot], figures: Path, state: str) -> str:
+    """A folding section."""
     if result.metrics is None:
         return f'<details><summary>{html.escape(result.key)}<span class="failed">failed</span></summary></details>'
     metrics = result.metrics
     switches = "/".join(str(agent["switches"]) for agent in metrics["agents"])
     clearance = min(agent["clearance_min"] for agent in metrics["agents"])
     facts = f"return {metrics['team']['return']:.0f}, switches {switches}, least clearance {clearance:.2f} m".replace("-", "−")
-    plots = {kind: _plot(figures / f"{file_stem(kind, result)}.png", _CAPTIONS[kind]) for kind in KINDS}
-    wide = "".join(plot for kind, plot in plots.items() if kind not in ("priorities", "errors"))
+    own = [p for p in drawn if p.method == result.key]
+    narrow = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in own if p.narrow)
+    wide = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in own if not p.narrow)
     return (
         f"<details{state}><summary>{html.escape(result.key)}<span>{facts}</span></summary>"
-        f'<div class="pair">{plots["priorities"]}{plots["errors"]}</div>{wide}</details>'
+        + (f'<div class="pair">{narrow}</div>' if narrow else "")
+        + f"{wide}</details>"
     )
 
 
-def _plot(png: Path, caption: str) -> str:
+def plot(png: Path, caption: str) -> str:
     """A figure's PNG at half its resolution in at most 256 colors, embedded; nothing where the file is missing."""
     if not png.is_file():
         return ""
@@ -178,7 +202,7 @@ def _video(video: Path, folder: Path) -> str:
     return f'<section id="video"><h2>Video</h2>{body}</section>'
 
 
-def _links(links: Sequence[Path], folder: Path) -> str:
+def _link_list(links: Sequence[Path], folder: Path) -> str:
     items = "".join(f"<li>{_link(link, folder)}</li>" for link in links)
     return f"<ul>{items}</ul>" if items else "<p>None beside this page.</p>"
 

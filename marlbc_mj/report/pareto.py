@@ -1,6 +1,7 @@
 """Figure of control cost against what it buys: return, safety and formation error."""
 
 from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,10 +11,14 @@ from matplotlib.lines import Line2D
 from marlbc_mj.metrics import Metrics
 from marlbc_mj.palette import AGENT_COLORS
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.printed import LIMITED, by_controller, by_supervisor
 from marlbc_mj.report.results import Result
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
+COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
 
+_INK = "#1A1A1A"
+_TOGETHER = 0.01  # marks closer than this share of every axis are one
 _PANELS: tuple[tuple[str, str, Callable[[Metrics], float]], ...] = (
     ("return", "upper left is better", lambda m: m["team"]["return"]),
     ("violation, worst agent [s]", "lower left is better", lambda m: max(agent["violation_time"] for agent in m["agents"])),
@@ -21,55 +26,142 @@ _PANELS: tuple[tuple[str, str, Callable[[Metrics], float]], ...] = (
 )
 
 
+class Group(NamedTuple):
+    """What shares a row of panels and a legend."""
+
+    results: Sequence[Result]
+    handles: Sequence[Line2D]
+    style: Callable[[Result], dict[str, Any]]
+
+
 def pareto(results: Sequence[Result]) -> Figure:
-    """Cost summed over agents against return, violation time and formation error; one mark a method that ran."""
+    """Cost summed over agents against return, violation time and formation error; one mark a method that ran.
+
+    Where the methods are supervisors with one controller and controllers under one supervisor, each of the two has a row of its
+    own, since their ranges differ; else all share one row. Laws with and without force limit have one marker, open without.
+    """
     ran = [result for result in results if result.metrics is not None]
-    supervisors = list(dict.fromkeys(result.supervisor for result in ran))
-    controllers = list(dict.fromkeys(result.controller for result in ran))
-    entries = len(supervisors) + len(controllers)
-    margins = pl.Margins(left=0.62, right=1.3, top=0.22, across=0.52)
-    figure, panels = pl.panels(pl.DOUBLE, max(2.2, 0.4 + 0.15 * entries), 1, len(_PANELS), margins)
-    costs = [_cost(result) for result in ran]
-    decades = 10.0 ** np.array([np.floor(np.log10(min(costs) / 1.1)), np.ceil(np.log10(1.1 * max(costs)))])
-    for axes, (label, better, read) in zip(panels[0], _PANELS, strict=True):
-        for result in ran:
-            _draw(axes, result, read, supervisors.index(result.supervisor), controllers.index(result.controller))
-        axes.set(xscale="log", xlim=decades, xlabel="cost, sum of agents", ylabel=label)
+    groups = _groups(ran)
+    margins = pl.Margins(left=0.62, right=1.42, top=0.24, across=0.56, between=0.62)
+    height = max(1.9, 0.15 * max(len(group.handles) for group in groups))
+    total = margins.top + margins.bottom + len(groups) * height + (len(groups) - 1) * margins.between
+    figure, panels = pl.panels(pl.DOUBLE, total, len(groups), len(_PANELS), margins)
+    for row, group in zip(panels, groups, strict=True):
+        _draw_group(row, group)
+        row[-1].legend(
+            handles=group.handles,
+            loc="center left",
+            bbox_to_anchor=(1.04, 0.5),
+            handletextpad=0.2,
+            labelspacing=0.28,
+            fontsize=6.5,
+        )
+    return figure
+
+
+def coincident(results: Sequence[Result]) -> list[list[str]]:
+    """Methods whose marks a reader cannot tell apart in any panel, by their controllers where these tell which they are."""
+    found = []
+    for group in _groups([result for result in results if result.metrics is not None]):
+        named = len({result.supervisor for result in group.results}) == 1
+        points = np.array([[np.log10(_cost(r)), *(read(_metrics(r)) for *_, read in _PANELS)] for r in group.results])
+        close = _TOGETHER * np.maximum(np.ptp(points, axis=0), 1e-12)
+        rest = list(range(len(points)))
+        while rest:
+            together = [k for k in rest if (np.abs(points[k] - points[rest[0]]) <= close).all()]
+            if len(together) > 1:
+                found.append([group.results[k].controller if named else group.results[k].key for k in together])
+            rest = [k for k in rest if k not in together]
+    return found
+
+
+def _groups(ran: Sequence[Result]) -> list[Group]:
+    supervisors, controllers = list(by_supervisor(ran).values()), list(by_controller(ran)[0].values())
+    laws = list(dict.fromkeys(map(_law, ran)))
+    names = {result.controller for result in ran}
+    twins = {law for law in laws if f"{law}{LIMITED}" in names}
+    chiefs = list(dict.fromkeys(result.supervisor for result in ran))
+
+    def of_supervisor(result: Result) -> dict[str, Any]:
+        return _style(chiefs.index(result.supervisor), 0, False)
+
+    def of_law(result: Result) -> dict[str, Any]:
+        k = laws.index(_law(result))
+        return {**_style(k, k, result.controller in twins), "markersize": max(4.0, 7.5 - k)}  # laws that coincide stay visible
+
+    def of_both(result: Result) -> dict[str, Any]:
+        return _style(chiefs.index(result.supervisor), laws.index(_law(result)), result.controller in twins)
+
+    named = [_entry(name, **_style(k, 0, False)) for k, name in enumerate(chiefs)]
+    marked = [_entry(law, **_style(k, k, False)) for k, law in enumerate(laws)]
+    plain = [_entry(law, **{**_style(0, k, False), "markerfacecolor": "#D0D0D0"}) for k, law in enumerate(laws)]
+    limit = [_entry("open: no force limit", **{**_style(0, 0, True), "markeredgecolor": _INK})] if twins else []
+    title = [_entry("supervisor:", marker="none")], [_entry("controller:", marker="none")]
+    if len(ran) == len(supervisors) + len(controllers) - 1 and min(len(supervisors), len(controllers)) > 1:
+        return [
+            Group(supervisors, title[0] + named, of_supervisor),
+            Group(controllers, title[1] + marked + limit, of_law),
+        ]
+    return [Group(ran, title[0] + named + title[1] + plain + limit, of_both)]
+
+
+def _draw_group(row: np.ndarray, group: Group) -> None:
+    costs = [_cost(result) for result in group.results]
+    limits = min(costs) / 1.6, max(costs) * 1.6
+    if limits[1] < 30 * limits[0]:  # an axis with at least two labels
+        limits = (10 ** np.floor(np.log10(limits[0])), 10 ** np.ceil(np.log10(limits[1])))
+    floor = [_cost(result) for result in group.results if result.controller == "lqr"]
+    for axes, (label, better, read) in zip(row, _PANELS, strict=True):
+        for result in group.results:
+            axes.plot(_cost(result), read(_metrics(result)), linestyle="none", clip_on=False, **group.style(result))
+        axes.set(xscale="log", xlim=limits, xlabel="cost, sum of agents", ylabel=label)
         axes.set_title(better, loc="left", fontsize=7, color=pl.GREY)
         axes.margins(y=0.12)
         axes.grid(color="#E4E4E4", linewidth=0.4)
         axes.set_axisbelow(True)
-    handles = [_mark("o", _color(k), name) for k, name in enumerate(supervisors)]
-    handles += [_mark(MARKERS[k % len(MARKERS)], "white", name) for k, name in enumerate(controllers)]
-    figure.legend(handles=handles, loc="center right", handletextpad=0.3, borderaxespad=0.1)
-    return figure
+        if floor:
+            _draw_floor(axes, min(floor))
+
+
+def _draw_floor(axes: Axes, cost: float) -> None:
+    axes.axvline(cost, color=pl.GREY, linewidth=0.6, linestyle=(0, (3, 2)), zorder=1)
+    axes.annotate(
+        "LQR",
+        (cost, 1.0),
+        (2, -2),
+        xycoords=("data", "axes fraction"),
+        textcoords="offset points",
+        fontsize=6.5,
+        color=pl.GREY,
+        va="top",
+    )
+
+
+def _metrics(result: Result) -> Metrics:
+    assert result.metrics is not None
+    return result.metrics
 
 
 def _cost(result: Result) -> float:
     """Cost integral summed over agents, kept off zero for the logarithmic axis."""
-    assert result.metrics is not None
-    return max(sum(agent["cost_integral"] for agent in result.metrics["agents"]), 1e-9)
+    return max(sum(agent["cost_integral"] for agent in _metrics(result)["agents"]), 1e-9)
 
 
-def _draw(axes: Axes, result: Result, read: Callable[[Metrics], float], supervisor: int, controller: int) -> None:
-    assert result.metrics is not None
-    axes.plot(
-        _cost(result),
-        read(result.metrics),
-        MARKERS[controller % len(MARKERS)],
-        color=_color(supervisor),
-        markeredgecolor="#1A1A1A",
-        markeredgewidth=0.4,
-        markersize=5,
-        alpha=0.9,
-    )
+def _law(result: Result) -> str:
+    return result.controller.removesuffix(LIMITED)
 
 
-def _color(supervisor: int) -> str:
-    return AGENT_COLORS[supervisor % len(AGENT_COLORS)]
+def _style(supervisor: int, law: int, hollow: bool) -> dict[str, Any]:
+    color = COLORS[supervisor % len(COLORS)]
+    return {
+        "marker": MARKERS[law % len(MARKERS)],
+        "markerfacecolor": "white" if hollow else color,
+        "markeredgecolor": color if hollow else _INK,
+        "markeredgewidth": 0.9 if hollow else 0.4,
+        "markersize": 5,
+        "zorder": 3,
+    }
 
 
-def _mark(marker: str, color: str, label: str) -> Line2D:
-    return Line2D(
-        [], [], marker=marker, color="none", markerfacecolor=color, markeredgecolor="#1A1A1A", markeredgewidth=0.5, label=label
-    )
+def _entry(label: str, **style: Any) -> Line2D:
+    return Line2D([], [], linestyle="none", label=label, **style)

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import matplotlib
 import numpy as np
@@ -55,6 +55,10 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.rc_context(_STYLE)
 
 
+Share = bool | Literal["none", "all", "row", "col"]
+"""Which panels share an axis."""
+
+
 class Margins(NamedTuple):
     """Room around and between panels [in]; fixed, so that one kind of figure has its axes in one place for every method."""
 
@@ -67,7 +71,7 @@ class Margins(NamedTuple):
 
 
 def panels(
-    width: float, height: float, rows: int, columns: int, margins: Margins, *, sharex: bool = False, sharey: bool = False
+    width: float, height: float, rows: int, columns: int, margins: Margins, *, sharex: Share = False, sharey: Share = False
 ) -> tuple[Figure, np.ndarray]:
     """A figure of exactly this size [in] and its (rows, columns) panels."""
     figure = Figure(figsize=(width, height))
@@ -122,6 +126,15 @@ def bin_maxima(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[
     size = -(-len(values) // bins)
     starts = np.arange(0, len(values), size)
     return time[starts], np.maximum.reduceat(values, starts)
+
+
+def bands(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Decimate (T,) to the start of each bin and its smallest, mean and largest value."""
+    size = -(-len(values) // bins)
+    starts = np.arange(0, len(values), size)
+    counts = np.diff(np.append(starts, len(values)))
+    low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
+    return time[starts], low, np.add.reduceat(values, starts) / counts, high
 
 
 def runs(values: np.ndarray) -> Iterator[tuple[int, int, int]]:

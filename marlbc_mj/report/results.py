@@ -12,6 +12,7 @@ import numpy as np
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.metrics import AgentMetrics, Metrics, TeamMetrics, measure
+from marlbc_mj.report.formats import one_line
 
 SCHEMA = 1
 AGENT_KEYS = tuple(AgentMetrics.__annotations__)
@@ -31,6 +32,7 @@ class Result:
     trajectory: Trajectory | None = None
     metrics: Metrics | None = None
     failure: str | None = None
+    solver_share: float | None = None  # of the decision time, in a network or a solver; None: the supervisor does not tell
 
     def __post_init__(self) -> None:
         if (self.metrics is None) == (self.failure is None):
@@ -42,9 +44,9 @@ class Result:
         return method_key(self.supervisor, self.controller)
 
     @classmethod
-    def of(cls, trajectory: Trajectory) -> "Result":
+    def of(cls, trajectory: Trajectory, solver_share: float | None = None) -> "Result":
         """The result of an episode that ran to its end."""
-        return cls(trajectory.supervisor, trajectory.controller, trajectory, measure(trajectory))
+        return cls(trajectory.supervisor, trajectory.controller, trajectory, measure(trajectory), solver_share=solver_share)
 
     @classmethod
     def failed(cls, supervisor: str, controller: str, reason: str) -> "Result":
@@ -67,7 +69,9 @@ def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str
     for result in results:
         if result.key in methods:
             raise ConfigurationError(f"method {result.key!r} has more than one result")
-        methods[result.key] = {"failure": result.failure} if result.metrics is None else _plain(result.metrics)
+        methods[result.key] = {"failure": result.failure} if result.metrics is None else plain(result.metrics)
+        if result.solver_share is not None:
+            methods[result.key]["solver_share"] = plain(result.solver_share)
     return {"schema": SCHEMA, "scenario": scenario_name, "versions": dict(versions), "methods": methods}
 
 
@@ -85,18 +89,18 @@ def write_csv(results: Sequence[Result], path: Path) -> Path:
 def _csv_rows(result: Result) -> list[dict[str, Any]]:
     method = {"supervisor": result.supervisor, "controller": result.controller}
     if result.metrics is None:
-        return [{**method, "failure": " ".join(str(result.failure).split())}]
-    plain = _plain(result.metrics)
-    team = {f"team_{key}": value for key, value in plain["team"].items()}
-    return [{**method, "agent": i + 1, **agent, **team} for i, agent in enumerate(plain["agents"])]
+        return [{**method, "failure": one_line(result.failure)}]
+    numbers = plain(result.metrics)
+    team = {f"team_{key}": value for key, value in numbers["team"].items()}
+    return [{**method, "agent": i + 1, **agent, **team} for i, agent in enumerate(numbers["agents"])]
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Nested containers and NumPy scalars as JSON's types; a number that is not finite as None."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.generic):
         value = value.item()
     return None if isinstance(value, float) and not math.isfinite(value) else value

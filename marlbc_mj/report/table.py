@@ -88,7 +88,7 @@ def to_latex(table: Table) -> str:
             rf"\caption{{{latex(table.caption)}}}",
             rf"\label{{tab:{table.name}}}",
             r"\footnotesize" if count <= 9 else r"\scriptsize",
-            r"\setlength{\tabcolsep}{" + ("6pt" if count <= 9 else "3pt" if count <= 11 else "2pt") + "}",
+            r"\setlength{\tabcolsep}{" + ("6pt" if count <= 9 else "3pt" if count <= 11 else "1pt") + "}",
             rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
             r"\toprule",
             *_latex_header(table),

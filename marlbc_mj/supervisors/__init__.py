@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 from marlbc_mj.errors import unknown
-from marlbc_mj.supervisors.base import Situation, Supervisor, situation
+from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, situation
 from marlbc_mj.supervisors.fms import FMS
+from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.supervisors.fsams import FSAMS
 from marlbc_mj.supervisors.mpcms import MPCMS
 from marlbc_mj.supervisors.oracle import Oracle
@@ -20,8 +21,17 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
     "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known that never violates"),
     "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
     "mpcms": (MPCMS, "model predictive: the cheapest order sequence over a 2 s horizon of the kinematic reference"),
+    "mpcms-mujoco": (
+        lambda: MPCMS(prediction="mujoco", horizon=120),
+        "the same over 6 s of simulated candidates, which sees the agents lag; minutes an episode",
+    ),
+    "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
+    "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
+    "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
 }
 """Factory and one line of description by name."""
+SLOW = ("mpcms-mujoco",)
+"""Supervisors that take minutes an episode: a benchmark runs them where they are named, not by default."""
 
 
 def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
@@ -39,7 +49,13 @@ __all__ = [
     "FMS",
     "FSAMS",
     "MPCMS",
+    "SLOW",
     "SUPERVISORS",
+    "Blend",
+    "Decision",
+    "FuzzyBlend",
+    "Layered",
+    "MotorSchema",
     "Oracle",
     "Scripted",
     "Situation",

@@ -1,4 +1,4 @@
-"""What the runner asks of a mission supervisor: state in, orders out, at every mission step."""
+"""What the runner asks of a mission supervisor: state in, orders out (with velocities or without), at every mission step."""
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -19,6 +19,18 @@ class Situation(NamedTuple):
     formation: int  # G: 2 in formation, 1 in column, 0 neither
     command: np.ndarray  # (N,) index into scenario.orders.commands; meaningless at step 0
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]
+    reference: np.ndarray  # (N, 2) p_r [m]
+
+
+class Blend(NamedTuple):
+    """A decision that does not leave the reference velocities to the composition of orders (12)."""
+
+    orders: np.ndarray  # (N,) indices into ``scenario.orders``: the labels that switches are counted by
+    velocity: np.ndarray  # (N, 2) v_r for the mission step [m/s]
+
+
+Decision = np.ndarray | Blend
+"""(N,) indices into ``scenario.orders``, whose composition (12) is v_r, or orders with a v_r of their own."""
 
 
 @runtime_checkable
@@ -29,8 +41,8 @@ class Supervisor(Protocol):
         """Memory at the start of an episode; checks that the scenario suits this supervisor."""
         ...
 
-    def decide(self, situation: Situation, memory: Any) -> tuple[np.ndarray, Any]:
-        """(N,) indices into ``scenario.orders``, and the memory for the next call."""
+    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
+        """Orders, alone or with reference velocities; and the memory for the next call."""
         ...
 
 
@@ -46,4 +58,5 @@ def situation(observation: Observation, obstacles: np.ndarray, mission_step: flo
         int(observation.formation[world]),
         observation.command[world],
         obstacles,
+        observation.reference[world],
     )

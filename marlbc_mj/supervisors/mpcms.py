@@ -24,6 +24,7 @@ that within the 2 s of H = 40 leaving it never pays, and the case study ends in 
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import combinations
+from time import perf_counter
 from typing import Literal, NamedTuple
 
 import numba
@@ -65,6 +66,7 @@ class Forecast(NamedTuple):
     reference: np.ndarray | None  # (N, 2) its own copy of p_r [m]; None before the first decision
     twin: World | None  # MuJoCo prediction: one world that was given the same orders
     worlds: World | None  # MuJoCo prediction: one world a candidate
+    solver_ms: float = 0.0  # what the prediction took in the last decision [ms]
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,9 @@ class MPCMS:
     def decide(self, situation: Situation, memory: Forecast) -> tuple[np.ndarray, Forecast]:
         """The first orders of the cheapest sequence; ties go to the earlier candidate, holding first."""
         candidates = self._candidates(memory.plan.scenario, memory.joint)
+        began = perf_counter()
         costs, reached = self._predict(situation, memory, candidates.orders)
+        solver_ms = 1e3 * (perf_counter() - began)
         costs = np.where(np.isfinite(costs), costs, np.inf) + self.w_switch * candidates.switches
         best = int(costs.argmin())
         if not np.isfinite(costs[best]):
@@ -145,7 +149,7 @@ class MPCMS:
         orders = candidates.orders[best, 0].copy()
         if memory.twin is not None:
             memory.twin.step(orders[None])
-        return orders, memory._replace(joint=candidates.first[best], reference=reached[best])
+        return orders, memory._replace(joint=candidates.first[best], reference=reached[best], solver_ms=solver_ms)
 
     def _predict(self, situation: Situation, memory: Forecast, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Costs (C,) without switches, and positions (C, N, 2) after the first predicted step."""

@@ -197,7 +197,7 @@ def command_table(scenario: Scenario, windows: tuple[Window, ...]) -> np.ndarray
     nothing = np.zeros(0)
     rows = []
     for k in range(scenario.mission_steps):
-        now = Situation(k, k * scenario.mission_step, nothing, nothing, nothing, 0, nothing, nothing)
+        now = Situation(k, k * scenario.mission_step, nothing, nothing, nothing, 0, nothing, nothing, nothing)
         rows.append(scenario.orders.command_of[script.decide(now, memory)[0]])
     return np.array(rows)
 

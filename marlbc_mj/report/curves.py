@@ -1,0 +1,254 @@
+"""Curves over time: priorities, forces, tracking errors and network weights; decimated so that every peak stays."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from marlbc_mj.controllers.sorlc import STATE_SIZE, Weights, weights
+from marlbc_mj.episode import Trajectory
+from marlbc_mj.orders import SEPARATOR
+from marlbc_mj.palette import command_color
+from marlbc_mj.report import plotting as pl
+
+_LANE = 1.25  # distance of two agents' strips, in strip heights
+_SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
+_ZOOM = 2.0  # width of the window that shows single force pulses [s]
+_PULSE = 1.0  # the same for one pulse [s]
+_FLAT = 1e-9  # relative change below which a weight counts as constant
+_SMALL_WEIGHT = 1e-2  # smaller norms are drawn in units of a power of ten
+
+_SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "va": "center_baseline", "annotation_clip": False}
+"""Text beside a strip."""
+
+
+def priorities(episodes: Sequence[Trajectory]) -> Figure:
+    """Each agent's command over time, color and height of the strip being those of its highest behavior.
+
+    One episode fills one column of text, several are panels, two a row.
+    """
+    columns = 1 if len(episodes) == 1 else 2
+    rows = -(-len(episodes) // columns)
+    margins = pl.Margins(left=0.52, right=0.52, top=0.4 if columns == 1 else 0.46, across=0.98, between=0.3)
+    width = pl.SINGLE if columns == 1 else pl.DOUBLE
+    each = 0.28 * episodes[0].scenario.agents if columns == 1 else 0.17 * episodes[0].scenario.agents
+    height = margins.top + margins.bottom + rows * each + (rows - 1) * margins.between
+    figure, panels = pl.panels(width, height, rows, columns, margins, sharex=True)
+    for axes, episode in zip(panels.flat, episodes, strict=False):
+        _draw_priorities(axes, episode)
+        if columns > 1:
+            pl.panel_label(axes, episode.supervisor)
+    _hide_rest(panels, len(episodes))
+    handles = {h.get_label(): h for h in pl.command_handles(episodes[0].scenario.orders.commands, 4)}
+    pl.legend_above(figure, [handles[head] for head in _heads(episodes[0])])
+    return figure
+
+
+def _hide_rest(panels: np.ndarray, used: int) -> None:
+    """Hide panels beyond ``used`` and label the time axis of the lowest one left in every column."""
+    for axes in panels.flat[used:]:
+        axes.set_visible(False)
+    for column in range(panels.shape[1]):
+        axes = panels[(used - 1 - column) // panels.shape[1], column]
+        axes.set_xlabel("time [s]")
+        axes.tick_params(labelbottom=True)
+
+
+def _heads(trajectory: Trajectory) -> list[str]:
+    return sorted({c.split(SEPARATOR)[0] for c in trajectory.scenario.orders.commands}, key=_rank(trajectory))
+
+
+def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
+    agents, commands = trajectory.scenario.agents, trajectory.scenario.orders.commands
+    heads = _heads(trajectory)
+    height = {head: (k + 1) / len(heads) for k, head in enumerate(heads)}
+    step = trajectory.scenario.mission_step
+    for i in range(agents):
+        base = (agents - 1 - i) * _LANE
+        bars: dict[str, list[tuple[float, float]]] = {head: [] for head in heads}
+        for start, end, value in pl.runs(trajectory.command[:, i]):
+            bars[commands[value].split(SEPARATOR)[0]].append((start * step, (end - start) * step))
+        for head, spans in bars.items():
+            axes.broken_barh(spans, (base, height[head]), color=command_color(head), linewidth=0.2, snap=False)
+        count = int((np.diff(trajectory.command[:, i]) != 0).sum())
+        axes.annotate(f"{count}", (1, base + 0.35), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
+    axes.annotate("switches", (1, agents * _LANE - 0.1), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
+    axes.set(xlim=(0, trajectory.scenario.duration), ylim=(0, agents * _LANE - 0.25))
+    axes.set_yticks([(agents - 1 - i) * _LANE + 0.35 for i in range(agents)], [f"agent {i + 1}" for i in range(agents)])
+    axes.tick_params(axis="y", length=0)
+    axes.spines["left"].set_visible(False)
+
+
+def _rank(trajectory: Trajectory) -> Callable[[str], int]:
+    """Formation first, then column, then whatever else, so that avoidance stands highest."""
+    known = trajectory.scenario.formation_names
+    return lambda head: known.index(head) if head in known else len(known)
+
+
+def forces(trajectory: Trajectory) -> Figure:
+    """The applied force, one row an agent: both axes over the episode, and both around the wildest two seconds.
+
+    Over the episode, light bands hold every sample and dark lines are means of 500 bins, so that a chattering force shows what
+    it amounts to; the limit is dashed.
+    """
+    agents, limit = trajectory.scenario.agents, trajectory.scenario.force_limit
+    margins = pl.Margins(left=0.56, top=0.24, bottom=0.36)
+    figure, panels = pl.panels(pl.DOUBLE, 0.4 + 0.75 * agents, agents, 3, margins, sharex="col", sharey=True)
+    window = busiest(trajectory)
+    for i in range(agents):
+        color = pl.agent_line(i)["color"]
+        for axis in range(2):
+            axes = panels[i, axis]
+            time, low, mean, high = pl.bands(trajectory.time, trajectory.force[:, i, axis])
+            axes.fill_between(time, low, high, color=color, alpha=0.3, linewidth=0.4)
+            axes.plot(time, mean, color=color, linewidth=0.8)
+            pl.panel_label(axes, f"agent {i + 1}, $u_{'xy'[axis]}$")
+            style = {"linestyle": ("-", (0, (2.5, 1)))[axis], "label": f"$u_{'xy'[axis]}$"}
+            panels[i, 2].plot(trajectory.time[window], trajectory.force[window, i, axis], color=color, linewidth=0.7, **style)
+        pl.panel_label(panels[i, 2], f"agent {i + 1}, {_ZOOM:g} s")
+        for axes in panels[i]:
+            for bound in (-limit, limit):
+                axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
+    reach = 1.12 * max(limit, float(np.abs(trajectory.force).max()))
+    panels[0, 0].set(ylim=(-reach, reach))
+    for axes, span in zip(panels[-1], (slice(None), slice(None), window), strict=True):
+        axes.set(xlabel="time [s]", xlim=(trajectory.time[span][0], trajectory.time[span][-1]))
+    panels[0, 2].legend(loc="lower right", bbox_to_anchor=(1.0, 0.93), ncols=2, borderpad=0.0, columnspacing=1.0)
+    figure.supylabel("force [N] (dashed: limit)", fontsize=8, x=0.05 / pl.DOUBLE)
+    return figure
+
+
+def busiest(trajectory: Trajectory) -> slice:
+    """The window in which the forces of all agents change most, in total variation over the episode's largest magnitude."""
+    size = min(len(trajectory.time), max(2, round(_ZOOM / trajectory.scenario.substep)))
+    change = np.abs(np.diff(trajectory.force, axis=0)).sum(axis=(1, 2))
+    total = np.concatenate([[0.0], np.cumsum(change)])
+    start = int((total[size - 1 :] - total[: len(total) - size + 1]).argmax())
+    return slice(start, start + size)
+
+
+def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
+    """One agent's force, one column a framework, each on its own scale; the limit is dashed.
+
+    Two rows show the axes over the episode, the third both of them around the largest force of all these episodes.
+    """
+    margins = pl.Margins(left=0.5, top=0.24, across=0.52, between=0.42)
+    figure, panels = pl.panels(pl.DOUBLE, 3.9, 3, len(episodes), margins, sharex="row", sharey="col")
+    color = pl.agent_line(agent)["color"]
+    wildest = max(episodes, key=lambda episode: float(np.abs(episode.force[:, agent]).max()))
+    peak = wildest.time[np.abs(wildest.force[:, agent]).max(axis=1).argmax()]
+    for column, episode in enumerate(episodes):
+        limit = episode.scenario.force_limit
+        for axis in range(2):
+            axes = panels[axis, column]
+            axes.plot(*pl.envelope(episode.time, episode.force[:, agent, axis]), color=color, linewidth=0.7)
+            for bound in (-limit, limit):
+                axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
+            pl.panel_label(axes, f"{episode.controller}, $u_{'xy'[axis]}$")
+        reach = 1.12 * max(limit, float(np.abs(episode.force[:, agent]).max()))
+        panels[0, column].set(xlim=(0, episode.scenario.duration), ylim=(-reach, reach))
+        panels[1, column].set(xlim=(0, episode.scenario.duration))
+        _draw_pulse(panels[2, column], episode, agent, peak)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("force [N]")
+    panels[2, -1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderpad=0.0, columnspacing=1.0)
+    return figure
+
+
+def _draw_pulse(axes: Axes, episode: Trajectory, agent: int, peak: float) -> None:
+    """Both axes of the force over ``_PULSE`` seconds around ``peak``."""
+    window = (episode.time >= peak - 0.2 * _PULSE) & (episode.time <= peak + 0.8 * _PULSE)
+    color, time = pl.agent_line(agent)["color"], episode.time[window]
+    for axis in range(2):
+        style = {"linestyle": ("-", (0, (2.5, 1)))[axis], "label": f"$u_{'xy'[axis]}$"}
+        axes.plot(time, episode.force[window, agent, axis], color=color, linewidth=0.9, **style)
+    for bound in (-episode.scenario.force_limit, episode.scenario.force_limit):
+        axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
+    axes.set(xlim=(time[0], time[-1]), xlabel="time [s]")
+    pl.panel_label(axes, f"{episode.controller}, {_PULSE:g} s")
+
+
+def errors(trajectory: Trajectory) -> Figure:
+    """Tracking errors of every agent on logarithmic axes, cut off where they vanish; decimated to each bin's largest."""
+    figure, panels = pl.panels(pl.SINGLE, 3.1, 2, 1, pl.Margins(left=0.56, between=0.12), sharex=True)
+    pairs = (
+        (trajectory.position[:-1] - trajectory.reference, r"$\|e_p\|$ [m]"),
+        (trajectory.velocity[:-1] - trajectory.reference_velocity, r"$\|e_v\|$ [m/s]"),
+    )
+    for axes, (error, label) in zip(panels[:, 0], pairs, strict=True):
+        size = np.maximum(np.linalg.norm(error, axis=-1), 1e-300)  # (T, N)
+        for i in range(size.shape[1]):
+            axes.plot(*pl.bin_maxima(trajectory.time, size[:, i]), **pl.agent_line(i))
+        axes.set(yscale="log", ylabel=label, xlim=(0, trajectory.scenario.duration))
+        axes.set_ylim(max(_SMALLEST_ERROR, 0.5 * float(size[1:].min())), 2 * max(float(size.max()), 10 * _SMALLEST_ERROR))
+        axes.grid(axis="y", color="#E4E4E4", linewidth=0.4)
+    panels[-1, 0].set_xlabel("time [s]")
+    figure.align_ylabels(panels)
+    pl.legend_above(figure, panels[0, 0].lines[:4], columnspacing=1.0)
+    return figure
+
+
+def weight_norms(trajectory: Trajectory) -> Figure:
+    """Frobenius norms of SORLC's weight matrices over time.
+
+    Raises:
+        ValueError: the controller's state is not SORLC's.
+    """
+    return _weight_figure(trajectory, lambda matrix: matrix, r"$\|\omega_{}\|_F$")
+
+
+def weight_errors(trajectory: Trajectory) -> Figure:
+    """Frobenius norms of their distance from the values at the end: ideal weights, which the paper subtracts, are unknown.
+
+    Raises:
+        ValueError: the controller's state is not SORLC's.
+    """
+    return _weight_figure(trajectory, lambda matrix: matrix - matrix[-1], r"$\|\omega_{0} - \omega_{0}(T)\|_F$")
+
+
+def _weight_figure(trajectory: Trajectory, change: Callable[[np.ndarray], np.ndarray], label: str) -> Figure:
+    read = network_weights(trajectory)
+    figure, panels = pl.panels(pl.DOUBLE, 2.0, 1, 3, pl.Margins(left=0.46, top=0.42, across=0.55), sharex=True)
+    time = np.arange(len(trajectory.controller_state)) * trajectory.scenario.mission_step
+    named = (("identifier", "f", read.identifier), ("actor", "a", read.actor), ("critic", "c", read.critic))
+    for axes, (name, symbol, matrix) in zip(panels[0], named, strict=True):
+        norms = np.linalg.norm(change(matrix), axis=(-2, -1))  # (M, N)
+        power = np.floor(np.log10(norms.max())) if 0.0 < norms.max() < _SMALL_WEIGHT else 0.0
+        norms, unit = norms * 10.0**-power, f" [$10^{{{power:.0f}}}$]" if power else ""
+        for i in range(norms.shape[1]):
+            axes.plot(*pl.envelope(time, norms[:, i]), **pl.agent_line(i))
+        axes.set(xlabel="time [s]", ylabel=label.replace("{0}", symbol).replace("{}", symbol) + unit)
+        axes.set(xlim=(0, trajectory.scenario.duration), ylim=(0, 1.08 * float(norms.max()) or 1.0))
+        pl.panel_label(axes, name)
+    pl.legend_above(figure, panels[0, 0].lines)
+    return figure
+
+
+def network_weights(trajectory: Trajectory) -> Weights:
+    """The weight matrices (M, N, 12, 2) at the start of every mission step.
+
+    Raises:
+        ValueError: the controller's state is not SORLC's.
+    """
+    if not has_weights(trajectory):
+        raise ValueError(f"controller {trajectory.controller!r} has no network weights")
+    return weights(trajectory.controller_state)
+
+
+def has_weights(trajectory: Trajectory) -> bool:
+    """Whether this controller's state is that of SORLC with networks."""
+    name, state = trajectory.controller, trajectory.controller_state
+    return name.startswith("sorlc") and name != "sorlc-off" and state.shape[-1] == STATE_SIZE
+
+
+def flat_after(trajectory: Trajectory) -> float:
+    """Time from which neither actor nor critic changes any more, beyond rounding [s]; about the duration if they do."""
+    read, last = network_weights(trajectory), 0
+    for matrix in (read.actor, read.critic):
+        norms = np.linalg.norm(matrix, axis=(-2, -1))
+        moving = np.abs(norms - norms[-1]) > _FLAT * np.abs(norms).max()
+        if moving.any():
+            last = max(last, int(np.flatnonzero(moving.any(axis=1))[-1]) + 1)
+    return last * trajectory.scenario.mission_step

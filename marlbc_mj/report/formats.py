@@ -1,0 +1,68 @@
+"""Numbers and text as every table shows them."""
+
+import math
+from collections.abc import Sequence
+
+from marlbc_mj.statistics import Estimate
+
+DASH = "–"
+FAILED = "failed"
+COST_SCALE = 1e-4
+"""Costs are tabulated in units of 1e4."""
+
+
+def fixed(value: float, digits: int) -> str:
+    """A number with this many decimals and a true minus sign; a dash where it is not finite."""
+    return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else DASH
+
+
+def significant(value: float, digits: int = 3) -> str:
+    """A number with this many significant digits, never in exponent notation."""
+    if not math.isfinite(value) or value == 0:
+        return DASH if value else "0"
+    decimals = digits - 1 - math.floor(math.log10(abs(value)))
+    return f"{round(value, decimals):.{max(0, decimals)}f}"
+
+
+def grouped(value: float) -> str:
+    """A whole number with spaces between thousands."""
+    return f"{value:,.0f}".replace(",", " ").replace("-", "−")
+
+
+def interval(estimate: Estimate, digits: int) -> str:
+    """``value [low, high]``; a dash where no run finished, no interval for a single run."""
+    if not math.isfinite(estimate.value):
+        return DASH
+    value, low, high = (fixed(number, digits) for number in estimate)
+    return value if math.isnan(estimate.low) else f"{value} [{low}, {high}]"
+
+
+def loose_interval(estimate: Estimate) -> str:
+    """The same with three significant digits."""
+    if not math.isfinite(estimate.value):
+        return DASH
+    ends = f" [{significant(estimate.low)}, {significant(estimate.high)}]"
+    return significant(estimate.value) + ("" if math.isnan(estimate.low) else ends)
+
+
+def percent(estimate: Estimate) -> Estimate:
+    """A share as per cent."""
+    return Estimate(*(100.0 * value for value in estimate))
+
+
+def one_line(text: str | None) -> str:
+    """Text without line breaks."""
+    return " ".join(str(text).split())
+
+
+def spans(numbers: Sequence[int]) -> str:
+    """Whole numbers as spans of three and more, 0, 2, 3, 4, 6, 7 as ``0, 2 to 4, 6, 7``."""
+    numbers = sorted(numbers)
+    starts = [k for k, n in enumerate(numbers) if k == 0 or n != numbers[k - 1] + 1]
+    pieces = [numbers[a:b] for a, b in zip(starts, [*starts[1:], len(numbers)], strict=True)]
+    return ", ".join(f"{piece[0]} to {piece[-1]}" if len(piece) > 2 else ", ".join(map(str, piece)) for piece in pieces)
+
+
+def listed(names: list[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""

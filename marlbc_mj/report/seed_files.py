@@ -1,0 +1,92 @@
+"""What many draws leave for machines: summary.json and episodes.csv."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.report.formats import one_line
+from marlbc_mj.report.results import AGENT_KEYS, SCHEMA, TEAM_KEYS, plain
+from marlbc_mj.report.seed_statistics import (
+    SCORES,
+    GroupStatistics,
+    MethodStatistics,
+    by_controller,
+    by_supervisor,
+    group,
+)
+from marlbc_mj.seeds import SeedResults, SeedRun
+from marlbc_mj.statistics import Estimate
+
+
+def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:
+    """The content of summary.json: schema 1 with medians, ``<key>_ci`` beside them, and what only draws can tell."""
+    groups = {"supervisors": by_supervisor, "controllers": by_controller}
+    content = {
+        "schema": SCHEMA,
+        "scenario": results.scenario.name,
+        "versions": dict(versions),
+        "seeds": list(results.seeds),
+        "perturbation": vars(results.scenario.perturbation),
+        "reference": results.reference,
+        "methods": {statistics.runs.key: _summary_entry(statistics) for statistics in methods},
+        "groups": {key: {g.name: _group_entry(g) for g in group(results, by)} for key, by in groups.items()},
+    }
+    return dict(plain(content))
+
+
+def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
+    failed = statistics.runs.failed
+    scores = {name: {**_with_ci("median", statistics.medians[name]), **_with_ci("iqm", statistics.iqms[name])} for name in SCORES}
+    entry: dict[str, Any] = {
+        "runs": len(statistics.runs.runs),
+        "failures": {str(run.seed): run.failure for run in failed},
+        **_with_ci("violation_rate", statistics.violation),
+        **_with_ci("improvement", statistics.improvement),
+    }
+    if len(failed) == len(statistics.runs.runs):
+        return {"failure": failed[0].failure, **entry}
+    agents = [_all_with_ci(agent) for agent in statistics.agents]
+    return {"agents": agents, "team": _all_with_ci(statistics.team), "scores": scores, **entry}
+
+
+def _group_entry(statistics: GroupStatistics) -> dict[str, Any]:
+    iqms = {f"{key}_iqm": value for key, value in statistics.iqms.items()}
+    counts = {"methods": statistics.methods, "draws": statistics.draws}
+    return {**counts, **_all_with_ci(iqms), **_with_ci("violation_rate", statistics.violation)}
+
+
+def _with_ci(key: str, estimate: Estimate) -> dict[str, Any]:
+    return {key: estimate.value, f"{key}_ci": [estimate.low, estimate.high]}
+
+
+def _all_with_ci(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
+    return {name: value for key, estimate in estimates.items() for name, value in _with_ci(key, estimate).items()}
+
+
+def write_csv(results: SeedResults, path: Path) -> Path:
+    """episodes.csv: one row per method, seed and agent, the team's columns repeated; a failed run has its reason in each, and
+    one row without agent where nothing was drawn.
+    """
+    drawn = ("disturbance_scale", "start_x", "start_y")
+    columns = ("supervisor", "controller", "seed", "agent", "failure", *drawn, *AGENT_KEYS, *(f"team_{k}" for k in TEAM_KEYS))
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, restval="")
+        writer.writeheader()
+        for method in results.methods:
+            for run in method.runs:
+                names = {"supervisor": method.supervisor, "controller": method.controller, "seed": run.seed}
+                writer.writerows({**names, **row} for row in _csv_rows(run))
+    return path
+
+
+def _csv_rows(run: SeedRun) -> list[dict[str, Any]]:
+    if run.instance is None:
+        return [{"failure": one_line(run.failure)}]
+    scale, starts = run.instance.disturbance_scale, run.instance.starts.tolist()
+    rows = [{"agent": i + 1, "disturbance_scale": scale, "start_x": x, "start_y": y} for i, (x, y) in enumerate(starts)]
+    if run.metrics is None:
+        return [{**row, "failure": one_line(run.failure)} for row in rows]
+    numbers = plain(run.metrics)
+    team = {f"team_{key}": value for key, value in numbers["team"].items()}
+    return [{**row, **agent, **team} for row, agent in zip(rows, numbers["agents"], strict=True)]

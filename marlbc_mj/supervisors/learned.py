@@ -1,0 +1,82 @@
+"""Learned supervisors: a checkpoint's greedy policy, evaluated in NumPy every few mission steps."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.engine.state import Observation
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.tasks.states import State, make_state
+from marlbc_mj.training.checkpoint import check_signature, read_policy
+from marlbc_mj.training.policy import Policy, greedy
+
+
+class LearnedMemory(NamedTuple):
+    """One team between two mission steps."""
+
+    read: State
+    order_of: np.ndarray  # (A,) index into scenario.orders of every action
+    actions: np.ndarray  # (1, N) in force
+    solver_ms: float = 0.0  # what state and networks took in the last mission step [ms]
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A trained policy as a supervisor; build it with :meth:`load`.
+
+    A decision holds for ``interval`` mission steps; in between, nothing is computed.
+    """
+
+    policy: Policy
+    signature: dict[str, object]
+    path: Path
+
+    @classmethod
+    def load(cls, path: Path) -> "Learned":
+        """From a checkpoint.
+
+        Raises:
+            ConfigurationError: the file is missing, torn, or not a checkpoint.
+        """
+        policy, description = read_policy(path)
+        return cls(policy, description["signature"], path)
+
+    def start(self, scenario: Scenario) -> LearnedMemory:
+        """Check the scenario against what the policy was trained for.
+
+        Raises:
+            ConfigurationError: another team, other behaviors, slots or mission step.
+        """
+        check_signature(self.path, self.signature, scenario)
+        orders = scenario.orders
+        order_of = orders.representative if self.signature["actions"] == "commands" else np.arange(len(orders))
+        return LearnedMemory(
+            make_state(str(self.signature["state"]), scenario), order_of, np.zeros((1, scenario.agents), dtype=np.int64)
+        )
+
+    def decide(self, situation: Situation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
+        """The greedy action of every agent; the one in force unless another is better by more than the margin."""
+        actions, began = memory.actions, perf_counter()
+        if situation.step % int(self.signature["interval"]) == 0:  # type: ignore[call-overload]  # checked by the signature
+            state = memory.read(_batch(situation), situation.obstacles[None])
+            fresh = np.array([situation.step == 0])
+            actions = greedy(self.policy.values(state), memory.actions, fresh, self.policy.margin)
+        solver_ms = 1e3 * (perf_counter() - began)
+        return memory.order_of[actions[0]], memory._replace(actions=actions, solver_ms=solver_ms)
+
+
+def _batch(situation: Situation) -> Observation:
+    """A batch observation of one world."""
+    return Observation(
+        np.array([situation.time]),
+        situation.position[None],
+        situation.velocity[None],
+        situation.clearance[None],
+        np.array([situation.formation]),
+        situation.command[None],
+        situation.reference[None],
+    )

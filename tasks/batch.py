@@ -1,0 +1,189 @@
+"""B missions at once for a learner: a decision every few mission steps, rewards by term, episodes that restart by themselves."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import Controller
+from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
+from marlbc_mj.engine.world import World
+from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.orders import SEPARATOR
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.tasks.states import make_state
+
+ACTIONS = ("commands", "orders")
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where episodes begin: this share of them anywhere along the route, in formation or in column, at rest in the slots.
+
+    An exploring start lasts ``length`` and then ends without being terminal. A formation whose slots come within the safe
+    distance of an obstacle starts as a column.
+    """
+
+    exploring: float = 0.0  # share of episodes in [0, 1]
+    length: float = 20.0  # [s]
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.exploring <= 1:
+            raise ConfigurationError(f"exploring starts are a share between 0 and 1, got {self.exploring}")
+        if not self.length > 0:
+            raise ConfigurationError(f"the length of an exploring start must be positive, got {self.length} s")
+
+
+class Outcome(NamedTuple):
+    """What a decision of every team led to."""
+
+    state: np.ndarray  # (B, S) of the next decision; where an episode ended, of the new one
+    final_state: np.ndarray  # (B, S) the same, but the true successor where an episode ended
+    formation: np.ndarray  # (B,) r1 without violations: 5 G a mission step (14), summed over the decision
+    violation: np.ndarray  # (B,) -10 a mission step with an agent at or inside the safe distance (14)
+    switching: np.ndarray  # (B,) r2 (15): -3 if any agent's command changed
+    switches: np.ndarray  # (B, N) bool, whose command changed
+    clearance: np.ndarray  # (B, N) least clearance at the ends of the decision's mission steps [m]
+    steps: np.ndarray  # (B,) mission steps made
+    terminal: np.ndarray  # (B,) bool, the mission is over
+    truncated: np.ndarray  # (B,) bool, the episode was cut
+
+    @property
+    def reward(self) -> np.ndarray:
+        """(B,) r = r1 + r2 (13), summed over the decision's mission steps."""
+        return np.asarray(self.formation + self.violation + self.switching)
+
+    @property
+    def ended(self) -> np.ndarray:
+        """(B,) bool, a new episode has begun."""
+        return np.asarray(self.terminal | self.truncated)
+
+
+class FormationBatch:
+    """B worlds of one scenario as a cooperative Markov game.
+
+    Args:
+        scenario: the problem instance; every episode is a draw of it.
+        controller: the force law; SORLC by default.
+        worlds: B.
+        threads: the worlds are shared out over this many.
+        interval: mission steps that a decision holds for.
+        state: ``"extended"`` or ``"printed"``.
+        actions: ``"commands"`` for the distinct ones, ``"orders"`` for all permutations.
+        starts: where episodes begin.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        controller: Controller | None = None,
+        *,
+        worlds: int = 1,
+        threads: int = 1,
+        interval: int = 4,
+        state: str = "extended",
+        actions: str = "commands",
+        starts: Starts | None = None,
+    ) -> None:
+        if interval < 1 or scenario.mission_steps % interval:
+            raise ConfigurationError(
+                f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
+            )
+        if actions not in ACTIONS:
+            raise unknown("action set", actions, ACTIONS)
+        orders = scenario.orders
+        self.scenario = scenario
+        self.interval = interval
+        self.order_of = orders.representative if actions == "commands" else np.arange(len(orders))
+        command_of = orders.command_of[self.order_of]
+        self.action_of = np.array([int(np.flatnonzero(command_of == c)[0]) for c in range(len(orders.commands))])
+        self.read = make_state(state, scenario)
+        self.world = World(scenario, controller, worlds=worlds, threads=threads)
+        self.starts = starts or Starts()
+        self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which an episode ends
+        self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
+        self.rng = np.random.default_rng(0)
+        last = [name.split(SEPARATOR)[-1] for name in orders.commands]
+        self.keeping = [[c for c, name in enumerate(last) if name == kept] for kept in scenario.formation_names]
+
+    @property
+    def actions(self) -> int:
+        """Number of actions of an agent."""
+        return len(self.order_of)
+
+    @property
+    def fresh(self) -> np.ndarray:
+        """(B,) bool, no action is in force yet: the mission has just begun."""
+        return np.asarray(self.world.state.steps == 0)
+
+    def reset(self, seed: int = 0) -> np.ndarray:
+        """Start all episodes anew; (B, S) states."""
+        self.rng = np.random.default_rng(seed)
+        self._restart(np.ones(self.world.worlds, dtype=bool))
+        return self.states()
+
+    def states(self) -> np.ndarray:
+        """(B, S) of all worlds."""
+        return self.read(self.world.observe(), self.world.state.obstacles)
+
+    def step(self, actions: np.ndarray) -> Outcome:
+        """One decision of every team; ``actions`` (B, N) are indices into the action set."""
+        state = self.world.state
+        orders = self.order_of[actions]
+        self.last = actions.copy()
+        before, started = state.command.copy(), state.steps > 0
+        worlds = self.world.worlds
+        reward, formation, violation = np.zeros(worlds), np.zeros(worlds), np.zeros(worlds)
+        clearance = np.full(actions.shape, np.inf)
+        for _ in range(self.interval):
+            if self.world.advance(orders):
+                self.world.raise_if_diverged()
+            reward += state.reward
+            violated = (state.clearance <= self.scenario.safe_distance).any(axis=1)
+            violation += VIOLATION_REWARD * violated
+            formation += np.where(violated, 0.0, FORMATION_REWARD * state.formation)
+            np.minimum(clearance, state.clearance, out=clearance)
+        switches = (state.command != before) & started[:, None]
+        terminal = state.steps >= self.scenario.mission_steps
+        truncated = (state.steps >= self.cut) & ~terminal
+        final = self.states()
+        now = final
+        if (terminal | truncated).any():
+            self._restart(terminal | truncated)
+            now = self.states()
+        return Outcome(
+            now, final, formation, violation, reward - formation - violation, switches, clearance,
+            np.full(worlds, self.interval), terminal, truncated,
+        )  # fmt: skip
+
+    def _restart(self, mask: np.ndarray) -> None:
+        """New episodes where ``mask`` is true."""
+        self.world.reset(int(self.rng.integers(2**31)), mask)
+        state = self.world.state
+        self.cut[mask] = self.scenario.mission_steps
+        for b in np.flatnonzero(mask):
+            if self.rng.random() < self.starts.exploring:
+                self._explore(int(b))
+            self.last[b] = self.action_of[state.command[b]]
+
+    def _explore(self, b: int) -> None:
+        scenario, state = self.scenario, self.world.state
+        last = scenario.mission_steps // self.interval - 1
+        step = int(self.rng.integers(last)) * self.interval
+        time = step * scenario.mission_step
+        centre = np.array(scenario.path_origin) + time * np.array(scenario.path_velocity)
+        which = int(self.rng.integers(2))
+        positions = centre + scenario.formations[which]
+        if which == 0 and self._blocked(positions, state.obstacles[b]):
+            which = 1
+            positions = centre + scenario.formations[1]
+        commands = self.rng.choice(self.keeping[which], size=scenario.agents)
+        self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
+        self.cut[b] = step + round(self.starts.length / scenario.mission_step)
+
+    def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> bool:
+        gaps = np.linalg.norm(positions[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
+        return bool((gaps <= 0.5).any())

@@ -1,0 +1,146 @@
+"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector.utils import batch_space
+
+from marlbc_mj.controllers import Controller
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
+from marlbc_mj.tasks.states import State
+
+ID = "marlbc_mj/PaperFormation-v0"
+"""Known to ``gymnasium.make`` and ``gymnasium.make_vec`` once :mod:`marlbc_mj.tasks` is imported."""
+
+
+def state_space(state: State) -> gymnasium.spaces.Box:
+    """The Box of a state."""
+    return gymnasium.spaces.Box(state.low.astype(np.float32), state.high.astype(np.float32), dtype=np.float32)
+
+
+def terms(outcome: Outcome, safe_distance: float) -> dict[str, np.ndarray]:
+    """Per-world infos of a decision: the reward's terms (14), (15) and what safety is judged by."""
+    return {
+        "formation_reward": outcome.formation,
+        "violation_reward": outcome.violation,
+        "switching_reward": outcome.switching,
+        "switches": outcome.switches.sum(axis=1),
+        "clearance": outcome.clearance.min(axis=1),
+        "violated": (outcome.clearance <= safe_distance).any(axis=1),
+    }
+
+
+class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One team: a MultiDiscrete joint order in, the team's state and shared reward (13) out.
+
+    An episode is the whole mission and ends by termination. ``info`` has the reward's terms, switches and clearance.
+
+    Args:
+        scenario: a scenario's name.
+        controller: the force law; SORLC by default.
+        state: ``"extended"`` or ``"printed"``.
+        actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
+        interval: mission steps that a decision holds for.
+        **changes: any field of the scenario, ``duration=20.0`` for example.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run.
+    """
+
+    metadata = {"render_modes": []}  # noqa: RUF012  # declared so by Gymnasium
+
+    def __init__(
+        self,
+        scenario: str = "paper",
+        controller: Controller | None = None,
+        *,
+        state: str = "extended",
+        actions: str = "commands",
+        interval: int = 1,
+        **changes: Any,
+    ) -> None:
+        self.batch = FormationBatch(
+            make_scenario(scenario, **changes), controller, interval=interval, state=state, actions=actions
+        )
+        self.action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
+        self.observation_space = state_space(self.batch.read)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin an episode; the draw of the scenario comes from ``seed``."""
+        super().reset(seed=seed)
+        return self.batch.reset(int(self.np_random.integers(2**31)))[0], {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """One decision; ``action`` (N,)."""
+        outcome = self.batch.step(np.asarray(action, dtype=np.int64)[None])
+        info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
+        return outcome.final_state[0], float(outcome.reward[0]), bool(outcome.terminal[0]), False, info
+
+
+class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """B teams in one World, stepped by the compiled loop; episodes restart in the step that ends them (same-step autoreset).
+
+    The state that an episode ended in is ``infos["final_obs"]``, valid where ``infos["_final_obs"]`` is true.
+
+    Args:
+        num_envs: B.
+        threads: the worlds are shared out over this many.
+        starts: where episodes begin; at the start of the mission by default.
+        scenario, controller, state, actions, interval, **changes: as for :class:`PaperFormation`.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: str = "paper",
+        controller: Controller | None = None,
+        *,
+        threads: int = 1,
+        starts: Starts | None = None,
+        state: str = "extended",
+        actions: str = "commands",
+        interval: int = 1,
+        **changes: Any,
+    ) -> None:
+        self.batch = FormationBatch(
+            make_scenario(scenario, **changes),
+            controller,
+            worlds=num_envs,
+            threads=threads,
+            interval=interval,
+            state=state,
+            actions=actions,
+            starts=starts,
+        )
+        self.num_envs = num_envs
+        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP, "render_modes": []}
+        self.single_action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
+        self.single_observation_space = state_space(self.batch.read)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+
+    def reset(
+        self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin B episodes. World b of one ``seed`` does the same for any B."""
+        first = seed[0] if isinstance(seed, list) else seed
+        super().reset(seed=first)
+        return self.batch.reset(int(self.np_random.integers(2**31))), {}
+
+    def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """One decision of every team; ``actions`` (B, N)."""
+        outcome = self.batch.step(np.asarray(actions, dtype=np.int64))
+        infos: dict[str, Any] = {}
+        for name, values in terms(outcome, self.batch.scenario.safe_distance).items():
+            infos[name], infos[f"_{name}"] = values, np.ones(self.num_envs, dtype=bool)
+        if outcome.ended.any():
+            final = np.empty(self.num_envs, dtype=object)
+            for b in np.flatnonzero(outcome.ended):
+                final[b] = outcome.final_state[b]
+            infos["final_obs"], infos["_final_obs"] = final, outcome.ended
+        return outcome.state, outcome.reward, outcome.terminal, outcome.truncated, infos

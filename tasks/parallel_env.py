@@ -1,0 +1,98 @@
+"""PettingZoo view of the missions: every agent chooses its own order and shares the team's reward."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+from gymnasium.spaces import Discrete, Space
+from pettingzoo import ParallelEnv
+
+from marlbc_mj.controllers import Controller
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.tasks.gymnasium_env import state_space, terms
+
+
+class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
+    """One team as a PettingZoo ``ParallelEnv``; agents are ``agent_1`` to ``agent_N``.
+
+    Everybody observes the team's state; ``state()`` returns it too.
+
+    Args:
+        scenario: a scenario's name.
+        controller: the force law; SORLC by default.
+        observation: ``"extended"`` or ``"printed"``.
+        actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
+        interval: mission steps that a decision holds for.
+        **changes: any field of the scenario, ``duration=20.0`` for example.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"name": "paper_formation_v0", "render_modes": []}
+
+    def __init__(
+        self,
+        scenario: str = "paper",
+        controller: Controller | None = None,
+        *,
+        observation: str = "extended",
+        actions: str = "commands",
+        interval: int = 1,
+        **changes: Any,
+    ) -> None:
+        self.batch = FormationBatch(
+            make_scenario(scenario, **changes), controller, interval=interval, state=observation, actions=actions
+        )
+        self.possible_agents = [f"agent_{i + 1}" for i in range(self.batch.scenario.agents)]
+        self.agents: list[str] = []
+        self.render_mode = None
+        self.state_space = state_space(self.batch.read)
+        self.observation_spaces = {agent: state_space(self.batch.read) for agent in self.possible_agents}
+        self.action_spaces = {agent: Discrete(self.batch.actions) for agent in self.possible_agents}
+        self._state = np.zeros(self.batch.read.size, dtype=np.float32)
+        self._seeds = np.random.default_rng()
+
+    def observation_space(self, agent: str) -> Space[np.ndarray]:
+        """Box of the team's state."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> Space[Any]:
+        """Discrete: the agent's order."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
+        """Begin an episode; the draw of the scenario comes from ``seed``."""
+        if seed is not None:
+            self._seeds = np.random.default_rng(seed)
+        self.agents = list(self.possible_agents)
+        self._state = self.batch.reset(int(self._seeds.integers(2**31)))[0]
+        return self._everybody(self._state), {agent: {} for agent in self.agents}
+
+    def step(
+        self, actions: dict[str, int]
+    ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
+        """One decision of every agent; the reward (13) is the same for all."""
+        joint = np.array([[int(actions[agent]) for agent in self.possible_agents]])
+        outcome = self.batch.step(joint)
+        self._state = outcome.final_state[0]
+        info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
+        agents, over = self.agents, bool(outcome.terminal[0])
+        if over:
+            self.agents = []
+        return (
+            {agent: self._state.copy() for agent in agents},
+            dict.fromkeys(agents, float(outcome.reward[0])),
+            dict.fromkeys(agents, over),
+            dict.fromkeys(agents, False),
+            {agent: dict(info) for agent in agents},
+        )
+
+    def state(self) -> np.ndarray:
+        """(S,) the team's state."""
+        return self._state.copy()
+
+    def _everybody(self, state: np.ndarray) -> dict[str, np.ndarray]:
+        return {agent: state.copy() for agent in self.agents}

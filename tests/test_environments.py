@@ -1,0 +1,156 @@
+"""Gymnasium, vector and PettingZoo views: their libraries' own checkers, and the same mission as World."""
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given
+from hypothesis import strategies as st
+from pettingzoo.test import parallel_api_test
+
+from marlbc_mj import World, paper
+from marlbc_mj.behaviors import clearances
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.scenarios import Perturbation
+from marlbc_mj.tasks.batch import FormationBatch, Starts
+from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
+from marlbc_mj.tasks.parallel_env import PaperFormationParallel
+from marlbc_mj.tasks.states import RANGE, make_state, nearest
+
+AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
+
+
+def test_gymnasium_checker():
+    check_env(gymnasium.make(ID, duration=1.0).unwrapped, skip_render_check=True)
+
+
+def test_parallel_api():
+    parallel_api_test(PaperFormationParallel(duration=1.0), num_cycles=60)
+
+
+@pytest.mark.parametrize(("actions", "count"), [("commands", 4), ("orders", 6)])
+def test_action_sets(actions, count):
+    env = PaperFormation(actions=actions)
+    assert env.action_space.nvec.tolist() == [count] * 4
+
+
+def test_a_whole_episode_is_the_mission_of_world():
+    """Same orders, same rewards and states, for a decision every mission step and every fourth."""
+    world, rng = World(paper(duration=20.0)), np.random.default_rng(3)
+    actions = rng.integers(4, size=(100, 4))
+    for interval in (1, 4):
+        env = PaperFormation(state="printed", interval=interval, duration=20.0)
+        state, _ = env.reset(seed=0)
+        world.reset(0)
+        assert (state == world.observe().state()[0].astype(np.float32)).all()
+        for k in range(400 // interval):
+            action = actions[k % 100]
+            state, reward, terminal, truncated, info = env.step(action)
+            orders = world.scenario.orders.representative[action][None]
+            expected = sum(world.step(orders).reward[0] for _ in range(interval))
+            assert reward == expected
+            assert reward == info["formation_reward"] + info["violation_reward"] + info["switching_reward"]
+            assert (state == world.observe().state()[0].astype(np.float32)).all()
+            assert not truncated and terminal == (k == 400 // interval - 1)
+
+
+@pytest.mark.parametrize("make", [PaperFormation, PaperFormationParallel])
+def test_a_seed_fixes_a_whole_episode(make):
+    def episode(seed):
+        env = make(duration=5.0, interval=4, perturbation=AROUND)
+        rng, seen = np.random.default_rng(1), []
+        env.reset(seed=seed)
+        for _ in range(25):
+            joint = rng.integers(4, size=4)
+            step = env.step(joint if make is PaperFormation else dict(zip(env.possible_agents, joint, strict=True)))
+            seen.append(step[0] if make is PaperFormation else step[0]["agent_1"])
+        return np.array(seen)
+
+    first = episode(7)
+    assert (first == episode(7)).all()
+    assert (first != episode(8)).any()
+
+
+def test_vector_env_restarts_by_itself_and_keeps_the_final_state():
+    vector = gymnasium.make_vec(ID, num_envs=3, vectorization_mode="vector_entry_point", duration=1.0)
+    single = PaperFormation(duration=1.0)
+    start, _ = vector.reset(seed=2)
+    single.reset(seed=2)
+    action = np.array([2, 3, 2, 3])
+    for _ in range(20):
+        states, _, terminal, truncated, infos = vector.step(np.tile(action, (3, 1)))
+        last, *_ = single.step(action)
+    assert terminal.all() and not truncated.any()
+    assert infos["_final_obs"].all()
+    for b in range(3):
+        assert (infos["final_obs"][b] == last).all()
+    assert (states == start).all()  # nothing is perturbed, so the new episode starts as the first did
+
+
+def test_worlds_of_a_vector_env_do_not_depend_on_their_number():
+    small, large = (PaperFormationVector(n, duration=2.0, perturbation=AROUND) for n in (2, 5))
+    assert (small.reset(seed=4)[0] == large.reset(seed=4)[0][:2]).all()
+    action = np.array([0, 1, 2, 3])
+    for _ in range(30):
+        a, b = small.step(np.tile(action, (2, 1))), large.step(np.tile(action, (5, 1)))
+        assert (a[1] == b[1][:2]).all()
+
+
+def test_exploring_starts_lie_on_the_route_and_are_cut():
+    batch = FormationBatch(paper(), worlds=40, starts=Starts(exploring=1.0, length=2.0))
+    batch.reset(0)
+    state = batch.world.state
+    time = state.steps * batch.scenario.mission_step
+    assert len(np.unique(time)) > 20
+    centroid = state.position.mean(axis=1)
+    assert np.allclose(centroid[:, 0], -2.5 + time) and np.allclose(centroid[:, 1], 0.0)
+    assert set(np.unique(state.formation)) == {1, 2}
+    assert clearances(state.position[0], state.obstacles[0]).min() > 0
+    for _ in range(10):
+        outcome = batch.step(np.zeros((40, 4), dtype=np.int64))
+    assert (outcome.truncated | outcome.terminal).any()
+    assert not (outcome.truncated & outcome.terminal).any()
+    assert (outcome.state[outcome.ended] != outcome.final_state[outcome.ended]).any()
+
+
+@given(
+    st.lists(st.tuples(*[st.floats(-50, 50)] * 2), min_size=1, max_size=4),
+    st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(0, 5)), max_size=5),
+)
+def test_nearest_points_at_the_nearest_surface(points, discs):
+    obstacles = np.array(discs, dtype=float).reshape(1, -1, 3)
+    seen = nearest(np.array([points]), obstacles)[0]
+    expected = np.minimum(clearances(np.array(points), obstacles[0]), RANGE)
+    assert np.allclose(seen[:, 2], expected)
+    if len(discs):
+        assert np.allclose(np.hypot(seen[:, 0], seen[:, 1]), np.abs(expected), atol=1e-9)
+
+
+def test_the_extended_state_does_not_know_where_on_the_path_it_is():
+    """Team and obstacles moved together along the path: the same state."""
+    scenario = paper()
+    read = make_state("extended", scenario)
+    world = World(scenario)
+    observation = world.observe()
+    shift = np.array([13.0, 0.0])
+    moved = observation._replace(position=observation.position + shift)
+    obstacles = world.state.obstacles
+    assert np.allclose(read(observation, obstacles), read(moved, obstacles + np.array([13.0, 0.0, 0.0])), atol=1e-6)
+    assert read(observation, obstacles).shape == (1, read.size)
+
+
+@pytest.mark.parametrize(
+    ("build", "fragments"),
+    [
+        (lambda: PaperFormation(state="pixels"), ["state", "pixels", "extended", "printed"]),
+        (lambda: PaperFormation(actions="all"), ["action set", "all", "commands", "orders"]),
+        (lambda: PaperFormation(interval=3), ["2000", "3"]),
+        (lambda: PaperFormation("maze"), ["maze", "paper"]),
+        (lambda: Starts(exploring=1.5), ["1.5"]),
+        (lambda: Starts(length=0.0), ["0.0"]),
+    ],
+)
+def test_wrong_settings_are_named(build, fragments):
+    with pytest.raises(ConfigurationError) as error:
+        build()
+    assert all(fragment in str(error.value) for fragment in fragments)

@@ -1,0 +1,297 @@
+"""Parts of MARLMS against hand arithmetic and closed forms."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.tasks.batch import Outcome
+from marlbc_mj.training.codes import StateHash
+from marlbc_mj.training.config import Shaping, TrainConfig, from_json, make_config
+from marlbc_mj.training.exploration import Exploration
+from marlbc_mj.training.learner import HYSTERESIS, Learner, td_weight
+from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
+from marlbc_mj.training.networks import TargetRing, TeamNetwork
+from marlbc_mj.training.policy import Policy, greedy
+from marlbc_mj.training.replay import Batch, Replay
+from marlbc_mj.training.trainer import shaped_reward
+
+N, S, A = 3, 5, 4
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def network(dueling=True, seed=0):
+    return TeamNetwork(N, S, A, (6, 7), torch.arange(1.0, S + 1), dueling=dueling, generator=generator(seed))
+
+
+def one_agent(net, agent, state):
+    """Agent's network written out."""
+    x = state / np.arange(1.0, S + 1)
+    weights = [w.detach().numpy()[agent] for w in net.weights]
+    biases = [b.detach().numpy()[agent, 0] for b in net.biases]
+    for weight, bias in zip(weights[:-1], biases[:-1], strict=True):
+        x = np.maximum(x @ weight + bias, 0.0)
+    y = x @ weights[-1] + biases[-1]
+    return y[0] + y[1:] - y[1:].mean() if net.dueling else y
+
+
+@pytest.mark.parametrize("dueling", [True, False])
+def test_the_stack_is_one_network_an_agent(dueling):
+    net, states = network(dueling), np.random.default_rng(0).normal(size=(8, S)).astype(np.float32)
+    values = net(torch.from_numpy(states)).detach().numpy()
+    expected = [[one_agent(net, i, state) for state in states] for i in range(N)]
+    assert np.allclose(values, expected, atol=1e-6)
+
+
+def test_the_mean_of_a_dueling_network_is_its_value():
+    net = network()
+    x = torch.randn(4, S, generator=generator(1))
+    hidden = x / net.scale
+    values = net(x)
+    for i in range(N):
+        y = hidden
+        for weight, bias in zip(net.weights[:-1], net.biases[:-1], strict=True):
+            y = torch.relu(y @ weight[i] + bias[i])
+        value = (y @ net.weights[-1][i] + net.biases[-1][i])[:, 0]
+        assert torch.allclose(values[i].mean(dim=-1), value, atol=1e-6)
+
+
+def test_averaged_targets_are_the_mean_over_the_last_copies():
+    net, x = network(), torch.randn(6, S, generator=generator(2))
+    ring = TargetRing(net, 3)
+    assert torch.allclose(ring(x), net(x), atol=1e-6)
+    past = [net(x).detach()] * 3
+    for k in range(5):
+        with torch.no_grad():
+            for p in net.parameters():
+                p.add_(0.1 * torch.randn(p.shape, generator=generator(10 + k)))
+        ring.push()
+        past = [*past[1:], net(x).detach()]
+        assert torch.allclose(ring(x), torch.stack(past).mean(dim=0), atol=1e-5)
+
+
+def test_numpy_policy_equals_the_network():
+    for dueling in (True, False):
+        net = network(dueling)
+        states = np.random.default_rng(1).normal(size=(9, S)).astype(np.float32)
+        arrays = [tuple(p.detach().numpy() for p in ps) for ps in (net.weights, net.biases)]
+        policy = Policy(*arrays, scale=np.arange(1.0, S + 1, dtype=np.float32), dueling=dueling, margin=0.0)
+        expected = net(torch.from_numpy(states)).detach().numpy().transpose(1, 0, 2)
+        assert np.allclose(policy.values(states), expected, atol=1e-6)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 2))
+def test_greedy_leaves_an_order_only_for_a_lead_above_the_margin(seed, margin):
+    rng = np.random.default_rng(seed)
+    values, last, fresh = rng.normal(size=(6, N, A)), rng.integers(A, size=(6, N)), rng.random(6) < 0.5
+    chosen = greedy(values, last, fresh, margin)
+    for b in range(6):
+        for i in range(N):
+            best = int(values[b, i].argmax())
+            leads = values[b, i, best] - values[b, i, last[b, i]] > margin
+            assert chosen[b, i] == (best if leads or fresh[b] else last[b, i])
+
+
+def test_leniency_is_the_printed_formula():
+    t = np.array([0.0, 0.05, 0.5, 1.0])
+    assert np.allclose(leniency(t), 1.0 - np.exp(-KAPPA * t))
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.integers(0, A - 1), st.integers(0, A - 1)), min_size=1, max_size=12))
+def test_temperatures_cool_backwards_from_the_end(path):
+    """Every visit multiplies by exp(rho d^m), m counted from the last decision; nothing exceeds nu."""
+    codes = np.array([[c] for c, _, _ in path])
+    actions = np.array([[[a, b]] for _, a, b in path])
+    tables = Temperatures(2, 4, A)
+    tables.nu = 0.8
+    tables.cool(codes, actions, 0, 0, len(path) - 1)
+    expected = {}
+    for m, (code, *orders) in enumerate(reversed(path)):
+        for agent, order in enumerate(orders):
+            key = agent, code, order
+            expected[key] = min(np.exp(RHO * DECAY**m) * expected.get(key, 0.8), 0.8)
+    for (agent, code, order), value in expected.items():
+        assert tables.read(np.array([code]))[0, agent, order] == pytest.approx(value, rel=1e-5)
+    tables.nu = 0.1
+    unseen = np.isinf(tables.table).transpose(1, 0, 2)
+    assert (tables.read(np.arange(4))[unseen] == np.float32(0.1)).all()
+
+
+def test_a_positive_error_always_counts_and_a_negative_one_with_probability_1_minus_l():
+    draws = 20_000
+    error = torch.cat([torch.full((draws,), -1.0), torch.full((draws,), 1.0)])[None]
+    for lenience in (0.0, 0.3, 1.0):
+        weight = td_weight(error, torch.full_like(error, lenience), "lenient", generator())
+        assert (weight[0, draws:] == 1).all()
+        assert weight[0, :draws].mean().item() == pytest.approx(1.0 - lenience, abs=0.02)
+    assert set(td_weight(error, error, "hysteretic", generator()).unique().tolist()) == {HYSTERESIS, 1.0}
+    assert (td_weight(error, error, "plain", generator()) == 1).all()
+
+
+@given(st.integers(1, 4), st.lists(st.sampled_from(["go", "cut", "over"]), min_size=8, max_size=14), st.integers(5, 9))
+def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
+    """Against a plain loop over one world, with rewards that name their row."""
+    replay, gamma = Replay(rows, 1, 1, 1), 0.5
+    for k, end in enumerate(ends):
+        replay.store(
+            state=np.array([[k]]), final=np.array([[k + 1]]), action=np.array([[k]]), reward=np.array([[2.0**k]]),
+            leniency=np.array([[0.1 * k]]), code=np.array([0]), ended=np.array([end != "go"]), terminal=np.array([end == "over"]),
+        )  # fmt: skip
+    batch = replay.sample(200, steps, gamma, np.random.default_rng(0))
+    first = batch.state[:, 0].astype(int)
+    assert first.min() >= max(0, len(ends) - rows) and first.max() == len(ends) - steps
+    for m, start in enumerate(first):
+        total, discount, k = 0.0, 1.0, start
+        for k in range(start, start + steps):  # noqa: B007  # the row the loop stops at is needed
+            total += discount * 2.0**k
+            discount *= gamma
+            if ends[k] != "go":
+                break
+        assert batch.reward[m, 0] == pytest.approx(total, rel=1e-5)
+        assert batch.discount[m] == pytest.approx(0.0 if ends[k] == "over" else discount)
+        assert batch.next_state[m, 0] == k + 1
+        assert batch.action[m, 0] == start and batch.leniency[m, 0] == np.float32(0.1 * start)
+
+
+def test_one_update_by_hand():
+    """Target r + gamma^n max of the averaged network, Huber slope, weight 0 for a negative error at L = 1."""
+    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000)
+    learner = Learner(config, 2, A, np.ones(S), generator())
+    rng = np.random.default_rng(0)
+    state, after = (rng.normal(size=(2, S)).astype(np.float32) for _ in range(2))
+    action = np.array([[0, 1], [2, 3]])
+    reward = np.array([[0.5, -90.0], [0.25, 0.75]], dtype=np.float32)  # the second agent's first error is negative
+    batch = Batch(state, action, reward, np.array([0.9, 0.0], np.float32), after, np.ones((2, 2), np.float32))
+    q = learner.network(torch.from_numpy(state))
+    ahead = learner.targets(torch.from_numpy(after)).amax(dim=-1)
+    target = torch.from_numpy(reward.T) + torch.tensor([0.9, 0.0]) * ahead
+    chosen = torch.stack([torch.stack([q[i, m, action[m, i]] for m in range(2)]) for i in range(2)])
+    error = (target - chosen).detach()
+    slope = -torch.where(error > 0, error.clamp(-1, 1), torch.zeros(())) / 2  # mean over the batch
+    expected = torch.autograd.grad(chosen, list(learner.network.parameters()), slope)
+    reported = learner.update(batch, 0.0)
+    assert reported == pytest.approx(error.abs().mean().item(), rel=1e-5)
+    for p, gradient in zip(learner.network.parameters(), expected, strict=True):
+        assert torch.allclose(p.grad, gradient, atol=1e-6)
+
+
+def test_updates_learn_a_bandit():
+    """Two agents, reward 1 for one order each: the values find it."""
+    config = replace(TrainConfig(), hidden=(16,), copies=2, capacity=4000, learner="plain")
+    learner = Learner(config, 2, A, np.ones(S), generator())
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        state, action = np.zeros((64, S), np.float32), rng.integers(A, size=(64, 2))
+        reward = (action == np.array([1, 3])).astype(np.float32)
+        learner.update(Batch(state, action, reward, np.zeros(64, np.float32), state, np.zeros((64, 2), np.float32)), 1e-2)
+    assert np.allclose(learner.values(np.zeros((1, S)))[0], np.eye(A)[[1, 3]], atol=0.05)
+
+
+def test_exploration_follows_the_temperature():
+    config = replace(TrainConfig(), worlds=4000, hold=1, together=0.0, least_exploration=0.0, capacity=40_000)
+    rng, best = np.random.default_rng(0), np.full((4000, N), 9)
+    for temperature in (0.0, 0.3, 1.0):
+        explore = Exploration(config, N, A)
+        chosen = explore(best, np.full(best.shape, temperature), rng)
+        assert (chosen != 9).mean() == pytest.approx(temperature**0.999, abs=0.02)
+        assert set(np.unique(chosen)) <= {0, 1, 2, 3, 9}
+
+
+def test_held_orders_last_and_are_shared():
+    config = replace(TrainConfig(), worlds=500, hold=6, together=1.0, least_exploration=0.0, capacity=40_000)
+    explore, rng, best = Exploration(config, N, A), np.random.default_rng(0), np.full((500, N), 9)
+    rows = [explore(best, np.ones(best.shape), rng)]
+    assert (rows[0] == rows[0][:, :1]).all() and (rows[0] != 9).all()
+    cold = np.zeros(best.shape)
+    rows += [explore(best, cold, rng) for _ in range(7)]
+    lengths = (np.array(rows)[:, :, 0] != 9).sum(axis=0)
+    assert set(np.unique(lengths)) == {1, 2, 3, 4, 5, 6}
+    for b, length in enumerate(lengths):
+        held = np.array(rows)[:length, b, 0]
+        assert (held == held[0]).all()
+    explore(best, np.ones(best.shape), rng)
+    explore.forget(np.ones(500, dtype=bool))
+    assert (explore(best, cold, rng) == 9).all()
+
+
+@pytest.mark.parametrize("kind", ["autoencoder", "plain"])
+def test_hash_codes(kind):
+    rng = np.random.default_rng(0)
+    factors = rng.normal(size=(4000, 3)) @ rng.normal(size=(3, 20))
+    states = (0.5 * factors).astype(np.float32)
+    code = StateHash(20, 16, kind, rng)
+    assert (code(states) == 0).all()
+    error = code.fit(states, generator())
+    if kind == "autoencoder":
+        assert error < 0.25 * states.var()
+    codes = code(states)
+    assert codes.min() >= 0 and codes.max() < 1 << 16 and len(np.unique(codes)) > 100
+    assert (code(states) == codes).all()
+    near, far = code(states + 1e-4), code(states[rng.permutation(4000)])
+
+    def bits(other):
+        return np.mean([bin(int(x)).count("1") for x in codes ^ other])
+
+    assert bits(near) < 0.2 < 2.0 < bits(far)
+
+
+def outcome(**changes):
+    b = 2
+    fields = {
+        "state": None, "final_state": None, "formation": np.array([40.0, 0.0]), "violation": np.array([0.0, -20.0]),
+        "switching": np.array([-3.0, 0.0]), "switches": np.array([[True, False, True], [False] * 3]),
+        "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
+    }  # fmt: skip
+    return Outcome(**{**fields, **changes})
+
+
+def test_the_printed_reward_is_unshaped():
+    assert shaped_reward(outcome(), Shaping(), 2.0).tolist() == [[37.0] * 3, [-20.0] * 3]
+
+
+def test_shaped_reward_by_hand():
+    shaping = Shaping(centre=10.0, scale=2.0, margin=0.06, margin_cost=100.0, own_switch_cost=5.0)
+    expected = [[(37 - 40 - 100 - 5) / 2, (37 - 40 - 100) / 2, (37 - 40 - 100 - 5) / 2], [(-20 - 40 - 100) / 2] * 3]
+    assert np.allclose(shaped_reward(outcome(), shaping, 2.0), expected)
+
+
+def test_presets_and_json():
+    paper = make_config("paper")
+    assert (paper.learning_rate, paper.capacity, paper.budget, paper.interval) == (1e-4, 50_000, 200_000_000, 1)
+    assert (paper.state, paper.actions, paper.shaping) == ("printed", "orders", Shaping())
+    from marlbc_mj.provenance import plain_data
+
+    config = make_config("fast", seed=4, hidden=(8, 9))
+    assert from_json(plain_data(config)) == config
+
+
+@pytest.mark.parametrize(
+    ("changes", "fragments"),
+    [
+        ({"budget": 0}, ["budget", "0"]),
+        ({"gamma": 1.0}, ["gamma", "1.0"]),
+        ({"state": "pixels"}, ["state", "pixels", "extended"]),
+        ({"learner": "bold"}, ["learner", "bold", "lenient"]),
+        ({"learning_rate": 0.0}, ["learning_rate", "0.0"]),
+        ({"hidden": ()}, ["hidden"]),
+        ({"seed": -1}, ["seed", "-1"]),
+        ({"capacity": 256}, ["capacity", "256"]),
+        ({"together": 2.0}, ["together", "2.0"]),
+    ],
+)
+def test_wrong_settings_are_named(changes, fragments):
+    with pytest.raises(ConfigurationError) as error:
+        make_config("fast", **changes)
+    assert all(fragment in str(error.value) for fragment in fragments)
+
+
+def test_unknown_preset():
+    with pytest.raises(ConfigurationError, match="fast, paper"):
+        make_config("slow")

@@ -1,0 +1,80 @@
+"""Hash codes of states: sign(A (z - mean z)) of an auto-encoder's code z, or of the state itself (Tang et al. 2017)."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+CODE = 16  # width of the auto-encoder's code
+HIDDEN = 32
+MINIBATCHES = 500
+MINIBATCH = 256
+
+
+class StateHash:
+    """Maps states to integers below 2^bits; everything is 0 until :meth:`fit`.
+
+    Args:
+        size: S.
+        bits: of a hash code.
+        kind: ``"autoencoder"`` or ``"plain"``.
+        rng: of the projection A.
+    """
+
+    def __init__(self, size: int, bits: int, kind: str, rng: np.random.Generator) -> None:
+        self.kind = kind
+        self.bits = bits
+        width = CODE if kind == "autoencoder" else size
+        self.arrays = {
+            "projection": rng.standard_normal((width, bits)).astype(np.float32),
+            "mean": np.zeros(width, dtype=np.float32),
+            "weight1": np.zeros((size, HIDDEN), dtype=np.float32),
+            "bias1": np.zeros(HIDDEN, dtype=np.float32),
+            "weight2": np.zeros((HIDDEN, CODE), dtype=np.float32),
+            "bias2": np.zeros(CODE, dtype=np.float32),
+            "fitted": np.zeros(1, dtype=np.float32),
+        }
+
+    def fit(self, states: np.ndarray, generator: torch.Generator) -> float:
+        """Train the auto-encoder on states (M, S), then keep it; returns the last reconstruction error (mean square)."""
+        error = 0.0
+        if self.kind == "autoencoder":
+            error = self._train(torch.from_numpy(states), generator)
+        self.arrays["mean"] = self._encode(states).mean(axis=0)
+        self.arrays["fitted"][:] = 1.0
+        return error
+
+    def _train(self, states: Tensor, generator: torch.Generator) -> float:
+        size = states.shape[1]
+        first, second = nn.Linear(size, HIDDEN), nn.Linear(HIDDEN, CODE)
+        coder = nn.Sequential(
+            first, nn.Tanh(), second, nn.Tanh(), nn.Linear(CODE, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, size)
+        )  # fmt: skip
+        for parameter in coder.parameters():
+            bound = 1.0 / np.sqrt(parameter.shape[-1])
+            parameter.data = (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0) * bound
+        optimiser = torch.optim.Adam(coder.parameters(), lr=3e-3)
+        error = torch.zeros(())
+        for _ in range(MINIBATCHES):
+            batch = states[torch.randint(len(states), (MINIBATCH,), generator=generator)]
+            error = nn.functional.mse_loss(coder(batch), batch)
+            optimiser.zero_grad()
+            error.backward()
+            optimiser.step()
+        for k, layer in ((1, first), (2, second)):
+            self.arrays[f"weight{k}"] = layer.weight.detach().numpy().T.copy()
+            self.arrays[f"bias{k}"] = layer.bias.detach().numpy().copy()
+        return float(error.detach())
+
+    def _encode(self, states: np.ndarray) -> np.ndarray:
+        if self.kind == "plain":
+            return states
+        a = self.arrays
+        hidden = np.tanh(states @ a["weight1"] + a["bias1"])
+        return np.asarray(np.tanh(hidden @ a["weight2"] + a["bias2"]))
+
+    def __call__(self, states: np.ndarray) -> np.ndarray:
+        """(B,) int64 codes of scaled states (B, S)."""
+        if not self.arrays["fitted"][0]:
+            return np.zeros(len(states), dtype=np.int64)
+        signs = (self._encode(states) - self.arrays["mean"]) @ self.arrays["projection"] > 0
+        return np.asarray(signs @ (1 << np.arange(self.bits)))

@@ -1,0 +1,212 @@
+"""What a training run is: one frozen dataclass, and the presets of it."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+from marlbc_mj.errors import ConfigurationError, unknown
+
+
+@dataclass(frozen=True)
+class Shaping:
+    """The reward that a learner sees, made from the printed terms. The defaults leave the printed reward as it is.
+
+    Evaluation never uses it: returns are those of (13).
+    """
+
+    centre: float = 0.0
+    """Subtracted for every mission step. At 10, the reward of being in formation, the value of an undisturbed mission is 0
+    instead of 10 / (1 - gamma), and differences between orders are no longer small against it."""
+    scale: float = 1.0
+    """Rewards are divided by it."""
+    margin: float = 0.0
+    """A clearance below safe_distance + margin costs ``margin_cost`` [m]."""
+    margin_cost: float = 0.0
+    """For a decision with any agent inside the margin: the printed reward alone makes grazing an obstacle worth while."""
+    own_switch_cost: float = 0.0
+    """For every switch of an agent, paid by that agent alone: who switched is known, so the team need not guess."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A training run of a mission supervisor.
+
+    Raises:
+        ConfigurationError: a value that cannot be run.
+    """
+
+    method: str = "marlms"
+    """What is learned; a name in METHODS."""
+    preset: str = "fast"
+    """Name of the preset that the values come from."""
+    seed: int = 0
+    """Of networks, exploration, starts and draws."""
+    scenario: str = "paper"
+    """Scenario that is trained on."""
+    controller: str = "sorlc"
+    """Controller that tracks the references."""
+    budget: int = 5_000_000
+    """Mission steps, over all worlds."""
+
+    worlds: int = 256
+    """Worlds stepped together."""
+    state: str = "extended"
+    """State: extended or printed."""
+    actions: str = "commands"
+    """Action set: commands (the distinct ones) or orders (all permutations)."""
+    interval: int = 4
+    """Mission steps that a decision holds for."""
+    exploring_starts: float = 0.8
+    """Share of episodes that begin anywhere along the route."""
+    start_length: float = 20.0
+    """Length of those episodes [s]."""
+
+    hidden: tuple[int, ...] = (64, 64)
+    """Widths of the hidden layers."""
+    dueling: bool = True
+    """Dueling networks: Q = V + B - mean B."""
+    copies: int = 5
+    """Past networks that a target is averaged over; 1 switches averaging off."""
+    push_every: int = 100
+    """Updates after which the present network joins the past ones."""
+    gamma: float = 0.97
+    """Discount factor of a decision."""
+    n_step: int = 3
+    """Decisions whose rewards are summed before the bootstrap."""
+    learning_rate: float = 1e-3
+    """Of Adam, at the start."""
+    final_learning_rate: float = 1e-4
+    """Of Adam, at the end; linear in between."""
+    batch: int = 512
+    """Transitions of an update."""
+    updates: int = 3
+    """Updates after each decision of all worlds."""
+    capacity: int = 200_000
+    """Transitions in the replay buffer."""
+
+    learner: str = "lenient"
+    """What becomes of a negative TD error: lenient, hysteretic (half of it counts), plain."""
+    hash: str = "autoencoder"
+    """States are hashed by the codes of an auto-encoder (autoencoder) or as they are (plain)."""
+    bits: int = 16
+    """Bits of a hash code."""
+    cool_by: float = 0.5
+    """Share of the budget after which the largest temperature is 0.05."""
+    hold: int = 10
+    """An exploring agent keeps its random order for 1 to this many decisions."""
+    together: float = 0.5
+    """Share of explorations in which the whole team takes one random order."""
+    least_exploration: float = 0.02
+    """Exploration never falls below it."""
+    switching_margin: float = 0.1
+    """The greedy policy leaves an order only for one whose value is higher by this."""
+    shaping: Shaping = Shaping(centre=10.0, scale=40.0, margin=0.06, margin_cost=100.0, own_switch_cost=5.0)
+    """The reward that is learned from."""
+
+    evaluate_every: int = 100_000
+    """Mission steps between evaluations on the case study."""
+    save_every: float = 60.0
+    """Seconds between saves for --resume."""
+    threads: int = 2
+    """Threads of the simulation; networks take the same number."""
+    device: str = "cpu"
+    """Device of the networks: cpu or cuda."""
+
+    def __post_init__(self) -> None:
+        for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("exploring_starts", "together", "least_exploration"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
+        if not 0 <= self.gamma < 1:
+            raise ConfigurationError(f"gamma must be at least 0 and below 1, got {self.gamma}")
+        for name in ("learning_rate", "final_learning_rate", "cool_by", "start_length"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)}")
+        for name, choices in CHOICES.items():
+            if getattr(self, name) not in choices:
+                raise unknown(name, getattr(self, name), choices)
+        if not self.hidden or min(self.hidden) < 1:
+            raise ConfigurationError(f"hidden layers must have at least one unit, got {self.hidden}")
+        if self.seed < 0:
+            raise ConfigurationError(f"seed must not be negative, got {self.seed}")
+        if self.rows <= self.n_step:
+            raise ConfigurationError(
+                f"a capacity of {self.capacity} transitions holds {self.rows} decisions of {self.worlds} worlds; "
+                f"{self.n_step}-step returns need more"
+            )
+
+    @property
+    def rows(self) -> int:
+        """Decisions of all worlds that the replay buffer holds."""
+        return self.capacity // self.worlds
+
+
+CHOICES = {
+    "state": ("extended", "printed"),
+    "actions": ("commands", "orders"),
+    "learner": ("lenient", "hysteretic", "plain"),
+    "hash": ("autoencoder", "plain"),
+    "device": ("cpu", "cuda"),
+}
+
+METHODS: dict[str, tuple[dict[str, Any], str]] = {
+    "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one an agent"),
+    "hysteretic": ({"learner": "hysteretic"}, "the same, but a negative TD error counts half instead of being overlooked"),
+    "iql": ({"learner": "plain"}, "independent Q-learning: the same without leniency"),
+}
+"""What a method changes in a preset, and one line of description, by name."""
+
+PRESETS: dict[str, tuple[TrainConfig, str]] = {
+    "fast": (TrainConfig(), "minutes on two cores: extended state, exploring starts, held exploration, 3-step returns"),
+    "paper": (
+        TrainConfig(
+            preset="paper",
+            budget=200_000_000,
+            state="printed",
+            actions="orders",
+            interval=1,
+            exploring_starts=0.0,
+            gamma=0.99,
+            n_step=1,
+            learning_rate=1e-4,
+            final_learning_rate=1e-4,
+            capacity=50_000,
+            worlds=16,
+            batch=64,
+            updates=1,
+            hold=1,
+            together=0.0,
+            least_exploration=0.0,
+            switching_margin=0.0,
+            shaping=Shaping(),
+        ),
+        "the printed hyper-parameters: 100 000 episodes of 2000 decisions, printed state, reward and orders",
+    ),
+}
+"""Configuration and one line of description by name."""
+
+
+def from_json(data: dict[str, Any]) -> TrainConfig:
+    """A configuration from its JSON data.
+
+    Raises:
+        ConfigurationError: an unknown setting or a value that cannot be run.
+    """
+    data = {name: value for name, value in data.items() if name != "type"}
+    try:
+        shaping = Shaping(**{name: value for name, value in data.pop("shaping").items() if name != "type"})
+        return TrainConfig(**{**data, "hidden": tuple(data["hidden"])}, shaping=shaping)
+    except (KeyError, TypeError) as error:
+        raise ConfigurationError(f"not the configuration of a training run: {error}") from error
+
+
+def make_config(preset: str, **changes: Any) -> TrainConfig:
+    """A preset with changes.
+
+    Raises:
+        ConfigurationError: unknown preset or a value that cannot be run.
+    """
+    if preset not in PRESETS:
+        raise unknown("preset", preset, PRESETS)
+    return replace(PRESETS[preset][0], **changes)

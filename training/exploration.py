@@ -1,0 +1,44 @@
+"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the whole team."""
+
+import numpy as np
+
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.leniency import ZETA
+
+
+class Exploration:
+    """Replaces greedy actions by random ones. With ``hold=1, together=0`` every agent explores with T^zeta, as printed.
+
+    Args:
+        config: hold, together and least_exploration of it are used.
+        agents: N.
+        actions: A.
+    """
+
+    def __init__(self, config: TrainConfig, agents: int, actions: int) -> None:
+        self.config = config
+        self.actions = actions
+        self.left = np.zeros((config.worlds, agents), dtype=np.int64)  # decisions that a held order still lasts
+        self.held = np.zeros((config.worlds, agents), dtype=np.int64)
+
+    def __call__(self, greedy: np.ndarray, temperature: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """(B, N) actions from greedy ones (B, N) and each agent's mean temperature (B, N)."""
+        config = self.config
+        chance = np.maximum(temperature**ZETA, config.least_exploration)
+        free = self.left == 0
+        team = (rng.random(len(chance)) < config.together * chance.mean(axis=1)) & free.all(axis=1)
+        alone = (rng.random(chance.shape) < (1.0 - config.together) * chance) & free
+        begin = team[:, None] | alone
+        one = np.broadcast_to(rng.integers(self.actions, size=(len(chance), 1)), chance.shape)
+        order = np.where(team[:, None], one, rng.integers(self.actions, size=chance.shape))
+        one = np.broadcast_to(rng.integers(1, config.hold + 1, size=(len(chance), 1)), chance.shape)
+        length = np.where(team[:, None], one, rng.integers(1, config.hold + 1, size=chance.shape))
+        self.held = np.where(begin, order, self.held)
+        self.left = np.where(begin, length, self.left)
+        chosen = np.where(self.left > 0, self.held, greedy)
+        self.left = np.maximum(self.left - 1, 0)
+        return np.asarray(chosen)
+
+    def forget(self, ended: np.ndarray) -> None:
+        """Drop held orders of worlds whose episode ended; ``ended`` (B,)."""
+        self.left[ended] = 0

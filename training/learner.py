@@ -1,0 +1,107 @@
+"""Independent deep Q-learners of a team: dueling, averaged targets, lenient (17) or hysteretic about negative errors."""
+
+import numpy as np
+import torch
+
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.networks import TargetRing, TeamNetwork
+from marlbc_mj.training.replay import Batch
+
+HYSTERESIS = 0.5
+"""Weight of a negative TD error of a hysteretic learner (Omidshafiei et al. 2017)."""
+LARGEST_GRADIENT = 10.0  # norm
+
+
+class Learner:
+    """The networks of N agents, their targets and their optimiser.
+
+    Args:
+        config: of the run.
+        agents, actions: N, A.
+        scale: (S,) a state is divided by it.
+        generator: of initial weights and of the draws x of (17).
+    """
+
+    def __init__(self, config: TrainConfig, agents: int, actions: int, scale: np.ndarray, generator: torch.Generator) -> None:
+        self.config = config
+        self.generator = generator
+        self.network = TeamNetwork(
+            agents,
+            len(scale),
+            actions,
+            config.hidden,
+            torch.from_numpy(scale),
+            dueling=config.dueling,
+            generator=generator,
+        ).to(config.device)
+        self.targets = TargetRing(self.network, config.copies)
+        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, eps=1e-5)
+        self.updates = 0
+
+    @torch.no_grad()
+    def values(self, state: np.ndarray) -> np.ndarray:
+        """(B, N, A) action values of states (B, S)."""
+        q = self.network(self._tensor(state))
+        return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
+
+    def update(self, batch: Batch, learning_rate: float) -> float:
+        """One gradient step; returns the mean absolute TD error over agents and transitions."""
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate
+        target = self.targets(self._tensor(batch.next_state)).amax(dim=-1)  # (N, M)
+        target = self._tensor(batch.reward.T) + self._tensor(batch.discount) * target
+        actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
+        chosen = self.network(self._tensor(batch.state)).gather(-1, actions[..., None]).squeeze(-1)
+        error = (target - chosen).detach()
+        weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
+        loss = (torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
+        self.optimiser.step()
+        self.updates += 1
+        if self.updates % self.config.push_every == 0:
+            self.targets.push()
+        return float(error.abs().mean())
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of the networks, the past networks and Adam's moments, by name."""
+        tensors = {f"network{k}": p.detach() for k, p in enumerate(self.network.parameters())}
+        tensors |= {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
+        for k, p in enumerate(self.network.parameters()):
+            tensors |= {f"adam{k}.{name}": value for name, value in self.optimiser.state.get(p, {}).items()}
+        return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go back to a :meth:`snapshot`."""
+        for k, p in enumerate(self.network.parameters()):
+            p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
+            moments = {
+                name: arrays[f"adam{k}.{name}"] for name in ("step", "exp_avg", "exp_avg_sq") if f"adam{k}.{name}" in arrays
+            }
+            if moments:
+                self.optimiser.state[p] = {
+                    name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device)
+                    for name, array in moments.items()
+                }
+        for k, tensor in enumerate(self.targets.tensors):
+            tensor.copy_(torch.from_numpy(arrays[f"target{k}"]))
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
+
+
+def td_weight(error: torch.Tensor, leniency: torch.Tensor, kind: str, generator: torch.Generator) -> torch.Tensor:
+    """What each TD error counts (17): 1 where it is positive or x > L, x uniform in (0, 1), else 0.
+
+    Args:
+        error, leniency: (N, M).
+        kind: lenient; hysteretic takes ``HYSTERESIS`` instead of 0 and needs no L; plain is 1 throughout.
+        generator: of x.
+    """
+    if kind == "plain":
+        return torch.ones_like(error)
+    if kind == "hysteretic":
+        return torch.where(error > 0, 1.0, HYSTERESIS)
+    x = torch.rand(error.shape, generator=generator).to(error.device)
+    return ((error > 0) | (x > leniency)).to(error.dtype)

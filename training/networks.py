@@ -1,0 +1,93 @@
+"""Dueling networks of a whole team as one stack of matrices, and the ring of past weights that averaged targets are made of."""
+
+import itertools
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor, nn
+
+
+class TeamNetwork(nn.Module):
+    """One dueling network per agent, Q_i(s, b) = V_i(s) + B_i(s, b) - mean_b B_i (Wang et al. 2016), all on the same state.
+
+    Args:
+        agents: N.
+        state: S, the size of the state.
+        actions: A.
+        hidden: widths of the ReLU layers.
+        scale: (S,) the state is divided by it.
+        dueling: False makes the last layer give Q itself.
+        generator: of the initial weights.
+    """
+
+    def __init__(
+        self,
+        agents: int,
+        state: int,
+        actions: int,
+        hidden: tuple[int, ...],
+        scale: Tensor,
+        *,
+        dueling: bool = True,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.dueling = dueling
+        self.actions = actions
+        self.scale: Tensor
+        self.register_buffer("scale", scale.to(torch.float32))
+        sizes = [state, *hidden, actions + 1 if dueling else actions]
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for inputs, outputs in itertools.pairwise(sizes):
+            bound = 1.0 / math.sqrt(inputs)
+            weight = (2.0 * torch.rand(agents, inputs, outputs, generator=generator) - 1.0) * bound
+            self.weights.append(nn.Parameter(weight))
+            self.biases.append(nn.Parameter(torch.zeros(agents, 1, outputs)))
+
+    def forward(self, state: Tensor) -> Tensor:
+        """(N, B, A) action values of states (B, S)."""
+        return apply(list(self.weights), list(self.biases), state / self.scale, self.dueling)
+
+
+def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, dueling: bool) -> Tensor:
+    """(N, B, A) from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in)."""
+    networks, inputs, width = weights[0].shape
+    first = x @ weights[0].permute(1, 0, 2).reshape(inputs, networks * width)
+    y = first.view(len(x), networks, width).transpose(0, 1) + biases[0]
+    for weight, bias in zip(weights[1:], biases[1:], strict=True):
+        y = torch.baddbmm(bias, torch.relu(y), weight)
+    if not dueling:
+        return y
+    value, advantage = y[..., :1], y[..., 1:]
+    return value + advantage - advantage.mean(dim=-1, keepdim=True)
+
+
+class TargetRing:
+    """The last ``copies`` weights of a network; its value is the mean over them (Anschel et al. 2017)."""
+
+    def __init__(self, network: TeamNetwork, copies: int) -> None:
+        self.network = network
+        self.copies = copies
+        self.agents = network.weights[0].shape[0]
+        self.tensors = [p.detach().repeat(copies, 1, 1) for p in self._parameters()]  # (copies N, ., .)
+        self.next = 0
+
+    def _parameters(self) -> Iterator[Tensor]:
+        yield from self.network.weights
+        yield from self.network.biases
+
+    def push(self) -> None:
+        """The oldest copy becomes the network's present weights."""
+        rows = slice(self.next * self.agents, (self.next + 1) * self.agents)
+        for copy, parameter in zip(self.tensors, self._parameters(), strict=True):
+            copy[rows] = parameter.detach()
+        self.next = (self.next + 1) % self.copies
+
+    @torch.no_grad()
+    def __call__(self, state: Tensor) -> Tensor:
+        """(N, B, A) averaged action values of states (B, S)."""
+        layers = len(self.network.weights)
+        values = apply(self.tensors[:layers], self.tensors[layers:], state / self.network.scale, self.network.dueling)
+        return values.view(self.copies, self.agents, *values.shape[1:]).mean(dim=0)

@@ -1,0 +1,43 @@
+"""A trained team as plain NumPy: states in, actions out, without torch."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Policy(NamedTuple):
+    """Greedy policy of N dueling (or plain) networks with a switching margin; what a checkpoint holds."""
+
+    weights: tuple[np.ndarray, ...]  # (N, in, out) float32 each
+    biases: tuple[np.ndarray, ...]  # (N, 1, out)
+    scale: np.ndarray  # (S,)
+    dueling: bool
+    margin: float
+
+    def values(self, state: np.ndarray) -> np.ndarray:
+        """(B, N, A) action values of states (B, S)."""
+        first = self.weights[0]
+        networks, inputs, width = first.shape
+        y = (state / self.scale).astype(np.float32) @ first.transpose(1, 0, 2).reshape(inputs, networks * width)
+        y = y.reshape(len(state), networks, width).transpose(1, 0, 2) + self.biases[0]
+        for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
+            y = np.matmul(np.maximum(y, 0.0), weight) + bias
+        y = y.transpose(1, 0, 2)
+        if not self.dueling:
+            return np.asarray(y)
+        advantage = y[..., 1:]
+        return np.asarray(y[..., :1] + advantage - advantage.mean(axis=-1, keepdims=True))
+
+
+def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: float) -> np.ndarray:
+    """(B, N) actions: the best one, but the last one unless the best is better by more than ``margin``.
+
+    Args:
+        values: (B, N, A).
+        last: (B, N) actions before.
+        fresh: (B,) bool, no action has been taken yet, so there is nothing to keep.
+        margin: of the action values.
+    """
+    best = values.argmax(axis=-1)
+    lead = np.take_along_axis(values, best[..., None], axis=-1) - np.take_along_axis(values, last[..., None], axis=-1)
+    return np.where((lead[..., 0] > margin) | fresh[:, None], best, last)

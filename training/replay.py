@@ -1,0 +1,73 @@
+"""Replay buffer of decisions of B worlds in the order of time, from which n-step transitions are drawn."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Batch(NamedTuple):
+    """M transitions over up to n decisions."""
+
+    state: np.ndarray  # (M, S)
+    action: np.ndarray  # (M, N)
+    reward: np.ndarray  # (M, N) discounted sum of up to n rewards
+    discount: np.ndarray  # (M,) of the bootstrap: gamma^n, 0 where the mission ended
+    next_state: np.ndarray  # (M, S) to bootstrap from
+    leniency: np.ndarray  # (M, N)
+
+
+class Replay:
+    """A ring of rows; a row is one decision of all B worlds. All arrays are public: they are what a resumed run needs.
+
+    Args:
+        rows: decisions kept.
+        worlds, agents, state: B, N and the size of a state.
+    """
+
+    def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
+        self.rows = rows
+        self.count = 0  # rows ever written
+        self.arrays: dict[str, np.ndarray] = {
+            "state": np.zeros((rows, worlds, state), dtype=np.float32),
+            "final": np.zeros((rows, worlds, state), dtype=np.float32),  # the true successor
+            "action": np.zeros((rows, worlds, agents), dtype=np.int64),
+            "reward": np.zeros((rows, worlds, agents), dtype=np.float32),
+            "leniency": np.zeros((rows, worlds, agents), dtype=np.float32),
+            "code": np.zeros((rows, worlds), dtype=np.int64),
+            "ended": np.zeros((rows, worlds), dtype=bool),
+            "terminal": np.zeros((rows, worlds), dtype=bool),
+        }
+
+    def store(self, **row: np.ndarray) -> None:
+        """Write one row; keywords are the names of ``arrays``."""
+        for name, array in self.arrays.items():
+            array[self.count % self.rows] = row[name]
+        self.count += 1
+
+    def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator) -> Batch:
+        """``size`` transitions of up to ``steps`` decisions, uniformly; shorter where an episode ended."""
+        a = self.arrays
+        worlds = a["ended"].shape[1]
+        first = rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
+        world = rng.integers(worlds, size=size)
+        row = first % self.rows
+        reward = np.zeros((size, a["reward"].shape[2]), dtype=np.float32)
+        discount = np.ones(size, dtype=np.float32)
+        alive = np.ones(size, dtype=bool)
+        terminal = np.zeros(size, dtype=bool)
+        last = row
+        for k in range(steps):
+            now = (first + k) % self.rows
+            reward += (discount * alive)[:, None] * a["reward"][now, world]
+            last = np.where(alive, now, last)
+            discount = np.where(alive, np.float32(gamma) * discount, discount)
+            terminal |= alive & a["terminal"][now, world]
+            alive &= ~a["ended"][now, world]
+        return Batch(
+            a["state"][row, world],
+            a["action"][row, world],
+            reward,
+            np.where(terminal, np.float32(0.0), discount),
+            a["final"][last, world],
+            a["leniency"][row, world],
+        )
