@@ -186,4 +186,4 @@ class FormationBatch:
 
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> bool:
         gaps = np.linalg.norm(positions[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
-        return bool((gaps <= 0.5).any())
+        return bool((gaps <= self.scenario.safe_distance).any())

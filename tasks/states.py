@@ -14,6 +14,11 @@ from marlbc_mj.scenarios import Scenario
 RANGE = 10.0
 """How far a feature of the extended state reaches [m]; beyond it, it saturates."""
 
+CLOSE = 2.0
+"""The finer of the two scales of lengths in the extended state [m]."""
+
+LENGTHS = 10  # an agent has
+
 SPEED = 5.0
 """A velocity error of this size is 1 in the extended state [m/s]."""
 
@@ -49,34 +54,39 @@ class PrintedState:
 class ExtendedState:
     """Everything relative and normalised: nothing in it says where on the path, so it carries over to other obstacles.
 
-    For each agent 4 + C + 6 numbers, then G one-hot. Per agent: error to its FM and FR slots about the measured centroid;
-    velocity minus the path's; its command one-hot (C commands); the nearest obstacle, seen from the agent: offset of the surface
-    and clearance; the same seen from its FM slot, occupied or not. Lengths by ``RANGE``, clipped to [-1, 1].
+    Per agent: error to its FM and FR slots about the measured centroid; velocity minus the path's; its command one-hot; the
+    nearest obstacle (offset of the surface, clearance beyond the safe distance), seen from the agent and from its FM slot,
+    occupied or not. Then G one-hot. Lengths appear twice, by ``RANGE`` and by ``CLOSE``, clipped to [-1, 1]: a decision looks
+    metres ahead and turns on centimetres.
     """
 
     def __init__(self, scenario: Scenario) -> None:
         self.commands = len(scenario.orders.commands)
         self.slots = scenario.formations
         self.velocity = np.array(scenario.path_velocity)
-        self.size = scenario.agents * (12 + self.commands) + 3
+        self.safe = np.array([0.0, 0.0, scenario.safe_distance])
+        self.size = scenario.agents * (2 * LENGTHS + 2 + self.commands) + 3
         self.scale = np.ones(self.size)
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
 
     def __call__(self, observation: Observation, obstacles: np.ndarray) -> np.ndarray:
-        """(B, N (12 + C) + 3) float32 from a batch observation and obstacles (B, K, 3) [m]."""
+        """(B, N (22 + C) + 3) float32 from a batch observation and obstacles (B, K, 3) [m]; C commands."""
         position = observation.position
         worlds = len(position)
         centroid = position.mean(axis=1, keepdims=True)
         slots = centroid[:, None] + self.slots  # (B, 2, N, 2)
-        parts = [
-            (position - slots[:, 0]) / RANGE,
-            (position - slots[:, 1]) / RANGE,
-            (observation.velocity - self.velocity) / SPEED,
-            np.eye(self.commands)[observation.command],
-            nearest(position, obstacles) / RANGE,
-            nearest(slots[:, 0], obstacles) / RANGE,
-        ]
-        agents = np.concatenate(parts, axis=-1).reshape(worlds, -1)
+        lengths = np.concatenate(
+            [
+                position - slots[:, 0],
+                position - slots[:, 1],
+                nearest(position, obstacles) - self.safe,
+                nearest(slots[:, 0], obstacles) - self.safe,
+            ],
+            axis=-1,
+        )
+        speeds = (observation.velocity - self.velocity) / SPEED
+        commands = np.eye(self.commands)[observation.command]
+        agents = np.concatenate([lengths / RANGE, lengths / CLOSE, speeds, commands], axis=-1).reshape(worlds, -1)
         joint = np.concatenate([agents, np.eye(3)[observation.formation]], axis=-1)
         return np.asarray(np.clip(joint, -1.0, 1.0), dtype=np.float32)
 

@@ -291,14 +291,15 @@ def test_marks_that_coincide_are_named(results: list[Result]) -> None:
     sorlc = results[0]
     twin, other = scaled("scripted+sorlc-off", sorlc, 1.0), scaled("scripted+lqr", sorlc, 0.1)
     assert coincident([sorlc, other, twin]) == [["sorlc", "sorlc-off"]]
-    assert coincident([sorlc, other, scaled("fms+lqr", other, 1.0)]) == [["scripted+lqr", "fms+lqr"]]
+    both = [sorlc, other, *(scaled(f"fms+{name}", like, 1.0) for name, like in (("sorlc", sorlc), ("lqr", other)))]
+    assert coincident(both) == [["scripted+sorlc", "fms+sorlc"], ["scripted+lqr", "fms+lqr"]]
     (plot,) = [p for p in figures.plots([sorlc, other, twin]) if p.stem == "pareto_all"]
     assert plot.caption.endswith("Marks of sorlc and sorlc-off coincide.")
 
 
 def test_spans_of_numbers() -> None:
     """Three and more make a span."""
-    assert spans([7, 0, 2, 3, 4, 6]) == "0, 2 to 4, 6, 7" and spans([]) == ""
+    assert spans([7, 0, 2, 3, 4, 6]) == "0, 2 to 4, 6, 7"
 
 
 def test_predictions_and_solver_share(results: list[Result]) -> None:
@@ -309,7 +310,7 @@ def test_predictions_and_solver_share(results: list[Result]) -> None:
     assert predictions(kinds[:1]) is None
     told = replace(kinds[0], solver_share=0.75)
     times = make_tables([results[0], told], "paper")[2]
-    at = next(k for k, column in enumerate(times.columns) if "solver" in column.label)
+    at = next(k for k, column in enumerate(times.columns) if "solver" in column.group)
     assert [row[at] for row in times.rows[:2]] == ["–", "75"]
     assert summary([told], "paper", {})["methods"]["mpcms+sorlc"]["solver_share"] == 0.75
 

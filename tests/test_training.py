@@ -18,7 +18,7 @@ from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, lenienc
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.policy import Policy, greedy
 from marlbc_mj.training.replay import Batch, Replay
-from marlbc_mj.training.trainer import shaped_reward
+from marlbc_mj.training.trainer import lost, shaped_reward
 
 N, S, A = 3, 5, 4
 
@@ -142,20 +142,21 @@ def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
     for k, end in enumerate(ends):
         replay.store(
             state=np.array([[k]]), final=np.array([[k + 1]]), action=np.array([[k]]), reward=np.array([[2.0**k]]),
-            leniency=np.array([[0.1 * k]]), code=np.array([0]), ended=np.array([end != "go"]), terminal=np.array([end == "over"]),
+            leniency=np.array([[0.1 * k]]), code=np.array([0]), ended=np.array([end != "go"]),
+            terminal=np.array([[end == "over"]]),
         )  # fmt: skip
     batch = replay.sample(200, steps, gamma, np.random.default_rng(0))
     first = batch.state[:, 0].astype(int)
     assert first.min() >= max(0, len(ends) - rows) and first.max() == len(ends) - steps
     for m, start in enumerate(first):
         total, discount, k = 0.0, 1.0, start
-        for k in range(start, start + steps):  # noqa: B007  # the row the loop stops at is needed
+        for k in range(start, start + steps):  # the row the loop stops at is needed
             total += discount * 2.0**k
             discount *= gamma
             if ends[k] != "go":
                 break
         assert batch.reward[m, 0] == pytest.approx(total, rel=1e-5)
-        assert batch.discount[m] == pytest.approx(0.0 if ends[k] == "over" else discount)
+        assert batch.discount[m, 0] == pytest.approx(0.0 if ends[k] == "over" else discount)
         assert batch.next_state[m, 0] == k + 1
         assert batch.action[m, 0] == start and batch.leniency[m, 0] == np.float32(0.1 * start)
 
@@ -168,10 +169,11 @@ def test_one_update_by_hand():
     state, after = (rng.normal(size=(2, S)).astype(np.float32) for _ in range(2))
     action = np.array([[0, 1], [2, 3]])
     reward = np.array([[0.5, -90.0], [0.25, 0.75]], dtype=np.float32)  # the second agent's first error is negative
-    batch = Batch(state, action, reward, np.array([0.9, 0.0], np.float32), after, np.ones((2, 2), np.float32))
+    discount = np.array([[0.9, 0.9], [0.0, 0.9]], dtype=np.float32)  # over for the first agent of the second transition
+    batch = Batch(state, action, reward, discount, after, np.ones((2, 2), np.float32))
     q = learner.network(torch.from_numpy(state))
     ahead = learner.targets(torch.from_numpy(after)).amax(dim=-1)
-    target = torch.from_numpy(reward.T) + torch.tensor([0.9, 0.0]) * ahead
+    target = torch.from_numpy(reward.T) + torch.from_numpy(discount.T) * ahead
     chosen = torch.stack([torch.stack([q[i, m, action[m, i]] for m in range(2)]) for i in range(2)])
     error = (target - chosen).detach()
     slope = -torch.where(error > 0, error.clamp(-1, 1), torch.zeros(())) / 2  # mean over the batch
@@ -190,7 +192,7 @@ def test_updates_learn_a_bandit():
     for _ in range(300):
         state, action = np.zeros((64, S), np.float32), rng.integers(A, size=(64, 2))
         reward = (action == np.array([1, 3])).astype(np.float32)
-        learner.update(Batch(state, action, reward, np.zeros(64, np.float32), state, np.zeros((64, 2), np.float32)), 1e-2)
+        learner.update(Batch(state, action, reward, np.zeros((64, 2), np.float32), state, np.zeros((64, 2), np.float32)), 1e-2)
     assert np.allclose(learner.values(np.zeros((1, S)))[0], np.eye(A)[[1, 3]], atol=0.05)
 
 
@@ -253,13 +255,29 @@ def outcome(**changes):
 
 
 def test_the_printed_reward_is_unshaped():
-    assert shaped_reward(outcome(), Shaping(), 2.0).tolist() == [[37.0] * 3, [-20.0] * 3]
+    assert shaped_reward(outcome(), Shaping()).tolist() == [[37.0] * 3, [-20.0] * 3]
+    assert not lost(outcome(), Shaping(), 2.0).any()
 
 
 def test_shaped_reward_by_hand():
-    shaping = Shaping(centre=10.0, scale=2.0, margin=0.06, margin_cost=100.0, own_switch_cost=5.0)
-    expected = [[(37 - 40 - 100 - 5) / 2, (37 - 40 - 100) / 2, (37 - 40 - 100 - 5) / 2], [(-20 - 40 - 100) / 2] * 3]
-    assert np.allclose(shaped_reward(outcome(), shaping, 2.0), expected)
+    shaping = Shaping(centre=10.0, scale=2.0, violation=0.5, margin=0.06, own_violation_cost=100.0, own_switch_cost=5.0)
+    expected = [[(37 - 40 - 5) / 2, (37 - 40) / 2, (37 - 40 - 5) / 2], [(-10 - 40) / 2] * 3]
+    assert np.allclose(shaped_reward(outcome(), shaping), expected)
+    assert lost(outcome(), shaping, 2.0).tolist() == [[False, True, False], [True, False, False]]
+
+
+def test_what_an_agent_does_when_lost_is_its_own_business():
+    """The others' returns go on past the decision in which one agent is lost; its own ends there, without a bootstrap."""
+    replay = Replay(4, 1, 2, 1)
+    for k in range(4):
+        replay.store(
+            state=np.array([[k]]), final=np.array([[k + 1]]), action=np.zeros((1, 2)), reward=np.array([[1.0, 1.0]]),
+            leniency=np.zeros((1, 2)), code=np.zeros(1), ended=np.array([False]), terminal=np.array([[k == 1, False]]),
+        )  # fmt: skip
+    batch = replay.sample(50, 3, 0.5, np.random.default_rng(0))
+    for start, reward, discount in zip(batch.state[:, 0], batch.reward, batch.discount, strict=True):
+        assert reward.tolist() == [[1.5, 1.75], [1.0, 1.75]][int(start)]
+        assert discount.tolist() == [0.0, 0.125]
 
 
 def test_presets_and_json():

@@ -18,10 +18,14 @@ class Shaping:
     instead of 10 / (1 - gamma), and differences between orders are no longer small against it."""
     scale: float = 1.0
     """Rewards are divided by it."""
+    violation: float = 1.0
+    """Weight of the printed punishment of the whole team, -10 a mission step."""
     margin: float = 0.0
-    """A clearance below safe_distance + margin costs ``margin_cost`` [m]."""
-    margin_cost: float = 0.0
-    """For a decision with any agent inside the margin: the printed reward alone makes grazing an obstacle worth while."""
+    """An agent closer than safe_distance + margin counts as lost [m]."""
+    own_violation_cost: float = 0.0
+    """What an agent pays, alone and once, for a decision in which it came closer than that; nothing that follows counts for
+    it. The printed reward makes grazing an obstacle worth while (a dodge costs 760, a grazing 20 a mission step), and a
+    punishment that adds up over time makes the values of lost states so low that no network tells good ones apart."""
     own_switch_cost: float = 0.0
     """For every switch of an agent, paid by that agent alone: who switched is known, so the team need not guess."""
 
@@ -47,13 +51,13 @@ class TrainConfig:
     budget: int = 5_000_000
     """Mission steps, over all worlds."""
 
-    worlds: int = 256
+    worlds: int = 128
     """Worlds stepped together."""
     state: str = "extended"
     """State: extended or printed."""
     actions: str = "commands"
     """Action set: commands (the distinct ones) or orders (all permutations)."""
-    interval: int = 4
+    interval: int = 10
     """Mission steps that a decision holds for."""
     exploring_starts: float = 0.8
     """Share of episodes that begin anywhere along the route."""
@@ -66,9 +70,9 @@ class TrainConfig:
     """Dueling networks: Q = V + B - mean B."""
     copies: int = 5
     """Past networks that a target is averaged over; 1 switches averaging off."""
-    push_every: int = 100
+    push_every: int = 30
     """Updates after which the present network joins the past ones."""
-    gamma: float = 0.97
+    gamma: float = 0.95
     """Discount factor of a decision."""
     n_step: int = 3
     """Decisions whose rewards are summed before the bootstrap."""
@@ -76,11 +80,11 @@ class TrainConfig:
     """Of Adam, at the start."""
     final_learning_rate: float = 1e-4
     """Of Adam, at the end; linear in between."""
-    batch: int = 512
+    batch: int = 256
     """Transitions of an update."""
-    updates: int = 3
+    updates: int = 4
     """Updates after each decision of all worlds."""
-    capacity: int = 200_000
+    capacity: int = 100_000
     """Transitions in the replay buffer."""
 
     learner: str = "lenient"
@@ -91,7 +95,7 @@ class TrainConfig:
     """Bits of a hash code."""
     cool_by: float = 0.5
     """Share of the budget after which the largest temperature is 0.05."""
-    hold: int = 10
+    hold: int = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.5
     """Share of explorations in which the whole team takes one random order."""
@@ -99,7 +103,9 @@ class TrainConfig:
     """Exploration never falls below it."""
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by this."""
-    shaping: Shaping = Shaping(centre=10.0, scale=40.0, margin=0.06, margin_cost=100.0, own_switch_cost=5.0)
+    shaping: Shaping = Shaping(
+        centre=10.0, scale=100.0, violation=0.0, margin=0.06, own_violation_cost=2000.0, own_switch_cost=5.0
+    )
     """The reward that is learned from."""
 
     evaluate_every: int = 100_000

@@ -7,7 +7,7 @@ from marlbc_mj.training.leniency import ZETA
 
 
 class Exploration:
-    """Replaces greedy actions by random ones. With ``hold=1, together=0`` every agent explores with T^zeta, as printed.
+    """Replaces a share T^zeta of the greedy actions by random ones. With ``hold=1, together=0`` it does so as printed.
 
     Args:
         config: hold, together and least_exploration of it are used.
@@ -24,7 +24,9 @@ class Exploration:
     def __call__(self, greedy: np.ndarray, temperature: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """(B, N) actions from greedy ones (B, N) and each agent's mean temperature (B, N)."""
         config = self.config
-        chance = np.maximum(temperature**ZETA, config.least_exploration)
+        share = np.maximum(temperature**ZETA, config.least_exploration)
+        mean_hold = (config.hold + 1) / 2
+        chance = share / (share + mean_hold * (1.0 - share))  # of a beginning, such that ``share`` of all orders are random
         free = self.left == 0
         team = (rng.random(len(chance)) < config.together * chance.mean(axis=1)) & free.all(axis=1)
         alone = (rng.random(chance.shape) < (1.0 - config.together) * chance) & free

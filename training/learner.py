@@ -2,6 +2,7 @@
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
@@ -45,13 +46,10 @@ class Learner:
         return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
 
     def update(self, batch: Batch, learning_rate: float) -> float:
-        """One gradient step; returns the mean absolute TD error over agents and transitions."""
+        """One gradient step; returns the mean absolute TD error."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        target = self.targets(self._tensor(batch.next_state)).amax(dim=-1)  # (N, M)
-        target = self._tensor(batch.reward.T) + self._tensor(batch.discount) * target
-        actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
-        chosen = self.network(self._tensor(batch.state)).gather(-1, actions[..., None]).squeeze(-1)
+        chosen, target = self.estimates(batch)
         error = (target - chosen).detach()
         weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
         loss = (torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
@@ -63,6 +61,17 @@ class Learner:
         if self.updates % self.config.push_every == 0:
             self.targets.push()
         return float(error.abs().mean())
+
+    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row an agent, K = N."""
+        best = self.targets(self._tensor(batch.next_state)).amax(dim=-1)
+        target = self._tensor(batch.reward.T) + self._tensor(batch.discount.T) * best
+        return self._chosen(batch), target
+
+    def _chosen(self, batch: Batch) -> Tensor:
+        """(N, M) values of the actions that were taken."""
+        actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
+        return self.network(self._tensor(batch.state)).gather(-1, actions[..., None]).squeeze(-1)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of the networks, the past networks and Adam's moments, by name."""
@@ -87,11 +96,11 @@ class Learner:
         for k, tensor in enumerate(self.targets.tensors):
             tensor.copy_(torch.from_numpy(arrays[f"target{k}"]))
 
-    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+    def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
 
 
-def td_weight(error: torch.Tensor, leniency: torch.Tensor, kind: str, generator: torch.Generator) -> torch.Tensor:
+def td_weight(error: Tensor, leniency: Tensor, kind: str, generator: torch.Generator) -> Tensor:
     """What each TD error counts (17): 1 where it is positive or x > L, x uniform in (0, 1), else 0.
 
     Args:

@@ -33,11 +33,16 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
     """(B, N) actions: the best one, but the last one unless the best is better by more than ``margin``.
 
     Args:
-        values: (B, N, A).
+        values: (B, N, A), or (B, 1, A^N) of joint actions in C order, of which the best as a whole is taken.
         last: (B, N) actions before.
         fresh: (B,) bool, no action has been taken yet, so there is nothing to keep.
         margin: of the action values.
     """
+    agents = last.shape[1]
+    if values.shape[1] != agents:
+        each = (round(values.shape[2] ** (1 / agents)),) * agents
+        joint = greedy(values, np.ravel_multi_index(tuple(last.T), each)[:, None], fresh, margin)
+        return np.stack(np.unravel_index(joint[:, 0], each), axis=-1)
     best = values.argmax(axis=-1)
     lead = np.take_along_axis(values, best[..., None], axis=-1) - np.take_along_axis(values, last[..., None], axis=-1)
     return np.where((lead[..., 0] > margin) | fresh[:, None], best, last)

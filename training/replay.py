@@ -11,7 +11,7 @@ class Batch(NamedTuple):
     state: np.ndarray  # (M, S)
     action: np.ndarray  # (M, N)
     reward: np.ndarray  # (M, N) discounted sum of up to n rewards
-    discount: np.ndarray  # (M,) of the bootstrap: gamma^n, 0 where the mission ended
+    discount: np.ndarray  # (M, N) of the bootstrap: gamma^n, 0 where the mission ended for the agent
     next_state: np.ndarray  # (M, S) to bootstrap from
     leniency: np.ndarray  # (M, N)
 
@@ -35,7 +35,7 @@ class Replay:
             "leniency": np.zeros((rows, worlds, agents), dtype=np.float32),
             "code": np.zeros((rows, worlds), dtype=np.int64),
             "ended": np.zeros((rows, worlds), dtype=bool),
-            "terminal": np.zeros((rows, worlds), dtype=bool),
+            "terminal": np.zeros((rows, worlds, agents), dtype=bool),
         }
 
     def store(self, **row: np.ndarray) -> None:
@@ -52,22 +52,23 @@ class Replay:
         world = rng.integers(worlds, size=size)
         row = first % self.rows
         reward = np.zeros((size, a["reward"].shape[2]), dtype=np.float32)
-        discount = np.ones(size, dtype=np.float32)
-        alive = np.ones(size, dtype=bool)
-        terminal = np.zeros(size, dtype=bool)
+        discount = np.ones_like(reward)
+        running = np.ones(reward.shape, dtype=bool)  # the agent's mission still counts
+        alive = np.ones(size, dtype=bool)  # the episode has not ended
         last = row
         for k in range(steps):
             now = (first + k) % self.rows
-            reward += (discount * alive)[:, None] * a["reward"][now, world]
+            counts = running & alive[:, None]
+            reward += np.where(counts, discount * a["reward"][now, world], np.float32(0.0))
+            discount = np.where(counts, np.float32(gamma) * discount, discount)
+            running &= ~(counts & a["terminal"][now, world])
             last = np.where(alive, now, last)
-            discount = np.where(alive, np.float32(gamma) * discount, discount)
-            terminal |= alive & a["terminal"][now, world]
             alive &= ~a["ended"][now, world]
         return Batch(
             a["state"][row, world],
             a["action"][row, world],
             reward,
-            np.where(terminal, np.float32(0.0), discount),
+            np.where(running, discount, np.float32(0.0)),
             a["final"][last, world],
             a["leniency"][row, world],
         )

@@ -79,15 +79,18 @@ class Trainer:
         actions = self.exploration(best, warmth.mean(axis=-1), self.rng)
         self.explored = float((actions != best).mean())
         outcome = self.batch.step(actions)
+        shaping = config.shaping
+        gone = lost(outcome, shaping, self.scenario.safe_distance)
+        reward = shaped_reward(outcome, shaping)
         replay.store(
             state=self.state,
             final=outcome.final_state,
             action=actions,
-            reward=shaped_reward(outcome, config.shaping, self.scenario.safe_distance),
+            reward=np.where(gone, -shaping.own_violation_cost / shaping.scale, reward),
             leniency=leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0]),
             code=codes,
             ended=outcome.ended,
-            terminal=outcome.terminal,
+            terminal=outcome.terminal[:, None] | gone,
         )
         self._end_episodes(outcome.ended)
         self.state = outcome.state
@@ -177,9 +180,15 @@ def _unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndar
     return {name.removeprefix(f"{prefix}."): array for name, array in arrays.items() if name.startswith(f"{prefix}.")}
 
 
-def shaped_reward(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
-    """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says."""
-    team = outcome.reward - shaping.centre * outcome.steps
-    team = team - shaping.margin_cost * (outcome.clearance.min(axis=1) < safe_distance + shaping.margin)
+def shaped_reward(outcome: Outcome, shaping: Shaping) -> np.ndarray:
+    """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says; see :func:`lost`."""
+    team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps
     own = shaping.own_switch_cost * outcome.switches
     return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
+
+
+def lost(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
+    """(B, N) bool: agents for which the mission counts as lost, because they came too close."""
+    if not shaping.own_violation_cost:
+        return np.zeros(outcome.clearance.shape, dtype=bool)
+    return np.asarray(outcome.clearance < safe_distance + shaping.margin)

@@ -113,8 +113,9 @@ def forces(trajectory: Trajectory) -> Figure:
                 axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
     reach = 1.12 * max(limit, float(np.abs(trajectory.force).max()))
     panels[0, 0].set(ylim=(-reach, reach))
-    for axes, span in zip(panels[-1], (slice(None), slice(None), window), strict=True):
-        axes.set(xlabel="time [s]", xlim=(trajectory.time[span][0], trajectory.time[span][-1]))
+    whole, part = (0.0, trajectory.scenario.duration), (trajectory.time[window][0], trajectory.time[window][-1])
+    for axes, limits in zip(panels[-1], (whole, whole, part), strict=True):
+        axes.set(xlabel="time [s]", xlim=limits)
     panels[0, 2].legend(loc="lower right", bbox_to_anchor=(1.0, 0.93), ncols=2, borderpad=0.0, columnspacing=1.0)
     figure.supylabel("force [N] (dashed: limit)", fontsize=8, x=0.05 / pl.DOUBLE)
     return figure
@@ -126,6 +127,7 @@ def busiest(trajectory: Trajectory) -> slice:
     change = np.abs(np.diff(trajectory.force, axis=0)).sum(axis=(1, 2))
     total = np.concatenate([[0.0], np.cumsum(change)])
     start = int((total[size - 1 :] - total[: len(total) - size + 1]).argmax())
+    start = max(0, start - size // 20)  # a little before, so that the first edge is seen
     return slice(start, start + size)
 
 
@@ -162,7 +164,7 @@ def _draw_pulse(axes: Axes, episode: Trajectory, agent: int, peak: float) -> Non
     window = (episode.time >= peak - 0.2 * _PULSE) & (episode.time <= peak + 0.8 * _PULSE)
     color, time = pl.agent_line(agent)["color"], episode.time[window]
     for axis in range(2):
-        style = {"linestyle": ("-", (0, (2.5, 1)))[axis], "label": f"$u_{'xy'[axis]}$"}
+        style: dict[str, Any] = {"linestyle": ("-", (0, (2.5, 1)))[axis], "label": f"$u_{'xy'[axis]}$"}
         axes.plot(time, episode.force[window, agent, axis], color=color, linewidth=0.9, **style)
     for bound in (-episode.scenario.force_limit, episode.scenario.force_limit):
         axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
@@ -210,7 +212,7 @@ def weight_errors(trajectory: Trajectory) -> Figure:
 
 def _weight_figure(trajectory: Trajectory, change: Callable[[np.ndarray], np.ndarray], label: str) -> Figure:
     read = network_weights(trajectory)
-    figure, panels = pl.panels(pl.DOUBLE, 2.0, 1, 3, pl.Margins(left=0.46, top=0.42, across=0.55), sharex=True)
+    figure, panels = pl.panels(pl.DOUBLE, 2.0, 1, 3, pl.Margins(left=0.46, top=0.42, across=0.62), sharex=True)
     time = np.arange(len(trajectory.controller_state)) * trajectory.scenario.mission_step
     named = (("identifier", "f", read.identifier), ("actor", "a", read.actor), ("critic", "c", read.critic))
     for axes, (name, symbol, matrix) in zip(panels[0], named, strict=True):

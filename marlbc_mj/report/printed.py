@@ -155,7 +155,7 @@ def _table(
     if relative:
         notes = (*notes, "Last column: sum of the totals over agents, relative to sorlc.")
     columns = [Column(q.label if len(quantities) > 1 else "", f"agent {i + 1}") for q in quantities for i in range(agents)]
-    columns += [Column("total", "/ sorlc")] if relative else []
+    columns += [Column("total", "over sorlc's")] if relative else []
     notes = (*notes, *_missing(chosen, quantities, names), *map(failure_note, failures(chosen.values())))
     return Table(name, caption, (Column("", kind), *columns), tuple(rows), notes, tuple(rules))
 
@@ -180,9 +180,9 @@ def decision_time(chosen: Mapping[str, Result], printed: bool) -> Table:
     medians = {name: r.metrics["team"]["decision_ms_median"] for name, r in chosen.items() if r.metrics}
     shares = any(r.solver_share is not None for r in chosen.values())
     columns = [Column("", "supervisor"), Column("all agents, here [ms]", "median"), Column("all agents, here [ms]", "p99")]
-    columns += [Column("network or", "solver [%]")] if shares else []
+    columns += [Column("network or solver", "share [%]")] if shares else []
     columns += [Column("printed, each by itself [ms]", f"agent {i + 1}") for i in range(4)] if sums else []
-    columns += [Column("printed sum", "/ our median")] if sums else []
+    columns += [Column("printed sum", "over our median")] if sums else []
     rows = []
     for name, result in chosen.items():
         team = result.metrics["team"] if result.metrics else None

@@ -44,7 +44,12 @@ def caution(draws: int) -> str:
 
 def _return_table(results: SeedResults, methods: Sequence[MethodStatistics]) -> Table:
     spread = results.scenario.perturbation
-    columns = (Column("", "method"), Column("return", "median"), Column("return", "IQM"), Column("better", "than reference [%]"))
+    columns = (
+        Column("", "method"),
+        Column("return", "median"),
+        Column("return", "IQM"),
+        Column("better than reference", "chance [%]"),
+    )
     rows = [
         (
             s.runs.key,

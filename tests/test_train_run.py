@@ -1,0 +1,253 @@
+"""Training runs on disk: what they leave, how they go on, and what they refuse."""
+
+import csv
+import json
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from safetensors.numpy import load_file, save_file
+
+from marlbc_mj import World, paper, run_episode
+from marlbc_mj.cli import main
+from marlbc_mj.cli.training import with_settings
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
+from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
+from marlbc_mj.supervisors.learned import Learned
+from marlbc_mj.training.checkpoint import read_arrays, read_policy, write_arrays
+from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.training.run import RESUME, rank, resume, train
+from marlbc_mj.training.trainer import Trainer
+
+SMALL = {"worlds": 64, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1, "start_length": 5.0}
+
+
+def small(**changes) -> TrainConfig:
+    return make_config("fast", **{**SMALL, "budget": 40_000, "evaluate_every": 20_000, **changes})
+
+
+def equal(a, b):
+    return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
+
+
+@pytest.mark.parametrize("changes", [{}, {"hash": "plain", "learner": "hysteretic", "actions": "orders", "state": "printed"}])
+def test_a_restored_trainer_goes_on_bit_for_bit(changes):
+    config = small(**changes)
+    one = Trainer(config)
+    for _ in range(90):  # past the warm-up
+        one.advance()
+    arrays, scalars = one.snapshot()
+    arrays, scalars = {name: array.copy() for name, array in arrays.items()}, json.loads(json.dumps(scalars))
+    other = Trainer(replace(config, seed=5))
+    other.restore(arrays, scalars)
+    for _ in range(40):
+        a, b = one.advance(), other.advance()
+        assert (a.state == b.state).all() and (a.reward == b.reward).all()
+    assert one.error == other.error != 0.0
+    assert equal(*(trainer.snapshot()[0] for trainer in (one, other)))
+
+
+def test_seeds_differ_and_repeat():
+    def rewards(seed):
+        trainer = Trainer(small(seed=seed))
+        return [trainer.advance().reward.sum() for _ in range(85)]
+
+    assert rewards(1) == rewards(1) != rewards(2)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("train") / "run"
+    train(small(), folder)
+    return folder
+
+
+def test_a_run_leaves_what_the_design_fixes(finished):
+    with (finished / "eval.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert list(rows[0]) == [
+        "wall_s", "mission_steps", "return", *(f"switches_{i}" for i in range(1, 5)), "violation_time", "clearance_min"
+    ]  # fmt: skip
+    assert [float(r["mission_steps"]) for r in rows][-1] >= 40_000
+    config = json.loads((finished / "config.json").read_text())
+    assert config["train"]["seed"] == 0 and "torch" in config["versions"]
+    assert {p.name for p in (finished / "checkpoint").iterdir()} == {
+        "best.json", "best.safetensors", "last.json", "last.safetensors"
+    }  # fmt: skip
+    assert not list(finished.rglob("*partial*"))
+    assert os.stat(finished / "checkpoint" / "best.safetensors").st_size < 1_000_000
+
+
+def test_a_checkpoint_gives_the_evaluated_episode(finished):
+    policy, description = read_policy(finished / "checkpoint" / "last.safetensors")
+    trajectory = run_episode(World(paper(), record=True), Learned.load(finished / "checkpoint" / "last.safetensors"))
+    assert trajectory.reward.sum() == description["evaluation"]["return"]
+    assert policy.weights[0].shape[0] == 4
+    held = trajectory.command.reshape(-1, 4, 4)  # decisions of 4 mission steps
+    assert (held == held[:, :1]).all()
+
+
+def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
+    """kill -9 at any moment: what was saved last is enough to end with the same networks, to the bit."""
+    settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in SMALL.items() if k != "threads"]
+    folder = tmp_path / "run"
+    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "40000"]
+    command += ["--set", *settings, "evaluate_every=20000", "save_every=0.05"]
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    while not (folder / RESUME).exists() and process.poll() is None:
+        time.sleep(0.02)
+    time.sleep(0.3 * np.random.default_rng().random())
+    process.kill()
+    process.wait()
+    assert not (process.returncode == 0 and not (folder / RESUME).exists())
+    resume(folder)
+    for name in ("best", "last"):
+        a, b = (load_file(where / "checkpoint" / f"{name}.safetensors") for where in (finished, folder))
+        assert equal(a, b)
+    (a, _), (b, _) = (read_arrays(where / RESUME) for where in (finished, folder))
+    assert equal(a, b)
+
+
+def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "run"
+    calls = []
+
+    def interrupt(self):
+        calls.append(None)
+        if len(calls) == 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(self)
+
+    original = Trainer.advance
+    monkeypatch.setattr(Trainer, "advance", interrupt)
+    arguments = ["train", "--out", str(folder), "--threads", "1", "--budget", "40000", "--set", "worlds=64", "capacity=7000"]
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert f"--resume {folder}" in capsys.readouterr().err
+    assert (folder / RESUME).exists()
+
+
+def test_rank_puts_safety_first():
+    safe = {"violation_time": 0.0, "return": 9000.0, "switches_1": 0.0}
+    wild = {"violation_time": 0.1, "return": 15000.0, "switches_1": 0.0}
+    calm = {"violation_time": 0.0, "return": 9000.0, "switches_1": 4.0}
+    assert rank(safe) > rank(calm) > rank(wild)
+
+
+def test_settings_by_name():
+    config = with_settings(TrainConfig(), ("gamma=0.9", "hidden=8,9", "dueling=false", "shaping.margin=0.1", "copies=1"))
+    assert (config.gamma, config.hidden, config.dueling, config.shaping.margin, config.copies) == (0.9, (8, 9), False, 0.1, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["train", "dqn"], ["dqn", "marlms"]),
+        (["train", "--preset", "quick"], ["quick", "fast", "paper"]),
+        (["train", "--set", "gama=0.9"], ["gama", "gamma"]),
+        (["train", "--set", "gamma"], ["name=value"]),
+        (["train", "--set", "batch=many"], ["batch", "many", "int"]),
+        (["train", "--set", "dueling=perhaps"], ["dueling", "perhaps", "true"]),
+        (["train", "--budget", "0"], ["budget", "0"]),
+        (["train", "--resume", "nowhere"], ["nowhere", RESUME]),
+        (["train", "--device", "cuda"], ["cuda"]),
+    ],
+)
+def test_wrong_settings_are_one_line(arguments, fragments, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(arguments)
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(fragment in said for fragment in fragments)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_results_is_not_overwritten(finished, capsys):
+    before = (finished / "eval.csv").read_bytes()
+    with pytest.raises(SystemExit):
+        main(["train", "--out", str(finished)])
+    assert "not empty" in capsys.readouterr().err
+    assert (finished / "eval.csv").read_bytes() == before
+
+
+def damage(kind, path, source):
+    if kind == "missing":
+        return
+    data = (source / "checkpoint" / "best.safetensors").read_bytes()
+    if kind == "truncated":
+        path.write_bytes(data[: len(data) // 2])
+    elif kind == "pickle":
+        path.write_bytes(pickle.dumps({"weight0": [1.0]}))
+    elif kind == "foreign":
+        save_file({"x": np.zeros(3, np.float32)}, path)
+    elif kind == "nan":
+        arrays, description = read_arrays(source / "checkpoint" / "best.safetensors")
+        arrays["bias0"][:] = np.nan
+        write_arrays(path, arrays, description)
+    elif kind == "format":
+        save_file({"x": np.zeros(3, np.float32)}, path, {"marlbc_mj": '{"format": 99}'})
+    elif kind == "part":
+        write_arrays(path, {"weight0": np.zeros((4, 3, 2), np.float32)}, {"dueling": True, "margin": 0.0})
+
+
+@pytest.mark.parametrize("kind", ["missing", "truncated", "pickle", "foreign", "nan", "format", "part"])
+def test_damaged_checkpoints_are_refused(kind, finished, tmp_path):
+    path = tmp_path / "policy.safetensors"
+    damage(kind, path, finished)
+    with pytest.raises(ConfigurationError, match="policy.safetensors") as error:
+        Learned.load(path)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "fragment"),
+    [
+        (lambda: paper(starts=((0, 0), (0, 9)), behaviors=standard_behaviors(SLOTS[:2], COLUMN[:2]), schedule=()), "agents = 4"),
+        (lambda: paper(behaviors=standard_behaviors(COLUMN, SLOTS)), "slots"),
+        (lambda: paper(mission_step=0.1), "mission_step = 0.05"),
+    ],
+)
+def test_a_checkpoint_of_another_team_is_refused(scenario, fragment, finished):
+    with pytest.raises(ConfigurationError, match=fragment):
+        Learned.load(finished / "checkpoint" / "best.safetensors").start(scenario())
+
+
+def test_a_checkpoint_runs_on_perturbed_draws(finished):
+    world = World(paper(duration=2.0, perturbation=Perturbation(1.0, 0.5, (0.0, 2.0))), record=True)
+    assert len(run_episode(world, Learned.load(finished / "checkpoint" / "best.safetensors"), seed=3).reward) == 40
+
+
+def test_a_run_of_other_versions_or_a_torn_one_is_not_resumed(finished, tmp_path):
+    arrays, description = read_arrays(finished / RESUME)
+    description["versions"]["torch"] = "1.0"
+    write_arrays(tmp_path / RESUME, {"x": np.zeros(1)}, description)
+    with pytest.raises(ConfigurationError, match=r"torch 1\.0"):
+        resume(tmp_path)
+    data = (finished / RESUME).read_bytes()
+    (tmp_path / RESUME).write_bytes(data[:-100])
+    with pytest.raises(ConfigurationError, match="resume.safetensors"):
+        resume(tmp_path)
+    assert arrays
+
+
+def test_no_space_left_is_one_line_and_keeps_the_old_file(tmp_path, monkeypatch):
+    path = tmp_path / "a.safetensors"
+    write_arrays(path, {"x": np.ones(3)}, {})
+
+    def full(self, data):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(type(path), "write_bytes", full)
+    with pytest.raises(ConfigurationError, match="No space left"):
+        write_arrays(path, {"x": np.zeros(3)}, {})
+    monkeypatch.undo()
+    assert (read_arrays(path)[0]["x"] == 1).all() and list(tmp_path.iterdir()) == [path]
