@@ -13,7 +13,30 @@ from marlbc_mj.orders import SEPARATOR
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.states import make_state
 
-ACTIONS = ("commands", "orders")
+ACTIONS = ("commands", "orders", "avoidance")
+
+
+def order_of(scenario: Scenario, actions: str) -> np.ndarray:
+    """(A,) index into ``scenario.orders`` of every action of a set.
+
+    Args:
+        scenario: whose orders they are.
+        actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, those
+            commands that end in the first formation, the shortest first: FM and OA>FM in the case study.
+
+    Raises:
+        ConfigurationError: there is no such set.
+    """
+    orders = scenario.orders
+    if actions == "commands":
+        return orders.representative
+    if actions == "orders":
+        return np.arange(len(orders))
+    if actions != "avoidance":
+        raise unknown("action set", actions, ACTIONS)
+    parts = [name.split(SEPARATOR) for name in orders.commands]
+    kept = [c for c, names in enumerate(parts) if names[-1] == scenario.formation_names[0]]
+    return orders.representative[sorted(kept, key=lambda c: len(parts[c]))]
 
 
 @dataclass(frozen=True)
@@ -69,7 +92,7 @@ class FormationBatch:
         threads: the worlds are shared out over this many.
         interval: mission steps that a decision holds for.
         state: ``"extended"`` or ``"printed"``.
-        actions: ``"commands"`` for the distinct ones, ``"orders"`` for all permutations.
+        actions: set that agents choose from, see :func:`order_of`.
         starts: where episodes begin.
 
     Raises:
@@ -92,14 +115,13 @@ class FormationBatch:
             raise ConfigurationError(
                 f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
             )
-        if actions not in ACTIONS:
-            raise unknown("action set", actions, ACTIONS)
         orders = scenario.orders
         self.scenario = scenario
         self.interval = interval
-        self.order_of = orders.representative if actions == "commands" else np.arange(len(orders))
-        command_of = orders.command_of[self.order_of]
-        self.action_of = np.array([int(np.flatnonzero(command_of == c)[0]) for c in range(len(orders.commands))])
+        self.order_of = order_of(scenario, actions)
+        command_of = orders.command_of[self.order_of].tolist()
+        commands = range(len(orders.commands))
+        self.action_of = np.array([command_of.index(c) if c in command_of else 0 for c in commands])  # 0: not in the set
         self.read = make_state(state, scenario)
         self.world = World(scenario, controller, worlds=worlds, threads=threads)
         self.starts = starts or Starts()
@@ -107,7 +129,10 @@ class FormationBatch:
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.rng = np.random.default_rng(0)
         last = [name.split(SEPARATOR)[-1] for name in orders.commands]
-        self.keeping = [[c for c, name in enumerate(last) if name == kept] for kept in scenario.formation_names]
+        self.keeping = [
+            [c for c, name in enumerate(last) if name == kept and c in command_of] or sorted(command_of)
+            for kept in scenario.formation_names
+        ]  # commands that an exploring start in each formation has, as far as the action set has them
 
     @property
     def actions(self) -> int:

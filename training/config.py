@@ -31,6 +31,36 @@ class Shaping:
 
 
 @dataclass(frozen=True)
+class PPO:
+    """What MAPPO needs on top; it takes no replay, leniency, target copies or held exploration.
+
+    Raises:
+        ConfigurationError: a value that cannot be run.
+    """
+
+    rollout: int = 32
+    """Decisions of all worlds between two rounds of updates."""
+    epochs: int = 10
+    """Passes over a rollout."""
+    minibatches: int = 4
+    """Gradient steps of a pass."""
+    clip: float = 0.2
+    """Ratios of new to old probabilities count between 1 - clip and 1 + clip."""
+    trace: float = 0.95
+    """Lambda of the generalised advantage estimate."""
+    entropy: float = 0.01
+    """Weight of the entropy bonus."""
+
+    def __post_init__(self) -> None:
+        for name in ("rollout", "epochs", "minibatches"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"ppo.{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("clip", "trace", "entropy"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigurationError(f"ppo.{name} must be between 0 and 1, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """A training run of a mission supervisor.
 
@@ -56,7 +86,7 @@ class TrainConfig:
     state: str = "extended"
     """State: extended or printed."""
     actions: str = "commands"
-    """Action set: commands (the distinct ones) or orders (all permutations)."""
+    """Action set: commands (the distinct ones), orders (all permutations) or avoidance (formation, with obstacles or not)."""
     interval: int = 10
     """Mission steps that a decision holds for."""
     exploring_starts: float = 0.8
@@ -107,6 +137,8 @@ class TrainConfig:
         centre=10.0, scale=100.0, violation=0.0, margin=0.06, own_violation_cost=2000.0, own_switch_cost=5.0
     )
     """The reward that is learned from."""
+    ppo: PPO = PPO()
+    """Of MAPPO alone."""
 
     evaluate_every: int = 100_000
     """Mission steps between evaluations on the case study."""
@@ -132,6 +164,8 @@ class TrainConfig:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise unknown(name, getattr(self, name), choices)
+        if self.method in METHODS and self.learner != METHODS[self.method][0].get("learner", self.learner):
+            raise ConfigurationError(f"method {self.method} fixes the learner, got {self.learner}")
         if not self.hidden or min(self.hidden) < 1:
             raise ConfigurationError(f"hidden layers must have at least one unit, got {self.hidden}")
         if self.seed < 0:
@@ -150,7 +184,7 @@ class TrainConfig:
 
 CHOICES = {
     "state": ("extended", "printed"),
-    "actions": ("commands", "orders"),
+    "actions": ("commands", "orders", "avoidance"),
     "learner": ("lenient", "hysteretic", "plain"),
     "hash": ("autoencoder", "plain"),
     "device": ("cpu", "cuda"),
@@ -160,6 +194,29 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one an agent"),
     "hysteretic": ({"learner": "hysteretic"}, "the same, but a negative TD error counts half instead of being overlooked"),
     "iql": ({"learner": "plain"}, "independent Q-learning: the same without leniency"),
+    "vdn": ({"learner": "plain"}, "value decomposition: the team's value is the sum of the agents'"),
+    "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', mixed as the state says"),
+    "central": ({"learner": "plain"}, "one double, dueling network over all joint orders of the team"),
+    "rlms": (
+        {
+            "learner": "plain",
+            "actions": "avoidance",
+            "hidden": (20,),
+            "copies": 1,
+            "gamma": 0.9,
+            "n_step": 1,
+            "learning_rate": 5e-3,
+            "final_learning_rate": 5e-3,
+            "batch": 32,
+            "capacity": 5_000,
+            "together": 0.0,
+        },
+        "single agents side by side: own state, formation with or without avoidance, prioritised replay",
+    ),
+    "mappo": (
+        {"learner": "plain", "switching_margin": 0.0, "learning_rate": 5e-4, "final_learning_rate": 5e-5},
+        "multi-agent PPO: an actor each, one critic on the state, rollouts instead of a replay buffer",
+    ),
 }
 """What a method changes in a preset, and one line of description, by name."""
 
@@ -199,12 +256,17 @@ def from_json(data: dict[str, Any]) -> TrainConfig:
     Raises:
         ConfigurationError: an unknown setting or a value that cannot be run.
     """
-    data = {name: value for name, value in data.items() if name != "type"}
+    data = _fields(data)
     try:
-        shaping = Shaping(**{name: value for name, value in data.pop("shaping").items() if name != "type"})
-        return TrainConfig(**{**data, "hidden": tuple(data["hidden"])}, shaping=shaping)
+        shaping = Shaping(**_fields(data.pop("shaping")))
+        ppo = PPO(**_fields(data.pop("ppo", {})))  # runs from before MAPPO have none
+        return TrainConfig(**{**data, "hidden": tuple(data["hidden"])}, shaping=shaping, ppo=ppo)
     except (KeyError, TypeError) as error:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error
+
+
+def _fields(data: dict[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in data.items() if name != "type"}
 
 
 def make_config(preset: str, **changes: Any) -> TrainConfig:

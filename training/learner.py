@@ -1,11 +1,13 @@
 """Independent deep Q-learners of a team: dueling, averaged targets, lenient (17) or hysteretic about negative errors."""
 
+from collections.abc import Iterable
+
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TargetRing, TeamNetwork
+from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
@@ -21,23 +23,51 @@ class Learner:
         agents, actions: N, A.
         scale: (S,) a state is divided by it.
         generator: of initial weights and of the draws x of (17).
+        mask: (N, S) of 0 and 1, the entries of the state that each agent's network sees; all by default.
     """
 
-    def __init__(self, config: TrainConfig, agents: int, actions: int, scale: np.ndarray, generator: torch.Generator) -> None:
+    own_state = False  # whether the networks want a mask of each agent's own entries
+    prioritised = False  # whether transitions are to be drawn by their TD errors
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        agents: int,
+        actions: int,
+        scale: np.ndarray,
+        generator: torch.Generator,
+        mask: np.ndarray | None = None,
+    ) -> None:
         self.config = config
         self.generator = generator
+        networks, outputs = self.shape(agents, actions)
         self.network = TeamNetwork(
-            agents,
+            networks,
             len(scale),
-            actions,
+            outputs,
             config.hidden,
             torch.from_numpy(scale),
             dueling=config.dueling,
             generator=generator,
+            mask=None if mask is None else torch.from_numpy(mask),
         ).to(config.device)
         self.targets = TargetRing(self.network, config.copies)
-        self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate, eps=1e-5)
+        self.optimise(self.network.parameters())
         self.updates = 0
+        self.errors = np.zeros((0, 0), dtype=np.float32)  # (K, M) absolute TD errors of the last update
+
+    def shape(self, agents: int, actions: int) -> tuple[int, int]:
+        """Number of networks and of the values that each gives."""
+        return agents, actions
+
+    def optimise(self, parameters: Iterable[nn.Parameter]) -> None:
+        """Make these the parameters that are trained, with a fresh optimiser."""
+        self.parameters = list(parameters)
+        self.optimiser = self.make_optimiser()
+
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """Of ``parameters``."""
+        return torch.optim.Adam(self.parameters, lr=self.config.learning_rate, eps=1e-5)
 
     @torch.no_grad()
     def values(self, state: np.ndarray) -> np.ndarray:
@@ -52,15 +82,23 @@ class Learner:
         chosen, target = self.estimates(batch)
         error = (target - chosen).detach()
         weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
+        if batch.weight is not None:
+            weight = weight * self._tensor(batch.weight.T)
         loss = (torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
         self.optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
+        self.network.forget_unseen()
+        nn.utils.clip_grad_norm_(self.parameters, LARGEST_GRADIENT)
         self.optimiser.step()
         self.updates += 1
         if self.updates % self.config.push_every == 0:
-            self.targets.push()
+            self.push()
+        self.errors = error.abs().cpu().numpy()
         return float(error.abs().mean())
+
+    def push(self) -> None:
+        """The present networks join those that targets are made of."""
+        self.targets.push()
 
     def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row an agent, K = N."""
@@ -71,28 +109,17 @@ class Learner:
     def _chosen(self, batch: Batch) -> Tensor:
         """(N, M) values of the actions that were taken."""
         actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
-        return self.network(self._tensor(batch.state)).gather(-1, actions[..., None]).squeeze(-1)
+        values: Tensor = self.network(self._tensor(batch.state))
+        return values.gather(-1, actions[..., None]).squeeze(-1)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of the networks, the past networks and Adam's moments, by name."""
-        tensors = {f"network{k}": p.detach() for k, p in enumerate(self.network.parameters())}
-        tensors |= {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
-        for k, p in enumerate(self.network.parameters()):
-            tensors |= {f"adam{k}.{name}": value for name, value in self.optimiser.state.get(p, {}).items()}
+        tensors = saved(self.parameters, self.optimiser) | {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
         return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Go back to a :meth:`snapshot`."""
-        for k, p in enumerate(self.network.parameters()):
-            p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
-            moments = {
-                name: arrays[f"adam{k}.{name}"] for name in ("step", "exp_avg", "exp_avg_sq") if f"adam{k}.{name}" in arrays
-            }
-            if moments:
-                self.optimiser.state[p] = {
-                    name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device)
-                    for name, array in moments.items()
-                }
+        restore(arrays, self.parameters, self.optimiser)
         for k, tensor in enumerate(self.targets.tensors):
             tensor.copy_(torch.from_numpy(arrays[f"target{k}"]))
 

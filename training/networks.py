@@ -2,8 +2,9 @@
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -19,6 +20,8 @@ class TeamNetwork(nn.Module):
         scale: (S,) the state is divided by it.
         dueling: False makes the last layer give Q itself.
         generator: of the initial weights.
+        mask: (N, S) of 0 and 1, the entries that each agent's network sees; all by default. The others' weights in the first
+            layer are 0 and stay 0.
     """
 
     def __init__(
@@ -31,6 +34,7 @@ class TeamNetwork(nn.Module):
         *,
         dueling: bool = True,
         generator: torch.Generator | None = None,
+        mask: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.dueling = dueling
@@ -45,17 +49,30 @@ class TeamNetwork(nn.Module):
             weight = (2.0 * torch.rand(agents, inputs, outputs, generator=generator) - 1.0) * bound
             self.weights.append(nn.Parameter(weight))
             self.biases.append(nn.Parameter(torch.zeros(agents, 1, outputs)))
+        self.mask: Tensor | None
+        self.register_buffer("mask", None if mask is None else mask.to(torch.float32)[..., None])
+        if self.mask is not None:
+            self.weights[0].data *= self.mask
+
+    def forget_unseen(self) -> None:
+        """Take the masked weights out of the gradient; call it between ``backward`` and the step."""
+        gradient = self.weights[0].grad
+        if self.mask is not None and gradient is not None:
+            gradient *= self.mask
 
     def forward(self, state: Tensor) -> Tensor:
-        """(N, B, A) action values of states (B, S)."""
+        """(N, B, A) action values of states (B, S), or of (N, B, S) where every agent has its own."""
         return apply(list(self.weights), list(self.biases), state / self.scale, self.dueling)
 
 
 def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, dueling: bool) -> Tensor:
-    """(N, B, A) from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in)."""
+    """(N, B, A) from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in)."""
     networks, inputs, width = weights[0].shape
-    first = x @ weights[0].permute(1, 0, 2).reshape(inputs, networks * width)
-    y = first.view(len(x), networks, width).transpose(0, 1) + biases[0]
+    if x.ndim == 3:
+        y = torch.baddbmm(biases[0], x, weights[0])
+    else:
+        first = x @ weights[0].permute(1, 0, 2).reshape(inputs, networks * width)
+        y = first.view(len(x), networks, width).transpose(0, 1) + biases[0]
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
         y = torch.baddbmm(bias, torch.relu(y), weight)
     if not dueling:
@@ -87,7 +104,29 @@ class TargetRing:
 
     @torch.no_grad()
     def __call__(self, state: Tensor) -> Tensor:
-        """(N, B, A) averaged action values of states (B, S)."""
+        """(N, B, A) averaged action values of states (B, S), or of (N, B, S) where every agent has its own."""
         layers = len(self.network.weights)
+        if state.ndim == 3:
+            state = state.repeat(self.copies, 1, 1)
         values = apply(self.tensors[:layers], self.tensors[layers:], state / self.network.scale, self.network.dueling)
         return values.view(self.copies, self.agents, *values.shape[1:]).mean(dim=0)
+
+
+def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """Parameters and the optimiser's moments by name, not copied; ``adam`` is in the names whatever the optimiser is."""
+    tensors = {f"network{k}": p.detach() for k, p in enumerate(parameters)}
+    for k, p in enumerate(parameters):
+        tensors |= {f"adam{k}.{name}": value for name, value in optimiser.state.get(p, {}).items()}
+    return tensors
+
+
+def restore(arrays: Mapping[str, np.ndarray], parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
+    """Write what :func:`saved` gave back in place."""
+    for k, p in enumerate(parameters):
+        p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
+        prefix = f"adam{k}."
+        moments = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+        if moments:
+            optimiser.state[p] = {
+                name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device) for name, array in moments.items()
+            }

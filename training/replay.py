@@ -6,14 +6,16 @@ import numpy as np
 
 
 class Batch(NamedTuple):
-    """M transitions over up to n decisions."""
+    """M transitions over up to n decisions; from a prioritised replay, M of each agent's own."""
 
-    state: np.ndarray  # (M, S)
+    state: np.ndarray  # (M, S), or (N, M, S) of each agent's own
     action: np.ndarray  # (M, N)
     reward: np.ndarray  # (M, N) discounted sum of up to n rewards
     discount: np.ndarray  # (M, N) of the bootstrap: gamma^n, 0 where the mission ended for the agent
-    next_state: np.ndarray  # (M, S) to bootstrap from
+    next_state: np.ndarray  # (M, S) or (N, M, S) to bootstrap from
     leniency: np.ndarray  # (M, N)
+    weight: np.ndarray | None = None  # (M, N) what a TD error counts; 1 by default
+    place: np.ndarray | None = None  # (M, N) where the transitions begin in the buffer: row times B plus world
 
 
 class Replay:
@@ -44,12 +46,21 @@ class Replay:
             array[self.count % self.rows] = row[name]
         self.count += 1
 
-    def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator) -> Batch:
-        """``size`` transitions of up to ``steps`` decisions, uniformly; shorter where an episode ended."""
-        a = self.arrays
-        worlds = a["ended"].shape[1]
+    def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
+        """``size`` transitions of up to ``steps`` decisions, uniformly; shorter where an episode ended.
+
+        ``share`` of the budget is spent, which concerns prioritised replays only.
+        """
         first = rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
-        world = rng.integers(worlds, size=size)
+        world = rng.integers(self.arrays["ended"].shape[1], size=size)
+        return self.gather(first, world, steps, gamma)
+
+    def learnt(self, batch: Batch, errors: np.ndarray) -> None:
+        """Hear of an update with ``batch``, its absolute TD errors (K, M); nothing follows from it here."""
+
+    def gather(self, first: np.ndarray, world: np.ndarray, steps: int, gamma: float) -> Batch:
+        """The transitions of up to ``steps`` decisions that begin at rows ``first`` (M,), modulo the ring, of ``world`` (M,)."""
+        a, size = self.arrays, len(first)
         row = first % self.rows
         reward = np.zeros((size, a["reward"].shape[2]), dtype=np.float32)
         discount = np.ones_like(reward)

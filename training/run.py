@@ -19,9 +19,11 @@ from marlbc_mj.files import check_folder, staged_file, write_json
 from marlbc_mj.metrics import Metrics, measure
 from marlbc_mj.provenance import provenance
 from marlbc_mj.supervisors.learned import Learned
+from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.checkpoint import read_arrays, signature, write_arrays, write_policy
 from marlbc_mj.training.config import TrainConfig, from_json
 from marlbc_mj.training.curves import TensorBoard
+from marlbc_mj.training.mappo import MAPPO
 from marlbc_mj.training.policy import Policy
 from marlbc_mj.training.trainer import Trainer
 
@@ -61,8 +63,17 @@ def stopper() -> Iterator[Stopper]:
             signal.signal(number, handler)
 
 
+def make_trainer(config: TrainConfig) -> BaseTrainer:
+    """The trainer of the configuration's method.
+
+    Raises:
+        ConfigurationError: a method, scenario, controller or device that cannot be used.
+    """
+    return MAPPO(config) if config.method == "mappo" else Trainer(config)
+
+
 def train(
-    config: TrainConfig, out: Path, *, overwrite: bool = False, progress: Callable[[Trainer, Row], None] | None = None
+    config: TrainConfig, out: Path, *, overwrite: bool = False, progress: Callable[[BaseTrainer, Row], None] | None = None
 ) -> Interrupted | list[Row]:
     """Train from scratch into ``out``; returns the evaluations, or what interrupted the run.
 
@@ -71,7 +82,7 @@ def train(
         SimulationError: a world diverged.
     """
     check_folder(out, overwrite=overwrite)
-    run = Run(Trainer(config), out)
+    run = Run(make_trainer(config), out)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -80,7 +91,7 @@ def train(
     return run.go(progress)
 
 
-def resume(out: Path, *, progress: Callable[[Trainer, Row], None] | None = None) -> Interrupted | list[Row]:
+def resume(out: Path, *, progress: Callable[[BaseTrainer, Row], None] | None = None) -> Interrupted | list[Row]:
     """Continue the run in ``out`` where it was last saved, bit for bit.
 
     Raises:
@@ -97,7 +108,7 @@ def resume(out: Path, *, progress: Callable[[Trainer, Row], None] | None = None)
                 f"{out} was trained with {name} {description['versions'].get(name)}, here is {here[name]}; "
                 "a run resumes only under the same versions"
             )
-    run = Run(Trainer(from_json(description["train"])), out)
+    run = Run(make_trainer(from_json(description["train"])), out)
     run.trainer.restore(arrays, description["scalars"])
     run.evaluations, run.curve, run.wall = description["evaluations"], description["curve"], description["wall_s"]
     run.write_rows()
@@ -107,7 +118,7 @@ def resume(out: Path, *, progress: Callable[[Trainer, Row], None] | None = None)
 class Run:
     """A trainer with its folder: evaluates, logs and saves at set intervals."""
 
-    def __init__(self, trainer: Trainer, out: Path) -> None:
+    def __init__(self, trainer: BaseTrainer, out: Path) -> None:
         self.trainer = trainer
         self.config = trainer.config
         self.out = out
@@ -117,7 +128,7 @@ class Run:
         self.wall = 0.0  # seconds of training before this process
         self.world = World(trainer.scenario, make_controller(self.config.controller), record=True)
 
-    def go(self, progress: Callable[[Trainer, Row], None] | None = None) -> Interrupted | list[Row]:
+    def go(self, progress: Callable[[BaseTrainer, Row], None] | None = None) -> Interrupted | list[Row]:
         """Run to the end of the budget, or until a signal."""
         config, trainer = self.config, self.trainer
         began, saved = monotonic() - self.wall, monotonic()
@@ -154,9 +165,9 @@ class Run:
             {
                 "wall_s": self.wall,
                 "mission_steps": float(trainer.steps),
-                "updates": float(trainer.learner.updates),
+                "updates": float(trainer.updates),
                 "td_error": trainer.error,
-                "temperature": trainer.temperatures.nu,
+                "temperature": trainer.temperature,
                 "exploration": trainer.explored,
                 "steps_per_s": trainer.steps / max(self.wall, 1e-9),
             }

@@ -10,6 +10,7 @@ import numpy as np
 from marlbc_mj.engine.state import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.tasks.batch import order_of
 from marlbc_mj.tasks.states import State, make_state
 from marlbc_mj.training.checkpoint import check_signature, read_policy
 from marlbc_mj.training.policy import Policy, greedy
@@ -52,11 +53,9 @@ class Learned:
             ConfigurationError: another team, other behaviors, slots or mission step.
         """
         check_signature(self.path, self.signature, scenario)
-        orders = scenario.orders
-        order_of = orders.representative if self.signature["actions"] == "commands" else np.arange(len(orders))
-        return LearnedMemory(
-            make_state(str(self.signature["state"]), scenario), order_of, np.zeros((1, scenario.agents), dtype=np.int64)
-        )
+        read = make_state(str(self.signature["state"]), scenario)
+        orders = order_of(scenario, str(self.signature["actions"]))
+        return LearnedMemory(read, orders, np.zeros((1, scenario.agents), dtype=np.int64))
 
     def decide(self, situation: Situation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
         """The greedy action of every agent; the one in force unless another is better by more than the margin."""

@@ -1,0 +1,229 @@
+"""Multi-agent PPO (Yu et al., NeurIPS 2022): an actor for each agent, one critic on the state, trained on fresh rollouts."""
+
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from marlbc_mj.tasks.batch import Outcome
+from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.networks import TeamNetwork, restore, saved
+
+LAST_LAYER = 0.01
+"""An actor's last layer starts this much smaller, so that all actions are about equally likely."""
+LARGEST_GRADIENT = 10.0  # norm, of actors and critic each
+HUBER = 10.0
+"""Normalised value errors beyond it count linearly."""
+MEMORY = 0.99999
+"""What the running mean and square of the returns keep at a rollout; debiased, so at first they are plain means."""
+
+
+class MAPPO(BaseTrainer):
+    """One run of MAPPO. Every ``ppo.rollout`` decisions the rollout is learned from and forgotten.
+
+    Rewards are per agent, the team's and own costs, so the critic has one value for each, of which the returns end on their own.
+
+    Raises:
+        ConfigurationError: a scenario, controller or device that cannot be used.
+    """
+
+    def __init__(self, config: TrainConfig) -> None:
+        super().__init__(config)
+        agents, read = self.scenario.agents, self.batch.read
+
+        def network(networks: int, outputs: int) -> TeamNetwork:
+            return TeamNetwork(
+                networks, read.size, outputs, config.hidden, torch.from_numpy(read.scale),
+                dueling=False, generator=self.generator,
+            ).to(config.device)  # fmt: skip
+
+        self.actors = network(agents, self.batch.actions)
+        self.actors.weights[-1].data *= LAST_LAYER
+        self.critic = network(1, agents)
+        self.parameters = [*self.actors.parameters(), *self.critic.parameters()]
+        self.optimiser = torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5)
+        self.scaling = ValueScale(agents)
+        rows, worlds = config.ppo.rollout, config.worlds
+        self.rows: dict[str, np.ndarray] = {
+            "state": np.zeros((rows, worlds, read.size), dtype=np.float32),
+            "final": np.zeros((rows, worlds, read.size), dtype=np.float32),  # the true successor
+            "action": np.zeros((rows, worlds, agents), dtype=np.int64),
+            "reward": np.zeros((rows, worlds, agents), dtype=np.float32),
+            "over": np.zeros((rows, worlds, agents), dtype=bool),
+            "ended": np.zeros((rows, worlds), dtype=bool),
+        }
+        self.row = 0  # of the present rollout
+        self.made = 0  # gradient steps
+        self.surprise = 1.0  # mean entropy of the last update's actions, 1 at the most
+
+    @property
+    def updates(self) -> int:
+        """Gradient steps made."""
+        return self.made
+
+    @property
+    def temperature(self) -> float:
+        """Mean entropy of the actors, 1 where all actions are equally likely."""
+        return self.surprise
+
+    @property
+    def network(self) -> TeamNetwork:
+        """The actors; their logits stand for action values."""
+        return self.actors
+
+    def advance(self) -> Outcome:
+        """One sampled decision in every world; at the end of a rollout the updates that follow it."""
+        config = self.config
+        share = self.steps / config.budget
+        with torch.no_grad():
+            logits = self.actors(self._tensor(self.state)).transpose(0, 1).cpu().numpy()
+        actions = (logits + self.rng.gumbel(size=logits.shape)).argmax(axis=-1)  # a draw from the softmax
+        self.explored = float((actions != logits.argmax(axis=-1)).mean())
+        outcome = self.batch.step(actions)
+        reward, over = self.judge(outcome)
+        values = (self.state, outcome.final_state, actions, reward, over, outcome.ended)
+        for array, value in zip(self.rows.values(), values, strict=True):
+            array[self.row] = value
+        self.state = outcome.state
+        self.steps += config.worlds * config.interval
+        self.row += 1
+        if self.row == config.ppo.rollout:
+            self.row = 0
+            self._learn(self.learning_rate(share))
+        return outcome
+
+    @torch.no_grad()
+    def _assess(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """State (T B, S), actions, old log-probabilities, advantages and normalised returns (N, T B) of the rollout."""
+        rows = self.rows
+        flat = {name: array.reshape(-1, *array.shape[2:]) for name, array in rows.items()}
+        state, shape = self._tensor(flat["state"]), rows["reward"].shape
+        now, ahead = (
+            self.scaling.undo(self.critic(s)[0].cpu().numpy()).reshape(shape) for s in (state, self._tensor(flat["final"]))
+        )
+        advantage = advantages(rows["reward"], now, ahead, rows["over"], rows["ended"], self.config.gamma, self.config.ppo.trace)
+        returns = (advantage + now).reshape(-1, shape[-1])
+        self.scaling.take(returns)
+        action = torch.from_numpy(np.ascontiguousarray(flat["action"].T)).to(self.config.device)
+        old, _ = log_probability(self.actors(state), action)
+        gain = advantage.reshape(-1, shape[-1])
+        gain = (gain - gain.mean(axis=0)) / (gain.std(axis=0) + 1e-5)
+        return state, action, old, self._tensor(gain.T), self._tensor(self.scaling(returns).T)
+
+    def _learn(self, rate: float) -> None:
+        config, ppo = self.config, self.config.ppo
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        state, action, old, gain, returns = self._assess()
+        for _ in range(ppo.epochs):
+            order = torch.from_numpy(self.rng.permutation(len(state))).to(config.device)
+            for part in order.tensor_split(ppo.minibatches):
+                new, entropy = log_probability(self.actors(state[part]), action[:, part])
+                value = self.critic(state[part])[0].T
+                errors = nn.functional.huber_loss(value, returns[:, part], reduction="none", delta=HUBER)
+                loss = clipped_loss(new, old[:, part], gain[:, part], ppo.clip) - ppo.entropy * entropy + errors
+                self.optimiser.zero_grad()
+                loss.sum(dim=0).mean().backward()
+                for network in (self.actors, self.critic):
+                    nn.utils.clip_grad_norm_(network.parameters(), LARGEST_GRADIENT)
+                self.optimiser.step()
+                self.made += 1
+                self.error = float((returns[:, part] - value).detach().abs().mean())
+                self.surprise = float(entropy.detach().mean()) / float(np.log(self.batch.actions))
+        self.refuse_nonsense()
+
+    def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        arrays, scalars = super().snapshot()
+        tensors = saved(self.parameters, self.optimiser)
+        arrays |= {
+            **prefixed("learner", {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}),
+            **prefixed("rollout", self.rows),
+            "returns": self.scaling.sums.copy(),
+        }
+        return arrays, scalars | {"row": self.row, "updates": self.made, "entropy": self.surprise}
+
+    def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+        """Go on from a :meth:`snapshot` of a run with the same configuration."""
+        super().restore(arrays, scalars)
+        restore(unprefixed("learner", arrays), self.parameters, self.optimiser)
+        for name, array in self.rows.items():
+            array[:] = arrays[f"rollout.{name}"]
+        self.scaling.sums[:] = arrays["returns"]
+        self.row, self.made, self.surprise = scalars["row"], scalars["updates"], scalars["entropy"]
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
+
+
+class ValueScale:
+    """Running mean and deviation of the returns of N agents, by which the critic's targets are normalised."""
+
+    def __init__(self, agents: int) -> None:
+        self.sums = np.zeros((3, agents))  # of the weights, returns and squares
+
+    def take(self, returns: np.ndarray) -> None:
+        """Count returns (M, N) in."""
+        moments = np.stack([np.ones(returns.shape[1]), returns.mean(axis=0), (returns**2.0).mean(axis=0)])
+        self.sums = MEMORY * self.sums + (1.0 - MEMORY) * moments
+
+    def _moments(self) -> tuple[np.ndarray, np.ndarray]:
+        weight, total, square = self.sums
+        if not weight.any():
+            return np.zeros_like(weight), np.ones_like(weight)
+        mean = total / weight
+        return mean, np.sqrt(np.maximum(square / weight - mean**2, 1e-2))
+
+    def __call__(self, returns: np.ndarray) -> np.ndarray:
+        """Returns (M, N) with mean 0 and deviation 1."""
+        mean, deviation = self._moments()
+        return np.asarray((returns - mean) / deviation)
+
+    def undo(self, values: np.ndarray) -> np.ndarray:
+        """Values (M, N) as the critic gives them, back as returns."""
+        mean, deviation = self._moments()
+        return np.asarray(values * deviation + mean)
+
+
+def advantages(
+    reward: np.ndarray,
+    value: np.ndarray,
+    ahead: np.ndarray,
+    over: np.ndarray,
+    ended: np.ndarray,
+    gamma: float,
+    trace: float,
+) -> np.ndarray:
+    """(T, B, N) generalised advantage estimates (Schulman et al., ICLR 2016), A = d + gamma trace A' with
+    d = r + gamma V(s') - V(s); nothing is ahead of an agent whose return is over, and no trace crosses an episode's end.
+
+    Args:
+        reward, value: (T, B, N) rewards and values of the states they were got in.
+        ahead: (T, B, N) values of the true successors.
+        over: (T, B, N) bool, the agent's return ends here.
+        ended: (T, B) bool, an episode ends here.
+        gamma: discount factor.
+        trace: lambda.
+    """
+    delta = reward + gamma * np.where(over, 0.0, ahead) - value
+    goes_on = ~(over | ended[..., None])
+    gain, running = np.zeros(delta.shape), np.zeros(delta.shape[1:])
+    for t in range(len(delta) - 1, -1, -1):
+        running = delta[t] + gamma * trace * goes_on[t] * running
+        gain[t] = running
+    return gain
+
+
+def log_probability(logits: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+    """(N, M) log-probabilities of actions (N, M) under the softmax of logits (N, M, A), and its entropies."""
+    every = torch.log_softmax(logits, dim=-1)
+    return every.gather(-1, action[..., None]).squeeze(-1), -(every.exp() * every).sum(dim=-1)
+
+
+def clipped_loss(new: Tensor, old: Tensor, gain: Tensor, clip: float) -> Tensor:
+    """(N, M) -min(q A, clip(q, 1 - clip, 1 + clip) A), q = exp(new - old) the ratio of probabilities (Schulman et al. 2017)."""
+    ratio = (new - old).exp()
+    gained: Tensor = torch.minimum(ratio * gain, ratio.clamp(1.0 - clip, 1.0 + clip) * gain)
+    return -gained

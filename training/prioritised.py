@@ -1,0 +1,86 @@
+"""Proportional prioritised replay (Schaul et al., ICLR 2016): each agent draws the transitions that it predicts worst."""
+
+import numpy as np
+
+from marlbc_mj.training.replay import Batch, Replay
+
+ALPHA = 0.6
+"""Priorities are |TD error|^ALPHA."""
+BETA = 0.4
+"""Exponent of the importance weights at the start; 1 at the end of the budget, linear in between."""
+LEAST_ERROR = 1e-3
+"""Added to every |TD error|, so that no transition is lost for good."""
+
+
+class PrioritisedReplay(Replay):
+    """A ring of rows with a priority for every agent, because agents that learn alone have errors of their own.
+
+    A new transition has the largest priority that the agent has in the buffer, 1 where it is empty. ``arrays["priority"]``
+    (rows, B, N) are the priorities with the exponent in.
+    """
+
+    def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
+        super().__init__(rows, worlds, agents, state)
+        self.arrays["priority"] = np.zeros((rows, worlds, agents))
+
+    def store(self, **row: np.ndarray) -> None:
+        """Write one row; keywords are the names of ``arrays``, except ``priority``."""
+        priority = self.arrays["priority"]
+        largest = priority.max(axis=(0, 1)) if self.count else np.ones(priority.shape[2])
+        super().store(priority=np.broadcast_to(largest, priority.shape[1:]), **row)
+
+    def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
+        """``size`` transitions for each agent, one from each of ``size`` strata of equal probability.
+
+        P(j) = p_j / sum p, weights (n P(j))^-beta over the largest of the n transitions' weights.
+
+        Args:
+            size: M.
+            steps: decisions whose rewards are summed.
+            gamma: discount factor of a decision.
+            rng: of the draws.
+            share: of the budget that is spent; beta goes from ``BETA`` to 1 with it.
+        """
+        priority = self.arrays["priority"]
+        rows, worlds, agents = priority.shape
+        allowed = np.zeros(rows, dtype=bool)
+        allowed[np.arange(max(0, self.count - rows), self.count - steps + 1) % rows] = True
+        chance = np.where(allowed[:, None, None], priority, 0.0).reshape(rows * worlds, agents)
+        reach = chance.cumsum(axis=0)
+        points = (np.arange(size)[:, None] + rng.random((size, agents))) / size * reach[-1]
+        points = np.minimum(points, np.nextafter(reach[-1], 0.0))
+        place = np.stack([np.searchsorted(reach[:, i], points[:, i], side="right") for i in range(agents)], axis=-1)
+        beta = BETA + (1.0 - BETA) * min(share, 1.0)
+        least = priority[allowed].min(axis=(0, 1))
+        weight = (np.take_along_axis(chance, place, axis=0) / least) ** -beta  # n and the sum cancel
+        return self._own(self.gather((place // worlds).ravel(), (place % worlds).ravel(), steps, gamma), weight, place)
+
+    @staticmethod
+    def _own(batch: Batch, weight: np.ndarray, place: np.ndarray) -> Batch:
+        """Of transitions drawn for every agent (M N of them), each agent's part of its own."""
+        size, agents = place.shape
+        own = np.arange(agents)
+
+        def part(array: np.ndarray) -> np.ndarray:
+            return np.asarray(array.reshape(size, agents, agents)[:, own, own])
+
+        def states(array: np.ndarray) -> np.ndarray:
+            return array.reshape(size, agents, -1).transpose(1, 0, 2)
+
+        return Batch(
+            states(batch.state),
+            part(batch.action),
+            part(batch.reward),
+            part(batch.discount),
+            states(batch.next_state),
+            part(batch.leniency),
+            weight.astype(np.float32),
+            place,
+        )
+
+    def learnt(self, batch: Batch, errors: np.ndarray) -> None:
+        """Give the drawn transitions the priorities of their errors (N, M)."""
+        priority = self.arrays["priority"]
+        flat = priority.reshape(-1, priority.shape[2])  # a view
+        assert batch.place is not None
+        np.put_along_axis(flat, batch.place, (errors.T.astype(np.float64) + LEAST_ERROR) ** ALPHA, axis=0)

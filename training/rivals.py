@@ -1,0 +1,205 @@
+"""Rivals in learning from a replay buffer: VDN, QMIX, a central Q-network over joint orders, and RLMS, which learns alone."""
+
+import copy
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from marlbc_mj.errors import unknown
+from marlbc_mj.tasks.states import PrintedState, State
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.replay import Batch
+
+EMBEDDING = 32
+"""Units of QMIX's mixing network (Rashid et al. 2018)."""
+TEAM_ENTRIES = 3
+"""Entries behind the agents' in the extended state: G one-hot."""
+
+
+class VDN(Learner):
+    """Value decomposition (Sunehag et al., AAMAS 2018): the team's value is the sum of the agents', and one error trains all.
+
+    Target: sum over the agents of r_i + gamma_i max_b Q_i(s', b), Q_i averaged over the past networks.
+    """
+
+    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """(1, M) value of the team's action and its target."""
+        chosen, target = super().estimates(batch)
+        return chosen.sum(dim=0, keepdim=True), target.sum(dim=0, keepdim=True)
+
+
+class Mixer(nn.Module):
+    """Q_tot = w2(s) . elu(W1(s) Q + b1(s)) + b2(s), with W1 and w2 >= 0, so that Q_tot never falls with any Q_i.
+
+    Weights are linear in the state and taken absolute; b2 has a hidden ReLU layer (Rashid et al., ICML 2018).
+
+    Args:
+        agents: N.
+        scale: (S,) the state is divided by it.
+        generator: of the initial weights.
+    """
+
+    def __init__(self, agents: int, scale: Tensor, generator: torch.Generator) -> None:
+        super().__init__()
+        self.agents = agents
+        self.scale: Tensor
+        self.register_buffer("scale", scale.to(torch.float32))
+        size = len(scale)
+        self.weight1 = _linear(size, agents * EMBEDDING, generator)
+        self.bias1 = _linear(size, EMBEDDING, generator)
+        self.weight2 = _linear(size, EMBEDDING, generator)
+        self.bias2 = nn.Sequential(_linear(size, EMBEDDING, generator), nn.ReLU(), _linear(EMBEDDING, 1, generator))
+
+    def forward(self, values: Tensor, state: Tensor) -> Tensor:
+        """(1, M) team values from the agents' values (N, M) in states (M, S)."""
+        x = state / self.scale
+        weight = self.weight1(x).abs().view(len(x), self.agents, EMBEDDING)
+        hidden = nn.functional.elu(torch.einsum("nm,mne->me", values, weight) + self.bias1(x))
+        mixed: Tensor = (hidden * self.weight2(x).abs()).sum(dim=-1) + self.bias2(x)[:, 0]
+        return mixed[None]
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    bound = 1.0 / np.sqrt(inputs)
+    for parameter in layer.parameters():
+        parameter.data = (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0) * bound
+    return layer
+
+
+class QMIX(Learner):
+    """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
+
+    The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
+    max_b Q_i(s', b), averaged over past networks, by a mixer that is copied whenever a network joins the past ones.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        agents: int,
+        actions: int,
+        scale: np.ndarray,
+        generator: torch.Generator,
+        mask: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(config, agents, actions, scale, generator, mask)
+        self.mixer = Mixer(agents, torch.from_numpy(scale), generator).to(config.device)
+        self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
+        self.optimise([*self.network.parameters(), *self.mixer.parameters()])
+
+    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """(1, M) value of the team's action and its target."""
+        after = self._tensor(batch.next_state)
+        ahead = self.target_mixer(self.targets(after).amax(dim=-1), after)
+        reward, discount = team_return(batch)
+        target = self._tensor(reward) + self._tensor(discount) * ahead
+        return self.mixer(self._chosen(batch), self._tensor(batch.state)), target
+
+    def push(self) -> None:
+        """Network and mixer join those that targets are made of."""
+        super().push()
+        self.target_mixer.load_state_dict(self.mixer.state_dict())
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of all that training changes, by name."""
+        past = {f"past_mixer{k}": p.cpu().numpy().copy() for k, p in enumerate(self.target_mixer.parameters())}
+        return super().snapshot() | past
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go back to a :meth:`snapshot`."""
+        super().restore(arrays)
+        for k, p in enumerate(self.target_mixer.parameters()):
+            p.data.copy_(torch.from_numpy(arrays[f"past_mixer{k}"]))
+
+
+class Central(Learner):
+    """One dueling network whose actions are the A^N joint actions in C order, with double Q-learning (van Hasselt et al. 2016).
+
+    Target: r + gamma Q(s', argmax_b Q(s', b)), the argmax by the present network, its value by the averaged past ones; reward
+    and end of the team's return as in :class:`QMIX`.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        agents: int,
+        actions: int,
+        scale: np.ndarray,
+        generator: torch.Generator,
+        mask: np.ndarray | None = None,
+    ) -> None:
+        self.each = (actions,) * agents
+        super().__init__(config, agents, actions, scale, generator, mask)
+
+    def shape(self, agents: int, actions: int) -> tuple[int, int]:
+        """One network with A^N values."""
+        return 1, actions**agents
+
+    @torch.no_grad()
+    def _ahead(self, state: Tensor) -> Tensor:
+        best = self.network(state).argmax(dim=-1, keepdim=True)
+        return self.targets(state).gather(-1, best).squeeze(-1)
+
+    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """(1, M) value of the joint action and its target."""
+        reward, discount = team_return(batch)
+        target = self._tensor(reward) + self._tensor(discount) * self._ahead(self._tensor(batch.next_state))
+        joint = np.ravel_multi_index(tuple(batch.action.T), self.each)
+        return self._chosen(batch._replace(action=joint[:, None])), target
+
+
+class RLMS(Learner):
+    """Single-agent mission supervisors side by side (Huang, Mei, Zhang 2020): own state, own prioritised replay, RMSProp."""
+
+    own_state = True
+    prioritised = True
+
+    def make_optimiser(self) -> torch.optim.Optimizer:
+        """RMSProp of ``parameters``."""
+        return torch.optim.RMSprop(self.parameters, lr=self.config.learning_rate)
+
+
+LEARNERS: dict[str, type[Learner]] = {
+    "marlms": Learner,
+    "hysteretic": Learner,
+    "iql": Learner,
+    "vdn": VDN,
+    "qmix": QMIX,
+    "central": Central,
+    "rlms": RLMS,
+}
+"""Class by name of the method."""
+
+
+def learner_class(method: str) -> type[Learner]:
+    """The learner of a method.
+
+    Raises:
+        ConfigurationError: there is none of that name.
+    """
+    if method not in LEARNERS:
+        raise unknown("method", method, LEARNERS)
+    return LEARNERS[method]
+
+
+def team_return(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
+    """(1, M) rewards summed over the agents, and discounts of the bootstrap: the smallest, 0 once an agent is lost."""
+    return batch.reward.sum(axis=1)[None], batch.discount.min(axis=1)[None]
+
+
+def own_entries(state: State, agents: int) -> np.ndarray:
+    """(N, S) float32 of 0 and 1: which entries of a state are about agent i alone. G, which is the team's, is nobody's.
+
+    The slot errors of the extended state are about the measured centroid, so agent i's entries still depend on the others.
+    """
+    mask = np.zeros((agents, state.size), dtype=np.float32)
+    printed = isinstance(state, PrintedState)
+    width = 4 if printed else (state.size - TEAM_ENTRIES) // agents
+    for i in range(agents):
+        mask[i, i * width : (i + 1) * width] = 1.0
+        if printed:  # the commands follow all positions and velocities
+            mask[i, agents * width + i] = 1.0
+    return mask
