@@ -7,6 +7,7 @@ from marlbc_mj.robots import ROBOTS
 from marlbc_mj.scenarios import SCENARIOS
 from marlbc_mj.scenarios.base import REFERENCE_MODES
 from marlbc_mj.supervisors import SUPERVISORS
+from marlbc_mj.training.config import METHODS, PRESETS
 
 _BASES = ("inputs as in the paper", "inputs relative to the reference", "no networks")
 _REFERENCES = ("behaviors at the reference's own position", "behaviors at the measured position")
@@ -21,5 +22,7 @@ def selectable() -> dict[str, dict[str, str]]:
         "SORLC bases": dict(zip(BASES, _BASES, strict=True)),
         "reference modes": dict(zip(REFERENCE_MODES, _REFERENCES, strict=True)),
         "disturbances": {name: line for name, (_, line) in DISTURBANCES.items()},
+        "training methods": {name: line for name, (_, line) in METHODS.items()},
+        "training presets": {name: line for name, (_, line) in PRESETS.items()},
         "robots": {name: robot.description for name, robot in ROBOTS.items()},
     }

@@ -128,7 +128,7 @@ def _seconds(action: Callable[[], Any]) -> float:
     return perf_counter() - start
 
 
-def _interleaved(variants: dict[Any, Callable[[], None]], rounds: int) -> dict[Any, list[float]]:
+def interleaved(variants: dict[Any, Callable[[], None]], rounds: int) -> dict[Any, list[float]]:
     """Seconds of each variant in every round, variants in turn; one round before does not count."""
     taken: dict[Any, list[float]] = {name: [] for name in variants}
     for round_ in range(rounds + 1):
@@ -145,6 +145,8 @@ def measure_perf(rounds: int = 9, progress: Callable[[str], None] | None = None)
     Raises:
         ConfigurationError: fewer than 5 rounds.
     """
+    from marlbc_mj.perf_training import measure_training  # it takes its rounds from here
+
     if rounds < 5:
         raise ConfigurationError(f"rounds must be at least 5 for a median to mean something, got {rounds}")
     say = progress or (lambda message: None)
@@ -157,11 +159,13 @@ def measure_perf(rounds: int = 9, progress: Callable[[str], None] | None = None)
     missions = _measure_missions(scenario, orders, threads, rounds)
     say("one episode, and its log")
     episode = _measure_episode(scenario, rounds)
+    learning, more_ratios = measure_training(threads, rounds, say)
     return {
         "physics_steps_per_s": physics,
         "mission_steps_per_s": missions,
         **episode,
-        "ratios": ratios,
+        **learning,
+        "ratios": {**ratios, **more_ratios},
         "rounds": rounds,
     }
 
@@ -182,7 +186,7 @@ def _measure_physics(
     }
     for name, fleet in python.items():
         variants[name] = partial(fleet.advance, PYTHON_STEPS)
-    taken = _interleaved(variants, rounds)
+    taken = interleaved(variants, rounds)
     each = {
         name: [s / (PYTHON_STEPS * substeps if name in python else BURST) for s in seconds] for name, seconds in taken.items()
     }
@@ -193,16 +197,17 @@ def _measure_physics(
         "python_loop": rate["python"],
         "python_loop_compiled_laws": rate["python, compiled laws"],
     }
-    ratios = {f"closed_over_bare_{n}": _ratio(each["bare", n], each["closed", n]) for n in threads}
-    ratios["closed_over_python"] = _ratio(each["python"], each["closed", 1])
-    ratios["closed_over_python_compiled_laws"] = _ratio(each["python, compiled laws"], each["closed", 1])
+    ratios = {f"closed_over_bare_{n}": ratio(each["bare", n], each["closed", n]) for n in threads}
+    ratios["closed_over_python"] = ratio(each["python"], each["closed", 1])
+    ratios["closed_over_python_compiled_laws"] = ratio(each["python, compiled laws"], each["closed", 1])
     if len(threads) > 1:
-        ratios["second_thread"] = _ratio(taken["closed", 1], taken["closed", 2])
-        ratios["second_thread_bare"] = _ratio(taken["bare", 1], taken["bare", 2])
+        ratios["second_thread"] = ratio(taken["closed", 1], taken["closed", 2])
+        ratios["second_thread_bare"] = ratio(taken["bare", 1], taken["bare", 2])
     return physics, ratios
 
 
-def _ratio(above: list[float], below: list[float]) -> float:
+def ratio(above: list[float], below: list[float]) -> float:
+    """Median of the ratios in each round."""
     return median(a / b for a, b in zip(above, below, strict=True))
 
 
@@ -212,7 +217,7 @@ def _measure_missions(
     fleets = {(b, n): Fleet(scenario, b, n, orders) for b in BATCHES for n in threads}
     steps = {b: max(1, 2000 // b) for b in BATCHES}
     variants: dict[Any, Callable[[], None]] = {key: partial(fleet.advance, steps[key[0]]) for key, fleet in fleets.items()}
-    taken = _interleaved(variants, rounds)
+    taken = interleaved(variants, rounds)
     return {str(b): {str(n): b * steps[b] / median(taken[b, n]) for n in threads} for b in BATCHES}
 
 
@@ -230,7 +235,7 @@ def _measure_episode(scenario: Scenario, rounds: int) -> dict[str, float]:
             "rollout": lambda: _rollout(world, schedule),
             "record": lambda: _write(scenario, frames, Path(folder) / "perf.mcap"),
         }
-        taken = _interleaved(variants, rounds)
+        taken = interleaved(variants, rounds)
     return {f"{name}_s": median(seconds) for name, seconds in taken.items()}
 
 
@@ -267,6 +272,8 @@ def _write(scenario: Scenario, frames: list[Frame], path: Path) -> None:
 
 def perf_lines(figures: dict[str, Any]) -> list[str]:
     """The figures as text, one line each."""
+    from marlbc_mj.perf_training import training_lines
+
     physics, ratios = figures["physics_steps_per_s"], figures["ratios"]
     lines = [
         f"{name}, {threads} thread(s): {rate:,.0f} physics steps/s"
@@ -282,4 +289,4 @@ def perf_lines(figures: dict[str, Any]) -> list[str]:
     lines += [f"{name}: {ratio:.3f}" for name, ratio in ratios.items()]
     lines.append(f"100 s episode, B = 1, supervisor at every mission step: {figures['episode_s']:.3f} s")
     lines.append(f"the same with its orders known beforehand (World.rollout): {figures['rollout_s']:.3f} s")
-    return [*lines, f"its log: {figures['record_s']:.3f} s"]
+    return [*lines, f"its log: {figures['record_s']:.3f} s", *training_lines(figures)]

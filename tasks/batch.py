@@ -11,7 +11,7 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.orders import SEPARATOR
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.tasks.states import make_state
+from marlbc_mj.tasks.states import OLD, make_state
 
 ACTIONS = ("commands", "orders", "avoidance")
 
@@ -67,6 +67,7 @@ class Outcome(NamedTuple):
     switching: np.ndarray  # (B,) r2 (15): -3 if any agent's command changed
     switches: np.ndarray  # (B, N) bool, whose command changed
     clearance: np.ndarray  # (B, N) least clearance at the ends of the decision's mission steps [m]
+    age: np.ndarray  # (B, N) how long the commands before the decision had been in force [s]
     steps: np.ndarray  # (B,) mission steps made
     terminal: np.ndarray  # (B,) bool, the mission is over
     truncated: np.ndarray  # (B,) bool, the episode was cut
@@ -127,6 +128,7 @@ class FormationBatch:
         self.starts = starts or Starts()
         self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which an episode ends
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
+        self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
         self.rng = np.random.default_rng(0)
         last = [name.split(SEPARATOR)[-1] for name in orders.commands]
         self.keeping = [
@@ -152,7 +154,7 @@ class FormationBatch:
 
     def states(self) -> np.ndarray:
         """(B, S) of all worlds."""
-        return self.read(self.world.observe(), self.world.state.obstacles)
+        return self.read(self.world.observe(), self.world.state.obstacles, self.age)
 
     def step(self, actions: np.ndarray) -> Outcome:
         """One decision of every team; ``actions`` (B, N) are indices into the action set."""
@@ -172,6 +174,8 @@ class FormationBatch:
             formation += np.where(violated, 0.0, FORMATION_REWARD * state.formation)
             np.minimum(clearance, state.clearance, out=clearance)
         switches = (state.command != before) & started[:, None]
+        age, held = self.age, self.interval * self.scenario.mission_step
+        self.age = np.where(switches, 0.0, age) + held
         terminal = state.steps >= self.scenario.mission_steps
         truncated = (state.steps >= self.cut) & ~terminal
         final = self.states()
@@ -180,7 +184,7 @@ class FormationBatch:
             self._restart(terminal | truncated)
             now = self.states()
         return Outcome(
-            now, final, formation, violation, reward - formation - violation, switches, clearance,
+            now, final, formation, violation, reward - formation - violation, switches, clearance, age,
             np.full(worlds, self.interval), terminal, truncated,
         )  # fmt: skip
 
@@ -189,6 +193,7 @@ class FormationBatch:
         self.world.reset(int(self.rng.integers(2**31)), mask)
         state = self.world.state
         self.cut[mask] = self.scenario.mission_steps
+        self.age[mask] = OLD
         for b in np.flatnonzero(mask):
             if self.rng.random() < self.starts.exploring:
                 self._explore(int(b))

@@ -17,6 +17,9 @@ RANGE = 10.0
 CLOSE = 2.0
 """The finer of the two scales of lengths in the extended state [m]."""
 
+OLD = 5.0
+"""A command that has been in force for this long is 1 in the extended state, and so is any older one [s]."""
+
 LENGTHS = 10  # an agent has
 
 SPEED = 5.0
@@ -31,8 +34,10 @@ class State(Protocol):
     low: np.ndarray  # (S,)
     high: np.ndarray  # (S,)
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray) -> np.ndarray:
-        """(B, S) float32 states from a batch observation and obstacles (B, K, 3) [m]."""
+    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """(B, S) float32 states from a batch observation, obstacles (B, K, 3) [m] and how long every command has been in force,
+        (B, N) [s].
+        """
         ...
 
 
@@ -46,18 +51,18 @@ class PrintedState:
         self.low = np.array([-np.inf] * 4 * agents + [0.0] * (agents + 1))
         self.high = np.array([np.inf] * 4 * agents + [len(scenario.orders.commands) - 1.0] * agents + [2.0])
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray) -> np.ndarray:
-        """(B, 5N+1) float32; obstacles (B, K, 3) are not in it (erratum 9)."""
+    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """(B, 5N+1) float32; obstacles (B, K, 3) are not in it (erratum 9), nor is the age of the commands."""
         return observation.state().astype(np.float32)
 
 
 class ExtendedState:
     """Everything relative and normalised: nothing in it says where on the path, so it carries over to other obstacles.
 
-    Per agent: error to its FM and FR slots about the measured centroid; velocity minus the path's; its command one-hot; the
-    nearest obstacle (offset of the surface, clearance beyond the safe distance), seen from the agent and from its FM slot,
-    occupied or not. Then G one-hot. Lengths appear twice, by ``RANGE`` and by ``CLOSE``, clipped to [-1, 1]: a decision looks
-    metres ahead and turns on centimetres.
+    Per agent: error to its FM and FR slots about the measured centroid; velocity minus the path's; its command one-hot, and how
+    long it has been in force, by ``OLD``; the nearest obstacle (offset of the surface, clearance beyond the safe distance), seen
+    from the agent and from its FM slot, occupied or not. Then G one-hot. Lengths appear twice, by ``RANGE`` and by ``CLOSE``,
+    clipped to [-1, 1]: a decision looks metres ahead and turns on centimetres.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -65,12 +70,12 @@ class ExtendedState:
         self.slots = scenario.formations
         self.velocity = np.array(scenario.path_velocity)
         self.safe = np.array([0.0, 0.0, scenario.safe_distance])
-        self.size = scenario.agents * (2 * LENGTHS + 2 + self.commands) + 3
+        self.size = scenario.agents * (2 * LENGTHS + 3 + self.commands) + 3
         self.scale = np.ones(self.size)
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray) -> np.ndarray:
-        """(B, N (22 + C) + 3) float32 from a batch observation and obstacles (B, K, 3) [m]; C commands."""
+    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """(B, N (23 + C) + 3) float32 from a batch observation, obstacles (B, K, 3) [m] and ages (B, N) [s]; C commands."""
         position = observation.position
         worlds = len(position)
         centroid = position.mean(axis=1, keepdims=True)
@@ -86,7 +91,8 @@ class ExtendedState:
         )
         speeds = (observation.velocity - self.velocity) / SPEED
         commands = np.eye(self.commands)[observation.command]
-        agents = np.concatenate([lengths / RANGE, lengths / CLOSE, speeds, commands], axis=-1).reshape(worlds, -1)
+        parts = [lengths / RANGE, lengths / CLOSE, speeds, commands, age[..., None] / OLD]
+        agents = np.concatenate(parts, axis=-1).reshape(worlds, -1)
         joint = np.concatenate([agents, np.eye(3)[observation.formation]], axis=-1)
         return np.asarray(np.clip(joint, -1.0, 1.0), dtype=np.float32)
 

@@ -16,6 +16,7 @@ from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
 from marlbc_mj.supervisors import MPCMS, SLOW, SUPERVISORS, make_supervisor
+from marlbc_mj.training.config import METHODS, PRESETS
 
 SHORT = ("--duration", "1.0")
 
@@ -241,6 +242,9 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
     text = capsys.readouterr().out
     for name in ("paper", "fsams-hysteresis", "sorlc-scaled", "finite-time-limited", "actual", "quadratic", "point_mass"):
         assert f"  {name} " in text
+    for kind, names in (("training methods", METHODS), ("training presets", PRESETS)):
+        lines = text.split(f"{kind}:\n")[1].splitlines()[: len(names)]
+        assert [line.split()[0] for line in lines] == list(names)
 
 
 def test_a_broken_gl_loses_the_video_and_nothing_else(tmp_path: Path) -> None:

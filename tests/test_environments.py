@@ -135,8 +135,20 @@ def test_the_extended_state_does_not_know_where_on_the_path_it_is():
     shift = np.array([13.0, 0.0])
     moved = observation._replace(position=observation.position + shift)
     obstacles = world.state.obstacles
-    assert np.allclose(read(observation, obstacles), read(moved, obstacles + np.array([13.0, 0.0, 0.0])), atol=1e-6)
-    assert read(observation, obstacles).shape == (1, read.size)
+    age = np.ones((1, 4))
+    there = read(moved, obstacles + np.array([13.0, 0.0, 0.0]), age)
+    assert np.allclose(read(observation, obstacles, age), there, atol=1e-6)
+    assert there.shape == (1, read.size)
+
+
+def test_ages_count_from_the_last_change_of_command():
+    batch = FormationBatch(paper(), worlds=2, interval=10)
+    batch.reset(0)
+    plan = [[2, 2, 2, 2], [2, 2, 2, 2], [3, 2, 2, 2], [3, 2, 2, 0], [2, 2, 2, 0]]
+    ages = [batch.step(np.array([row, [2] * 4])).age[0] for row in plan]
+    assert ages[2][0] - ages[1][0] == pytest.approx(0.5)  # the first decision switches nothing
+    assert ages[3][0] == pytest.approx(0.5) and ages[4][0] == pytest.approx(1.0) and ages[4][3] == pytest.approx(0.5)
+    assert batch.age[0].tolist() == pytest.approx([0.5, ages[4][1] + 0.5, ages[4][2] + 0.5, 1.0])
 
 
 @pytest.mark.parametrize(

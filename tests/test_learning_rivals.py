@@ -42,16 +42,23 @@ def batch_of(size=6, seed=0):
 
 def learner_of(kind, **changes):
     """A learner whose past networks differ from the present one."""
-    config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", push_every=2, **changes)
+    config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", push_every=2, risk_gamma=0.0, **changes)
     learner = kind(config, N, A, np.arange(1.0, S + 1), generator())
     for seed in range(3):
         learner.update(batch_of(seed=seed), 1e-2)
     return learner
 
 
+def both(learner, batch):
+    """Values of the chosen actions and their targets."""
+    return learner.estimates(
+        batch, learner.network(torch.from_numpy(batch.state)), learner.targets(torch.from_numpy(batch.next_state))
+    )
+
+
 def test_vdn_by_hand():
     learner, batch = learner_of(VDN), batch_of(seed=9)
-    chosen, target = learner.estimates(batch)
+    chosen, target = both(learner, batch)
     now = learner.values(batch.state)
     ahead = learner.targets(torch.from_numpy(batch.next_state)).numpy()
     for m in range(len(batch.state)):
@@ -76,7 +83,7 @@ def mixed(mixer, values, state):
 
 def test_qmix_by_hand():
     learner, batch = learner_of(QMIX), batch_of(seed=9)
-    chosen, target = learner.estimates(batch)
+    chosen, target = both(learner, batch)
     now = learner.values(batch.state)
     ahead = learner.targets(torch.from_numpy(batch.next_state)).numpy()
     for m in range(len(batch.state)):
@@ -117,7 +124,7 @@ def test_the_mixer_is_monotonic(seed, size):
 
 def test_central_by_hand():
     learner, batch = learner_of(Central), batch_of(seed=9)
-    chosen, target = learner.estimates(batch)
+    chosen, target = both(learner, batch)
     now, present = learner.values(batch.state)[:, 0], learner.values(batch.next_state)[:, 0]
     past = learner.targets(torch.from_numpy(batch.next_state)).numpy()[0]
     assert now.shape == (6, A**N)
@@ -130,7 +137,7 @@ def test_central_by_hand():
 
 @given(st.lists(st.integers(0, A - 1), min_size=N, max_size=N))
 def test_joint_actions_are_read_as_they_are_written(action):
-    learner = Central(replace(TrainConfig(), hidden=(2,)), N, A, np.ones(S), generator())
+    learner = Central(replace(TrainConfig(), hidden=(2,), risk_gamma=0.0), N, A, np.ones(S), generator())
     joint = np.ravel_multi_index(tuple(action), learner.each)
     values = np.eye(A**N)[[joint]][:, None]
     assert greedy(values, np.zeros((1, N), dtype=np.int64), np.array([True]), 0.1).tolist() == [action]
@@ -139,7 +146,7 @@ def test_joint_actions_are_read_as_they_are_written(action):
 @pytest.mark.parametrize("kind", [VDN, QMIX, Central])
 def test_a_team_that_must_agree_learns_to(kind):
     """One decision, reward 1 only for one joint order, shared out over the agents; the greedy team finds it."""
-    config = replace(TrainConfig(), hidden=(16,), copies=2, push_every=10, learner="plain")
+    config = replace(TrainConfig(), hidden=(16,), copies=2, push_every=10, learner="plain", risk_gamma=0.0)
     learner = kind(config, N, A, np.ones(S), generator())
     rng, state, none = np.random.default_rng(0), np.zeros((64, S), np.float32), np.zeros((64, N), np.float32)
     for _ in range(400):
@@ -160,6 +167,7 @@ def filled(rows=6, worlds=5, decisions=8, agents=2):
             state=number[:, None], final=number[:, None] + 1, action=np.zeros((worlds, agents)),
             reward=number[:, None] + [0.0, 0.5], leniency=np.zeros((worlds, agents)), code=np.zeros(worlds),
             ended=np.zeros(worlds, dtype=bool), terminal=np.zeros((worlds, agents), dtype=bool),
+            lost=np.zeros((worlds, agents), dtype=bool),
         )  # fmt: skip
     return replay
 
@@ -208,7 +216,7 @@ def test_prioritised_sampling_is_the_closed_form(steps, share):
 
 def test_importance_weights_and_errors_go_through_an_update():
     mask = np.ones((2, S), dtype=np.float32)
-    config = replace(TrainConfig(), method="rlms", hidden=(6,), copies=1, learner="plain")
+    config = replace(TrainConfig(), method="rlms", hidden=(6,), copies=1, learner="plain", risk_gamma=0.0)
     learner = RLMS(config, 2, A, np.ones(S), generator(), mask)
     rng = np.random.default_rng(0)
     states = rng.normal(size=(2, 8, S)).astype(np.float32)
@@ -253,7 +261,7 @@ def test_the_own_entries_of_a_state_are_the_agents_own(name):
 
 def test_an_agent_on_its_own_does_not_see_the_others():
     mask = np.array([[1, 1, 0, 0, 0], [0, 0, 1, 1, 0], [0, 0, 0, 0, 1]], dtype=np.float32)
-    config = replace(TrainConfig(), method="rlms", hidden=(6,), copies=1, learner="plain", push_every=5)
+    config = replace(TrainConfig(), method="rlms", hidden=(6,), copies=1, learner="plain", risk_gamma=0.0, push_every=5)
     learner = RLMS(config, N, A, np.ones(S), generator(), mask)
     rng = np.random.default_rng(0)
     for _ in range(20):

@@ -3,9 +3,29 @@
 import numpy as np
 import pytest
 
-from marlbc_mj import perf
+from marlbc_mj import perf, perf_training
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import paper
+from marlbc_mj.training import trainer
+from marlbc_mj.training.config import TrainConfig, make_config
+
+PARTS = {"simulation", "state", "action_values", "exploration", "replay", "updates", "rest"}
+
+
+def small(threads: int) -> TrainConfig:
+    """A run of few worlds."""
+    return make_config(
+        "fast",
+        threads=threads,
+        interval=10,
+        worlds=8,
+        hidden=(8,),
+        batch=16,
+        updates=1,
+        capacity=1_000,
+        start_length=2.0,
+        hash="plain",
+    )
 
 
 def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -13,16 +33,78 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, value in {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1}.items():
         monkeypatch.setattr(perf, name, value)
     monkeypatch.setattr(perf, "paper", lambda: paper(duration=2.0))
+    monkeypatch.setattr(perf_training, "make_scenario", lambda name: paper(duration=10.0))
+    monkeypatch.setattr("marlbc_mj.training.base.make_scenario", lambda name: paper(duration=10.0))
+    monkeypatch.setattr(perf_training, "training_config", small)
+    monkeypatch.setattr(trainer, "WARM_UP", 64)
+    for name, value in {"WORLDS": 4, "DECISIONS": 2, "PROFILED": 10}.items():
+        monkeypatch.setattr(perf_training, name, value)
     figures = perf.measure_perf(rounds=5)
     physics = figures["physics_steps_per_s"]
     assert set(physics) == {"bare_mj_step", "closed_loop", "python_loop", "python_loop_compiled_laws"}
     rates = [*physics["bare_mj_step"].values(), *physics["closed_loop"].values(), physics["python_loop"]]
     rates += [rate for batch in figures["mission_steps_per_s"].values() for rate in batch.values()]
+    for key in ("environment_mission_steps_per_s", "training_mission_steps_per_s"):
+        assert set(figures[key]) == set(physics["bare_mj_step"])
+        rates += figures[key].values()
     assert np.isfinite(rates).all()
     assert min(rates) > 0
     assert figures["episode_s"] > 0
     assert figures["record_s"] > 0
-    assert len(perf.perf_lines(figures)) >= 12
+    for shares in figures["training_profile"].values():
+        assert set(shares) == PARTS
+        assert min(shares.values()) > 0
+        assert sum(shares.values()) == pytest.approx(1.0)
+    for taken in figures["decision_us"].values():
+        assert 0 < taken["median"] <= taken["p99"]
+    assert figures["decision_us"]["decision_step"]["median"] > figures["decision_us"]["all_mission_steps"]["median"]
+    assert figures["ratios"]["training_over_environment_1"] > 0
+    assert len(perf.perf_lines(figures)) >= 19
+
+
+def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Parts that call each other share out the time without counting any of it twice; the object is itself again after."""
+
+    class Work:
+        def outer(self) -> None:
+            self()
+
+        def __call__(self) -> None:
+            pass
+
+    now = iter(range(100))
+    monkeypatch.setattr(perf_training, "perf_counter", lambda: float(next(now)))  # a second between any two looks
+    clock, work = perf_training.Clock(), Work()
+    with clock.timing(work, ("outer",), "a"), clock.timing(work, ("__call__",), "b"):
+        work.outer()
+    assert clock.seconds == {"rest": 1.0, "a": 2.0, "b": 1.0}
+    assert type(work) is Work
+
+
+def test_a_profile_leaves_training_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same numbers with and without the clock."""
+    monkeypatch.setattr(trainer, "WARM_UP", 64)
+    one, other = trainer.Trainer(small(1)), trainer.Trainer(small(1))
+    for run in (one, other):
+        perf_training.warm_up(run)
+    perf_training.profile(one, 3)
+    for _ in range(3):
+        other.advance()
+    np.testing.assert_array_equal(one.state, other.state)
+    assert one.error == other.error != 0.0
+    assert type(one.batch.world) is World
+
+
+def test_exploring_starts_end_at_different_times() -> None:
+    """All of them after the present and none later than before; whole missions are left alone."""
+    batch = trainer.Trainer(make_config("fast", threads=1, worlds=32, capacity=1_000)).batch
+    before = batch.cut
+    perf_training.spread(batch, np.random.default_rng(0))
+    whole = before == batch.scenario.mission_steps
+    assert (batch.cut[whole] == before[whole]).all()
+    assert (batch.cut <= before).all()
+    assert (batch.cut > batch.world.state.steps).all()
+    assert len(set((before - batch.cut)[~whole].tolist())) > 5
 
 
 def test_a_fleet_is_spread_over_the_mission() -> None:

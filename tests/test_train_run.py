@@ -4,11 +4,13 @@ import csv
 import json
 import os
 import pickle
+import re
 import signal
 import subprocess
 import sys
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -90,7 +92,7 @@ def test_a_checkpoint_gives_the_evaluated_episode(finished):
     trajectory = run_episode(World(paper(), record=True), Learned.load(finished / "checkpoint" / "last.safetensors"))
     assert trajectory.reward.sum() == description["evaluation"]["return"]
     assert policy.weights[0].shape[0] == 4
-    held = trajectory.command.reshape(-1, 4, 4)  # decisions of 4 mission steps
+    held = trajectory.command.reshape(-1, description["signature"]["interval"], 4)
     assert (held == held[:, :1]).all()
 
 
@@ -145,6 +147,37 @@ def test_rank_puts_safety_first():
 def test_settings_by_name():
     config = with_settings(TrainConfig(), ("gamma=0.9", "hidden=8,9", "dueling=false", "shaping.margin=0.1", "copies=1"))
     assert (config.gamma, config.hidden, config.dueling, config.shaping.margin, config.copies) == (0.9, (8, 9), False, 0.1, 1)
+
+
+def test_the_examples_in_the_help_are_settings(capsys):
+    with pytest.raises(SystemExit):
+        main(["train", "--help"])
+    examples = re.findall(r"([\w.]+=[\d.,]*\d)", capsys.readouterr().out)
+    assert len(examples) == 3
+    assert with_settings(TrainConfig(), tuple(examples)) != TrainConfig()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "folder"),
+    [
+        ([], "runs/marlms-fast-0"),
+        (["vdn", "--preset", "paper", "--seed", "3"], "runs/vdn-paper-3"),
+        (["--set", "seed=4"], "runs/marlms-fast-4"),
+        (["--out", "here"], "here"),
+    ],
+)
+def test_runs_have_folders_of_their_own(arguments, folder, monkeypatch, capsys):
+    row = {"mission_steps": 0.0, "wall_s": 0.0, "return": 0.0, "violation_time": 0.0}
+    folders = []
+
+    def stand_in(config, out, **rest):
+        folders.append(out)
+        return [row]
+
+    monkeypatch.setattr("marlbc_mj.training.run.train", stand_in)
+    main(["train", *arguments])
+    assert folders == [Path(folder)]
+    assert f"{Path(folder) / 'checkpoint'} holds" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

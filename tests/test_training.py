@@ -16,7 +16,7 @@ from marlbc_mj.training.exploration import Exploration
 from marlbc_mj.training.learner import HYSTERESIS, Learner, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
-from marlbc_mj.training.policy import Policy, greedy
+from marlbc_mj.training.policy import Policy, admissible, greedy
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.trainer import lost, shaped_reward
 
@@ -27,8 +27,8 @@ def generator(seed=0):
     return torch.Generator().manual_seed(seed)
 
 
-def network(dueling=True, seed=0):
-    return TeamNetwork(N, S, A, (6, 7), torch.arange(1.0, S + 1), dueling=dueling, generator=generator(seed))
+def network(dueling=True, seed=0, risk=False):
+    return TeamNetwork(N, S, A, (6, 7), torch.arange(1.0, S + 1), dueling=dueling, risk=risk, generator=generator(seed))
 
 
 def one_agent(net, agent, state):
@@ -85,6 +85,16 @@ def test_numpy_policy_equals_the_network():
         policy = Policy(*arrays, scale=np.arange(1.0, S + 1, dtype=np.float32), dueling=dueling, margin=0.0)
         expected = net(torch.from_numpy(states)).detach().numpy().transpose(1, 0, 2)
         assert np.allclose(policy.values(states), expected, atol=1e-6)
+        risky = network(dueling, risk=True)
+        risky.biases[-1].data += torch.randn(risky.biases[-1].shape, generator=generator(4))  # risks apart from 1/2
+        arrays = [tuple(p.detach().numpy() for p in ps) for ps in (risky.weights, risky.biases)]
+        policy = Policy(*arrays, scale=policy.scale, dueling=dueling, margin=0.0, risk=0.45)
+        q, logits = (x.detach().numpy().transpose(1, 0, 2) for x in risky.heads(torch.from_numpy(states)))
+        risks = 1 / (1 + np.exp(-logits))
+        allowed = (risks <= 0.45) | (risks <= risks.min(axis=-1, keepdims=True) + 0.05)
+        values = policy.values(states)
+        assert 0 < allowed.mean() < 1
+        assert np.allclose(values[allowed], q[allowed], atol=1e-6) and np.isneginf(values[~allowed]).all()
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(0, 2))
@@ -143,7 +153,7 @@ def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
         replay.store(
             state=np.array([[k]]), final=np.array([[k + 1]]), action=np.array([[k]]), reward=np.array([[2.0**k]]),
             leniency=np.array([[0.1 * k]]), code=np.array([0]), ended=np.array([end != "go"]),
-            terminal=np.array([[end == "over"]]),
+            terminal=np.array([[end == "over"]]), lost=np.array([[False]]),
         )  # fmt: skip
     batch = replay.sample(200, steps, gamma, np.random.default_rng(0))
     first = batch.state[:, 0].astype(int)
@@ -163,7 +173,7 @@ def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
 
 def test_one_update_by_hand():
     """Target r + gamma^n max of the averaged network, Huber slope, weight 0 for a negative error at L = 1."""
-    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000)
+    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0)
     learner = Learner(config, 2, A, np.ones(S), generator())
     rng = np.random.default_rng(0)
     state, after = (rng.normal(size=(2, S)).astype(np.float32) for _ in range(2))
@@ -184,9 +194,49 @@ def test_one_update_by_hand():
         assert torch.allclose(p.grad, gradient, atol=1e-6)
 
 
+def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
+    """A corridor of three states with two orders: from the last, the first order is lost; from there on all is lost."""
+    config = replace(TrainConfig(), hidden=(32,), copies=2, push_every=10, capacity=4000, learner="plain", risk_gamma=0.5)
+    learner = Learner(config, 2, 2, np.ones(4), generator())
+    rng, eye = np.random.default_rng(0), np.eye(4, dtype=np.float32)
+    for _ in range(1500):
+        state, action = rng.integers(4, size=64), rng.integers(2, size=(64, 1))
+        action = np.repeat(action, 2, axis=1)
+        after = np.where((state == 3) | ((state == 2) & (action[:, 0] == 0)), 3, np.minimum(state + (action[:, 0] == 0), 2))
+        gone = np.repeat((after == 3)[:, None], 2, axis=1)
+        none = np.zeros((64, 2), np.float32)
+        learner.update(Batch(eye[state], action, none, none + 0.9, eye[after], none, lost=gone), 1e-2)
+    _, logits = learner.network.heads(torch.from_numpy(eye))
+    expected = [[0.0, 0.0], [0.0, 0.0], [1.0, 0.0], [1.0, 1.0]]
+    assert np.allclose(torch.sigmoid(logits).detach().numpy(), [expected] * 2, atol=0.05)
+    values = learner.values(eye)
+    assert np.isneginf(values[2, :, 0]).all() and np.isfinite(values[[0, 1, 3]]).all() and np.isfinite(values[2, :, 1]).all()
+
+
+@given(st.lists(st.floats(0, 1), min_size=2, max_size=6), st.floats(0, 1))
+def test_some_order_is_always_admissible(risks, limit):
+    allowed = admissible(np.array(risks), np.array([min(risks)]), limit)
+    assert allowed[np.argmin(risks)]
+    assert all(allowed[k] or (r > limit and r > min(risks)) for k, r in enumerate(risks))
+    assert (admissible(torch.tensor(risks), torch.tensor([min(risks)]), limit).numpy() == allowed).mean() >= 0.5
+
+
+def test_the_policy_is_the_running_mean_of_the_weights():
+    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0, smoothing=0.9)
+    learner = Learner(config, 2, A, np.ones(S), generator())
+    rng, mean = np.random.default_rng(0), None
+    for k in range(1, 30):
+        state = rng.normal(size=(8, S)).astype(np.float32)
+        action, reward = rng.integers(A, size=(8, 2)), rng.normal(size=(8, 2)).astype(np.float32)
+        learner.update(Batch(state, action, reward, 0 * reward, state, 0 * reward), 1e-2)
+        weight = learner.network.weights[0].detach().numpy().astype(float)
+        mean = weight if mean is None else mean + max(0.1, 1 / k) * (weight - mean)
+    assert np.allclose(learner.smooth.weights[0].detach().numpy(), mean, atol=1e-5)
+
+
 def test_updates_learn_a_bandit():
     """Two agents, reward 1 for one order each: the values find it."""
-    config = replace(TrainConfig(), hidden=(16,), copies=2, capacity=4000, learner="plain")
+    config = replace(TrainConfig(), hidden=(16,), copies=2, capacity=4000, learner="plain", risk_gamma=0.0)
     learner = Learner(config, 2, A, np.ones(S), generator())
     rng = np.random.default_rng(0)
     for _ in range(300):
@@ -249,19 +299,28 @@ def outcome(**changes):
     fields = {
         "state": None, "final_state": None, "formation": np.array([40.0, 0.0]), "violation": np.array([0.0, -20.0]),
         "switching": np.array([-3.0, 0.0]), "switches": np.array([[True, False, True], [False] * 3]),
-        "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
+        "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]), "age": np.array([[9.0, 9.0, 1.0], [1.0] * 3]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
     }  # fmt: skip
     return Outcome(**{**fields, **changes})
 
 
 def test_the_printed_reward_is_unshaped():
     assert shaped_reward(outcome(), Shaping()).tolist() == [[37.0] * 3, [-20.0] * 3]
-    assert not lost(outcome(), Shaping(), 2.0).any()
+    assert lost(outcome(), Shaping(), 2.0).tolist() == [[False] * 3, [True, False, False]]
 
 
 def test_shaped_reward_by_hand():
-    shaping = Shaping(centre=10.0, scale=2.0, violation=0.5, margin=0.06, own_violation_cost=100.0, own_switch_cost=5.0)
-    expected = [[(37 - 40 - 5) / 2, (37 - 40) / 2, (37 - 40 - 5) / 2], [(-10 - 40) / 2] * 3]
+    shaping = Shaping(
+        centre=10.0,
+        scale=2.0,
+        violation=0.5,
+        margin=0.06,
+        own_violation_cost=100.0,
+        own_switch_cost=5.0,
+        haste_cost=7.0,
+        dwell=2.0,
+    )
+    expected = [[(37 - 40 - 5) / 2, (37 - 40) / 2, (37 - 40 - 5 - 7) / 2], [(-10 - 40) / 2] * 3]
     assert np.allclose(shaped_reward(outcome(), shaping), expected)
     assert lost(outcome(), shaping, 2.0).tolist() == [[False, True, False], [True, False, False]]
 
@@ -273,6 +332,7 @@ def test_what_an_agent_does_when_lost_is_its_own_business():
         replay.store(
             state=np.array([[k]]), final=np.array([[k + 1]]), action=np.zeros((1, 2)), reward=np.array([[1.0, 1.0]]),
             leniency=np.zeros((1, 2)), code=np.zeros(1), ended=np.array([False]), terminal=np.array([[k == 1, False]]),
+            lost=np.array([[k == 1, False]]),
         )  # fmt: skip
     batch = replay.sample(50, 3, 0.5, np.random.default_rng(0))
     for start, reward, discount in zip(batch.state[:, 0], batch.reward, batch.discount, strict=True):
@@ -300,8 +360,9 @@ def test_presets_and_json():
         ({"learning_rate": 0.0}, ["learning_rate", "0.0"]),
         ({"hidden": ()}, ["hidden"]),
         ({"seed": -1}, ["seed", "-1"]),
-        ({"capacity": 256}, ["capacity", "256"]),
+        ({"capacity": 128}, ["capacity", "128"]),
         ({"together": 2.0}, ["together", "2.0"]),
+        ({"n_step": 3}, ["n_step", "3", "risk_gamma"]),
     ],
 )
 def test_wrong_settings_are_named(changes, fragments):

@@ -1,1 +1,1 @@
-"""Learners of mission supervisors. Nothing is in here yet: the environment they need is ``marlbc_mj.engine.world.World``."""
+"""Learners of mission supervisors: configurations, trainers, networks, runs on disk, checkpoints and their export."""

@@ -69,12 +69,15 @@ class BaseTrainer(ABC):
     def advance(self) -> Outcome:
         """One decision in every world, and what is learned then."""
 
-    def judge(self, outcome: Outcome) -> tuple[np.ndarray, np.ndarray]:
-        """(B, N) float32 rewards to learn from, and bool: the agent's return ends here, by the mission's end or its own loss."""
+    def judge(self, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(B, N) float32 rewards to learn from, and bool: the agent's return ends here, by the mission's end or its own loss;
+        the agent came too close.
+        """
         shaping = self.config.shaping
         gone = lost(outcome, shaping, self.scenario.safe_distance)
-        reward = np.where(gone, -shaping.own_violation_cost / shaping.scale, shaped_reward(outcome, shaping))
-        return reward, outcome.terminal[:, None] | gone
+        pays = gone & (shaping.own_violation_cost > 0)
+        reward = np.where(pays, -shaping.own_violation_cost / shaping.scale, shaped_reward(outcome, shaping))
+        return reward, outcome.terminal[:, None] | pays, gone
 
     def learning_rate(self, share: float) -> float:
         """From the first to the final one, linear in the ``share`` of the budget that is spent."""
@@ -92,7 +95,8 @@ class BaseTrainer(ABC):
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
         scale = self.batch.read.scale.astype(np.float32)
-        return Policy(weights, biases, scale, network.dueling, self.config.switching_margin)
+        risk = self.config.risk_limit if network.risk else 0.0
+        return Policy(weights, biases, scale, network.dueling, self.config.switching_margin, risk)
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
@@ -121,7 +125,7 @@ class BaseTrainer(ABC):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
-        return [(self, "state"), (self.batch, "cut"), (self.batch, "last")]
+        return [(self, "state"), *((self.batch, name) for name in ("cut", "last", "age"))]
 
 
 def prefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -137,12 +141,10 @@ def unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarr
 def shaped_reward(outcome: Outcome, shaping: Shaping) -> np.ndarray:
     """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says; see :func:`lost`."""
     team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps
-    own = shaping.own_switch_cost * outcome.switches
+    own = outcome.switches * (shaping.own_switch_cost + shaping.haste_cost * (outcome.age < shaping.dwell))
     return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
 
 
 def lost(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
-    """(B, N) bool: agents for which the mission counts as lost, because they came too close."""
-    if not shaping.own_violation_cost:
-        return np.zeros(outcome.clearance.shape, dtype=bool)
+    """(B, N) bool: agents that came too close."""
     return np.asarray(outcome.clearance < safe_distance + shaping.margin)

@@ -58,7 +58,7 @@ def write_policy(path: Path, policy: Policy, description: dict[str, Any]) -> Non
     """A policy with its description, and the description once more as JSON beside it for people."""
     arrays = {f"weight{k}": w for k, w in enumerate(policy.weights)}
     arrays |= {f"bias{k}": b for k, b in enumerate(policy.biases)}
-    description = {**description, "dueling": policy.dueling, "margin": policy.margin}
+    description = {**description, "dueling": policy.dueling, "margin": policy.margin, "risk": policy.risk}
     write_arrays(path, {**arrays, "scale": policy.scale}, description)
     write_json(path.with_suffix(".json"), description)
 
@@ -74,7 +74,8 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
     try:
         weights = tuple(arrays[f"weight{k}"] for k in range(layers))
         biases = tuple(arrays[f"bias{k}"] for k in range(layers))
-        policy = Policy(weights, biases, arrays["scale"], bool(description["dueling"]), float(description["margin"]))
+        settings = bool(description["dueling"]), float(description["margin"]), float(description["risk"])
+        policy = Policy(weights, biases, arrays["scale"], *settings)
         fits = layers > 0 and all(
             w.ndim == b.ndim == 3 and w.shape[::2] == b.shape[::2] for w, b in zip(weights, biases, strict=True)
         )

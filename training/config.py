@@ -28,6 +28,10 @@ class Shaping:
     punishment that adds up over time makes the values of lost states so low that no network tells good ones apart."""
     own_switch_cost: float = 0.0
     """For every switch of an agent, paid by that agent alone: who switched is known, so the team need not guess."""
+    haste_cost: float = 0.0
+    """What a switch costs more where the order before has been in force for less than ``dwell``."""
+    dwell: float = 4.0
+    """How long an order should be in force [s]."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +82,7 @@ class TrainConfig:
     """Scenario that is trained on."""
     controller: str = "sorlc"
     """Controller that tracks the references."""
-    budget: int = 5_000_000
+    budget: int = 4_000_000
     """Mission steps, over all worlds."""
 
     worlds: int = 128
@@ -100,22 +104,30 @@ class TrainConfig:
     """Dueling networks: Q = V + B - mean B."""
     copies: int = 5
     """Past networks that a target is averaged over; 1 switches averaging off."""
-    push_every: int = 30
+    push_every: int = 10
     """Updates after which the present network joins the past ones."""
-    gamma: float = 0.95
+    gamma: float = 0.99
     """Discount factor of a decision."""
-    n_step: int = 3
+    n_step: int = 1
     """Decisions whose rewards are summed before the bootstrap."""
     learning_rate: float = 1e-3
     """Of Adam, at the start."""
-    final_learning_rate: float = 1e-4
+    final_learning_rate: float = 3e-5
     """Of Adam, at the end; linear in between."""
     batch: int = 256
     """Transitions of an update."""
-    updates: int = 4
+    updates: int = 8
     """Updates after each decision of all worlds."""
     capacity: int = 100_000
     """Transitions in the replay buffer."""
+
+    smoothing: float = 0.998
+    """Of the running mean of the weights, which the greedy policy is made of; 0 takes the present ones."""
+    risk_gamma: float = 0.8
+    """The networks also learn the risk of every order: the chance, discounted by this a decision, that the agent can no longer
+    stay clear of obstacles by safe_distance + margin. 0 switches it off; then only costs make the policy careful."""
+    risk_limit: float = 0.4
+    """Orders of a higher risk are not taken, unless all are risky."""
 
     learner: str = "lenient"
     """What becomes of a negative TD error: lenient, hysteretic (half of it counts), plain."""
@@ -123,24 +135,22 @@ class TrainConfig:
     """States are hashed by the codes of an auto-encoder (autoencoder) or as they are (plain)."""
     bits: int = 16
     """Bits of a hash code."""
-    cool_by: float = 0.5
+    cool_by: float = 0.35
     """Share of the budget after which the largest temperature is 0.05."""
     hold: int = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.5
     """Share of explorations in which the whole team takes one random order."""
-    least_exploration: float = 0.02
+    least_exploration: float = 0.03
     """Exploration never falls below it."""
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by this."""
-    shaping: Shaping = Shaping(
-        centre=10.0, scale=100.0, violation=0.0, margin=0.06, own_violation_cost=2000.0, own_switch_cost=5.0
-    )
+    shaping: Shaping = Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_switch_cost=40.0, haste_cost=200.0)
     """The reward that is learned from."""
     ppo: PPO = PPO()
     """Of MAPPO alone."""
 
-    evaluate_every: int = 100_000
+    evaluate_every: int = 50_000
     """Mission steps between evaluations on the case study."""
     save_every: float = 60.0
     """Seconds between saves for --resume."""
@@ -153,7 +163,7 @@ class TrainConfig:
         for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("exploring_starts", "together", "least_exploration"):
+        for name in ("exploring_starts", "together", "least_exploration", "smoothing", "risk_gamma", "risk_limit"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
@@ -166,6 +176,10 @@ class TrainConfig:
                 raise unknown(name, getattr(self, name), choices)
         if self.method in METHODS and self.learner != METHODS[self.method][0].get("learner", self.learner):
             raise ConfigurationError(f"method {self.method} fixes the learner, got {self.learner}")
+        if self.risk_gamma and self.n_step > 1:
+            raise ConfigurationError(
+                f"risks are learned from single decisions: n_step must be 1 with risk_gamma, got {self.n_step}"
+            )
         if not self.hidden or min(self.hidden) < 1:
             raise ConfigurationError(f"hidden layers must have at least one unit, got {self.hidden}")
         if self.seed < 0:
@@ -190,15 +204,24 @@ CHOICES = {
     "device": ("cpu", "cuda"),
 }
 
+CARE: dict[str, Any] = {
+    "risk_gamma": 0.0,
+    "gamma": 0.95,
+    "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_violation_cost=2000.0, own_switch_cost=40.0),
+}
+"""For methods without risks of every agent's orders: coming too close ends the agent's return with a cost that nothing exceeds,
+which bounds the discount factor: 2000 must be more than being out of formation for ever, 10 * interval / (1 - gamma)."""
+
 METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one an agent"),
     "hysteretic": ({"learner": "hysteretic"}, "the same, but a negative TD error counts half instead of being overlooked"),
     "iql": ({"learner": "plain"}, "independent Q-learning: the same without leniency"),
     "vdn": ({"learner": "plain"}, "value decomposition: the team's value is the sum of the agents'"),
     "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', mixed as the state says"),
-    "central": ({"learner": "plain"}, "one double, dueling network over all joint orders of the team"),
+    "central": ({"learner": "plain", **CARE}, "one double, dueling network over all joint orders of the team"),
     "rlms": (
         {
+            **CARE,
             "learner": "plain",
             "actions": "avoidance",
             "hidden": (20,),
@@ -214,14 +237,17 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
         "single agents side by side: own state, formation with or without avoidance, prioritised replay",
     ),
     "mappo": (
-        {"learner": "plain", "switching_margin": 0.0, "learning_rate": 5e-4, "final_learning_rate": 5e-5},
+        {**CARE, "learner": "plain", "switching_margin": 0.0, "learning_rate": 5e-4, "final_learning_rate": 5e-5},
         "multi-agent PPO: an actor each, one critic on the state, rollouts instead of a replay buffer",
     ),
 }
 """What a method changes in a preset, and one line of description, by name."""
 
 PRESETS: dict[str, tuple[TrainConfig, str]] = {
-    "fast": (TrainConfig(), "minutes on two cores: extended state, exploring starts, held exploration, 3-step returns"),
+    "fast": (
+        TrainConfig(),
+        "minutes on two cores: extended state, exploring starts, held exploration, a decision every 0.5 s, learned risks",
+    ),
     "paper": (
         TrainConfig(
             preset="paper",
@@ -242,6 +268,8 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             together=0.0,
             least_exploration=0.0,
             switching_margin=0.0,
+            smoothing=0.0,
+            risk_gamma=0.0,
             shaping=Shaping(),
         ),
         "the printed hyper-parameters: 100 000 episodes of 2000 decisions, printed state, reward and orders",

@@ -1,5 +1,7 @@
 """Independent deep Q-learners of a team: dueling, averaged targets, lenient (17) or hysteretic about negative errors."""
 
+import copy
+import math
 from collections.abc import Iterable
 
 import numpy as np
@@ -8,6 +10,7 @@ from torch import Tensor, nn
 
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved
+from marlbc_mj.training.policy import admissible
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
@@ -48,9 +51,11 @@ class Learner:
             config.hidden,
             torch.from_numpy(scale),
             dueling=config.dueling,
+            risk=config.risk_gamma > 0,
             generator=generator,
             mask=None if mask is None else torch.from_numpy(mask),
         ).to(config.device)
+        self.smooth = copy.deepcopy(self.network).requires_grad_(False)  # running mean of the weights
         self.targets = TargetRing(self.network, config.copies)
         self.optimise(self.network.parameters())
         self.updates = 0
@@ -71,50 +76,87 @@ class Learner:
 
     @torch.no_grad()
     def values(self, state: np.ndarray) -> np.ndarray:
-        """(B, N, A) action values of states (B, S)."""
-        q = self.network(self._tensor(state))
+        """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
+        q, logits = self.network.heads(self._tensor(state))
+        q = self._masked(q, torch.sigmoid(logits))[0]
         return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
 
     def update(self, batch: Batch, learning_rate: float) -> float:
         """One gradient step; returns the mean absolute TD error."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        chosen, target = self.estimates(batch)
+        now, logits = self.network.heads(self._tensor(batch.state))
+        ahead, least = self._masked(*self.targets.heads(self._tensor(batch.next_state)))
+        chosen, target = self.estimates(batch, now, ahead)
         error = (target - chosen).detach()
         weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
         if batch.weight is not None:
             weight = weight * self._tensor(batch.weight.T)
-        loss = (torch.nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
+        loss = (nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
+        if self.network.risk:
+            loss = loss + self.risk_loss(batch, logits, least)
         self.optimiser.zero_grad()
         loss.backward()
         self.network.forget_unseen()
         nn.utils.clip_grad_norm_(self.parameters, LARGEST_GRADIENT)
         self.optimiser.step()
         self.updates += 1
+        self._smooth()
         if self.updates % self.config.push_every == 0:
             self.push()
         self.errors = error.abs().cpu().numpy()
         return float(error.abs().mean())
 
+    @torch.no_grad()
+    def _smooth(self) -> None:
+        share = max(1.0 - self.config.smoothing, 1.0 / self.updates)
+        for mean, p in zip(self.smooth.parameters(), self.network.parameters(), strict=True):
+            mean.lerp_(p, share)
+
+    def _masked(self, values: Tensor, risks: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M)."""
+        if not self.network.risk:
+            return values, torch.zeros(values.shape[:-1], device=values.device)
+        least = risks.amin(dim=-1, keepdim=True)
+        allowed = admissible(risks, least, self.config.risk_limit)
+        return torch.where(allowed, values, torch.full((), -math.inf, device=values.device)), least[..., 0]
+
+    def risk_loss(self, batch: Batch, logits: Tensor, least: Tensor) -> Tensor:
+        """Cross entropy of the risks of the chosen actions: 1 where the agent was lost, else risk_gamma min_b risk(s', b).
+
+        The risk of an action is so the discounted chance that coming too close can no longer be avoided (Bharadhwaj et al.,
+        ICLR 2021, learn a safety critic alike). ``batch`` must be of single decisions; ``logits`` (N, M, A), ``least`` (N, M).
+        """
+        goes_on = self._tensor(batch.discount.T) > 0
+        assert batch.lost is not None
+        target = torch.maximum(self._tensor(batch.lost.T), self.config.risk_gamma * goes_on * least)
+        chosen = self._chosen(batch, logits)
+        return nn.functional.binary_cross_entropy_with_logits(chosen, target, reduction="none").sum(dim=0).mean()
+
     def push(self) -> None:
         """The present networks join those that targets are made of."""
         self.targets.push()
 
-    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row an agent, K = N."""
-        best = self.targets(self._tensor(batch.next_state)).amax(dim=-1)
-        target = self._tensor(batch.reward.T) + self._tensor(batch.discount.T) * best
-        return self._chosen(batch), target
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row an agent, K = N.
 
-    def _chosen(self, batch: Batch) -> Tensor:
-        """(N, M) values of the actions that were taken."""
+        Args:
+            batch: M transitions.
+            now: (N, M, A) values in ``batch.state``.
+            ahead: (N, M, A) averaged values in ``batch.next_state``, -inf for actions that are too risky.
+        """
+        target = self._tensor(batch.reward.T) + self._tensor(batch.discount.T) * ahead.amax(dim=-1)
+        return self._chosen(batch, now), target
+
+    def _chosen(self, batch: Batch, values: Tensor) -> Tensor:
+        """(N, M) entries of ``values`` (N, M, A) for the actions that were taken."""
         actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
-        values: Tensor = self.network(self._tensor(batch.state))
         return values.gather(-1, actions[..., None]).squeeze(-1)
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of the networks, the past networks and Adam's moments, by name."""
         tensors = saved(self.parameters, self.optimiser) | {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
+        tensors |= {f"smooth{k}": p for k, p in enumerate(self.smooth.parameters())}
         return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
@@ -122,6 +164,8 @@ class Learner:
         restore(arrays, self.parameters, self.optimiser)
         for k, tensor in enumerate(self.targets.tensors):
             tensor.copy_(torch.from_numpy(arrays[f"target{k}"]))
+        for k, p in enumerate(self.smooth.parameters()):
+            p.copy_(torch.from_numpy(arrays[f"smooth{k}"]))
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)

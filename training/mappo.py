@@ -82,7 +82,7 @@ class MAPPO(BaseTrainer):
         actions = (logits + self.rng.gumbel(size=logits.shape)).argmax(axis=-1)  # a draw from the softmax
         self.explored = float((actions != logits.argmax(axis=-1)).mean())
         outcome = self.batch.step(actions)
-        reward, over = self.judge(outcome)
+        reward, over, _ = self.judge(outcome)
         values = (self.state, outcome.final_state, actions, reward, over, outcome.ended)
         for array, value in zip(self.rows.values(), values, strict=True):
             array[self.row] = value

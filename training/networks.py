@@ -19,6 +19,7 @@ class TeamNetwork(nn.Module):
         hidden: widths of the ReLU layers.
         scale: (S,) the state is divided by it.
         dueling: False makes the last layer give Q itself.
+        risk: the last layer gives the logit of a risk for every action, too.
         generator: of the initial weights.
         mask: (N, S) of 0 and 1, the entries that each agent's network sees; all by default. The others' weights in the first
             layer are 0 and stay 0.
@@ -33,15 +34,17 @@ class TeamNetwork(nn.Module):
         scale: Tensor,
         *,
         dueling: bool = True,
+        risk: bool = False,
         generator: torch.Generator | None = None,
         mask: Tensor | None = None,
     ) -> None:
         super().__init__()
         self.dueling = dueling
+        self.risk = risk
         self.actions = actions
         self.scale: Tensor
         self.register_buffer("scale", scale.to(torch.float32))
-        sizes = [state, *hidden, actions + 1 if dueling else actions]
+        sizes = [state, *hidden, dueling + actions + risk * actions]
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for inputs, outputs in itertools.pairwise(sizes):
@@ -62,11 +65,22 @@ class TeamNetwork(nn.Module):
 
     def forward(self, state: Tensor) -> Tensor:
         """(N, B, A) action values of states (B, S), or of (N, B, S) where every agent has its own."""
-        return apply(list(self.weights), list(self.biases), state / self.scale, self.dueling)
+        return self.heads(state)[0]
+
+    def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Action values, and logits of the risks (no columns without them), both (N, B, A)."""
+        return self.split(apply(list(self.weights), list(self.biases), state / self.scale))
+
+    def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        """Outputs (..., O) of the last layer as action values and logits of the risks."""
+        if not self.dueling:
+            return outputs[..., : self.actions], outputs[..., self.actions :]
+        value, advantage, risk = outputs[..., :1], outputs[..., 1 : 1 + self.actions], outputs[..., 1 + self.actions :]
+        return value + advantage - advantage.mean(dim=-1, keepdim=True), risk
 
 
-def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, dueling: bool) -> Tensor:
-    """(N, B, A) from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in)."""
+def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor) -> Tensor:
+    """(N, B, O) outputs from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in)."""
     networks, inputs, width = weights[0].shape
     if x.ndim == 3:
         y = torch.baddbmm(biases[0], x, weights[0])
@@ -75,14 +89,11 @@ def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, dueling: bool)
         y = first.view(len(x), networks, width).transpose(0, 1) + biases[0]
     for weight, bias in zip(weights[1:], biases[1:], strict=True):
         y = torch.baddbmm(bias, torch.relu(y), weight)
-    if not dueling:
-        return y
-    value, advantage = y[..., :1], y[..., 1:]
-    return value + advantage - advantage.mean(dim=-1, keepdim=True)
+    return y
 
 
 class TargetRing:
-    """The last ``copies`` weights of a network; its value is the mean over them (Anschel et al. 2017)."""
+    """The last ``copies`` weights of a network; values and risks are means over them (Anschel et al. 2017)."""
 
     def __init__(self, network: TeamNetwork, copies: int) -> None:
         self.network = network
@@ -102,14 +113,19 @@ class TargetRing:
             copy[rows] = parameter.detach()
         self.next = (self.next + 1) % self.copies
 
-    @torch.no_grad()
     def __call__(self, state: Tensor) -> Tensor:
         """(N, B, A) averaged action values of states (B, S), or of (N, B, S) where every agent has its own."""
+        return self.heads(state)[0]
+
+    @torch.no_grad()
+    def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Averaged action values and averaged risks in [0, 1] (no columns without them), both (N, B, A)."""
         layers = len(self.network.weights)
         if state.ndim == 3:
             state = state.repeat(self.copies, 1, 1)
-        values = apply(self.tensors[:layers], self.tensors[layers:], state / self.network.scale, self.network.dueling)
-        return values.view(self.copies, self.agents, *values.shape[1:]).mean(dim=0)
+        outputs = apply(self.tensors[:layers], self.tensors[layers:], state / self.network.scale)
+        values, risks = self.network.split(outputs.view(self.copies, self.agents, *outputs.shape[1:]))
+        return values.mean(dim=0), torch.sigmoid(risks).mean(dim=0)
 
 
 def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:

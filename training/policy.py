@@ -1,8 +1,16 @@
 """A trained team as plain NumPy: states in, actions out, without torch."""
 
-from typing import NamedTuple
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+SLACK = 0.05
+"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
 
 class Policy(NamedTuple):
@@ -13,9 +21,10 @@ class Policy(NamedTuple):
     scale: np.ndarray  # (S,)
     dueling: bool
     margin: float
+    risk: float = 0.0  # largest admissible risk; 0 where the networks have no risks
 
     def values(self, state: np.ndarray) -> np.ndarray:
-        """(B, N, A) action values of states (B, S)."""
+        """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
         first = self.weights[0]
         networks, inputs, width = first.shape
         y = (state / self.scale).astype(np.float32) @ first.transpose(1, 0, 2).reshape(inputs, networks * width)
@@ -23,10 +32,22 @@ class Policy(NamedTuple):
         for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
             y = np.matmul(np.maximum(y, 0.0), weight) + bias
         y = y.transpose(1, 0, 2)
-        if not self.dueling:
-            return np.asarray(y)
-        advantage = y[..., 1:]
-        return np.asarray(y[..., :1] + advantage - advantage.mean(axis=-1, keepdims=True))
+        actions = (y.shape[-1] - self.dueling) // (2 if self.risk else 1)
+        values, logits = y[..., self.dueling : self.dueling + actions], y[..., self.dueling + actions :]
+        if self.dueling:
+            values = y[..., :1] + values - values.mean(axis=-1, keepdims=True)
+        if self.risk:
+            risks = 1.0 / (1.0 + np.exp(-logits))
+            values = np.where(admissible(risks, risks.min(axis=-1, keepdims=True), self.risk), values, -np.inf)
+        return np.asarray(values)
+
+
+Array = TypeVar("Array", np.ndarray, "Tensor")
+
+
+def admissible(risks: Array, least: Array, limit: float) -> Array:
+    """Bool (..., A): which actions may be taken, by their risks (..., A) and the least of these (..., 1)."""
+    return (risks <= limit) | (risks <= least + SLACK)
 
 
 def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: float) -> np.ndarray:

@@ -16,6 +16,7 @@ class Batch(NamedTuple):
     leniency: np.ndarray  # (M, N)
     weight: np.ndarray | None = None  # (M, N) what a TD error counts; 1 by default
     place: np.ndarray | None = None  # (M, N) where the transitions begin in the buffer: row times B plus world
+    lost: np.ndarray | None = None  # (M, N) bool, the agent came too close in the first of the decisions
 
 
 class Replay:
@@ -35,6 +36,7 @@ class Replay:
             "action": np.zeros((rows, worlds, agents), dtype=np.int64),
             "reward": np.zeros((rows, worlds, agents), dtype=np.float32),
             "leniency": np.zeros((rows, worlds, agents), dtype=np.float32),
+            "lost": np.zeros((rows, worlds, agents), dtype=bool),
             "code": np.zeros((rows, worlds), dtype=np.int64),
             "ended": np.zeros((rows, worlds), dtype=bool),
             "terminal": np.zeros((rows, worlds, agents), dtype=bool),
@@ -82,4 +84,5 @@ class Replay:
             np.where(running, discount, np.float32(0.0)),
             a["final"][last, world],
             a["leniency"][row, world],
+            lost=a["lost"][row, world],
         )

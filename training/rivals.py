@@ -24,9 +24,9 @@ class VDN(Learner):
     Target: sum over the agents of r_i + gamma_i max_b Q_i(s', b), Q_i averaged over the past networks.
     """
 
-    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the team's action and its target."""
-        chosen, target = super().estimates(batch)
+        chosen, target = super().estimates(batch, now, ahead)
         return chosen.sum(dim=0, keepdim=True), target.sum(dim=0, keepdim=True)
 
 
@@ -90,13 +90,12 @@ class QMIX(Learner):
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
         self.optimise([*self.network.parameters(), *self.mixer.parameters()])
 
-    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the team's action and its target."""
-        after = self._tensor(batch.next_state)
-        ahead = self.target_mixer(self.targets(after).amax(dim=-1), after)
         reward, discount = team_return(batch)
-        target = self._tensor(reward) + self._tensor(discount) * ahead
-        return self.mixer(self._chosen(batch), self._tensor(batch.state)), target
+        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self._tensor(batch.next_state))
+        target = self._tensor(reward) + self._tensor(discount) * mixed
+        return self.mixer(self._chosen(batch, now), self._tensor(batch.state)), target
 
     def push(self) -> None:
         """Network and mixer join those that targets are made of."""
@@ -138,17 +137,13 @@ class Central(Learner):
         """One network with A^N values."""
         return 1, actions**agents
 
-    @torch.no_grad()
-    def _ahead(self, state: Tensor) -> Tensor:
-        best = self.network(state).argmax(dim=-1, keepdim=True)
-        return self.targets(state).gather(-1, best).squeeze(-1)
-
-    def estimates(self, batch: Batch) -> tuple[Tensor, Tensor]:
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the joint action and its target."""
         reward, discount = team_return(batch)
-        target = self._tensor(reward) + self._tensor(discount) * self._ahead(self._tensor(batch.next_state))
+        best = self.network(self._tensor(batch.next_state)).detach().argmax(dim=-1, keepdim=True)
+        target = self._tensor(reward) + self._tensor(discount) * ahead.gather(-1, best).squeeze(-1)
         joint = np.ravel_multi_index(tuple(batch.action.T), self.each)
-        return self._chosen(batch._replace(action=joint[:, None])), target
+        return self._chosen(batch._replace(action=joint[:, None]), now), target
 
 
 class RLMS(Learner):

@@ -223,9 +223,9 @@ def scores(metrics: Metrics) -> Row:
 
 
 def rank(row: Row) -> tuple[float, float]:
-    """What makes one evaluation better than another: less violation first, then return less 10 a switch."""
+    """What makes one evaluation better than another: less violation first, then return less 100 a switch."""
     switches = sum(value for name, value in row.items() if name.startswith("switches_"))
-    return -row["violation_time"], row["return"] - 10.0 * switches
+    return -row["violation_time"], row["return"] - 100.0 * switches
 
 
 def write_table(path: Path, rows: Sequence[Row]) -> None:

@@ -57,7 +57,7 @@ class Trainer(BaseTrainer):
     @property
     def network(self) -> TeamNetwork:
         """The networks whose largest output is the greedy action."""
-        return self.learner.network
+        return self.learner.smooth
 
     def advance(self) -> Outcome:
         """One decision in every world, then ``updates`` gradient steps."""
@@ -72,13 +72,14 @@ class Trainer(BaseTrainer):
         actions = self.exploration(best, warmth.mean(axis=-1), self.rng)
         self.explored = float((actions != best).mean())
         outcome = self.batch.step(actions)
-        reward, over = self.judge(outcome)
+        reward, over, gone = self.judge(outcome)
         replay.store(
             state=self.state,
             final=outcome.final_state,
             action=actions,
             reward=reward,
             leniency=leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0]),
+            lost=gone,
             code=codes,
             ended=outcome.ended,
             terminal=over,

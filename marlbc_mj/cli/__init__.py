@@ -10,8 +10,10 @@ import tyro
 from tyro.conf import subcommand
 
 from marlbc_mj.cli.benchmark import Bench, Run
+from marlbc_mj.cli.export import Export
 from marlbc_mj.cli.recordings import Log, Video, View
 from marlbc_mj.cli.studies import Ablation, Calibrate, ListAll, OracleSearch, Perf
+from marlbc_mj.cli.study import Study
 from marlbc_mj.cli.training import Train
 from marlbc_mj.errors import MarlbcError
 from marlbc_mj.terminal import prepare_gl
@@ -20,6 +22,8 @@ Command = (
     Annotated[Bench, subcommand("bench")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Export, subcommand("export")]
+    | Annotated[Study, subcommand("study")]
     | Annotated[Video, subcommand("video")]
     | Annotated[View, subcommand("view")]
     | Annotated[Log, subcommand("log")]

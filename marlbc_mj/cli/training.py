@@ -23,8 +23,8 @@ class Train:
     """Hyper-parameters: fast, or paper for the printed ones."""
     seed: int = 0
     """Of networks, exploration and starts."""
-    out: Path = Path("runs/marlms")
-    """Folder of the run."""
+    out: Path | None = None
+    """Folder of the run; runs/METHOD-PRESET-SEED by default."""
     resume: Path | None = None
     """Folder of a run that was interrupted: it goes on, bit for bit, with its own settings."""
     budget: int | None = None
@@ -34,7 +34,7 @@ class Train:
     device: str | None = None
     """Device of the networks: cpu or cuda."""
     set: tuple[str, ...] = ()
-    """Any other setting of the preset, name=value: gamma=0.98 copies=1 shaping.margin_cost=50."""
+    """Any other setting of the preset, name=value: gamma=0.98 copies=1 shaping.margin=0.1."""
     overwrite: bool = False
     """Write into a folder that is not empty."""
 
@@ -47,7 +47,9 @@ class Train:
             if self.resume is not None:
                 folder, ended = self.resume, run.resume(self.resume, progress=progress)
             else:
-                folder, ended = self.out, run.train(self.config(), self.out, overwrite=self.overwrite, progress=progress)
+                config = self.config()
+                folder = self.out or Path("runs") / f"{config.method}-{config.preset}-{config.seed}"
+                ended = run.train(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, run.Interrupted):
             print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
             sys.exit(128 + ended.signal)

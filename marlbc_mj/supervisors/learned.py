@@ -11,7 +11,7 @@ from marlbc_mj.engine.state import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.tasks.batch import order_of
-from marlbc_mj.tasks.states import State, make_state
+from marlbc_mj.tasks.states import OLD, State, make_state
 from marlbc_mj.training.checkpoint import check_signature, read_policy
 from marlbc_mj.training.policy import Policy, greedy
 
@@ -21,7 +21,9 @@ class LearnedMemory(NamedTuple):
 
     read: State
     order_of: np.ndarray  # (A,) index into scenario.orders of every action
+    scenario: Scenario
     actions: np.ndarray  # (1, N) in force
+    age: np.ndarray  # (1, N) how long their commands have been in force [s]
     solver_ms: float = 0.0  # what state and networks took in the last mission step [ms]
 
 
@@ -55,17 +57,22 @@ class Learned:
         check_signature(self.path, self.signature, scenario)
         read = make_state(str(self.signature["state"]), scenario)
         orders = order_of(scenario, str(self.signature["actions"]))
-        return LearnedMemory(read, orders, np.zeros((1, scenario.agents), dtype=np.int64))
+        none = np.zeros((1, scenario.agents), dtype=np.int64)
+        return LearnedMemory(read, orders, scenario, none, np.full(none.shape, OLD))
 
     def decide(self, situation: Situation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
         """The greedy action of every agent; the one in force unless another is better by more than the margin."""
-        actions, began = memory.actions, perf_counter()
-        if situation.step % int(self.signature["interval"]) == 0:  # type: ignore[call-overload]  # checked by the signature
-            state = memory.read(_batch(situation), situation.obstacles[None])
+        actions, age, began = memory.actions, memory.age, perf_counter()
+        interval = int(self.signature["interval"])  # type: ignore[call-overload]  # checked by the signature
+        if situation.step % interval == 0:
+            state = memory.read(_batch(situation), situation.obstacles[None], age)
             fresh = np.array([situation.step == 0])
             actions = greedy(self.policy.values(state), memory.actions, fresh, self.policy.margin)
+            command = memory.scenario.orders.command_of[memory.order_of[actions]]
+            switches = (command != situation.command) & ~fresh[:, None]
+            age = np.where(switches, 0.0, age) + interval * memory.scenario.mission_step
         solver_ms = 1e3 * (perf_counter() - began)
-        return memory.order_of[actions[0]], memory._replace(actions=actions, solver_ms=solver_ms)
+        return memory.order_of[actions[0]], memory._replace(actions=actions, age=age, solver_ms=solver_ms)
 
 
 def _batch(situation: Situation) -> Observation:

@@ -1,0 +1,24 @@
+"""``marlbc ship``: make a training run's best checkpoint one that comes with the package."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from tyro.conf import Positional
+
+
+@dataclass(frozen=True)
+class Ship:
+    """Copy the best checkpoint of a run to the shipped ones and write its model card. For developers of the package."""
+
+    run_folder: Positional[Path]
+    """Folder of the training run."""
+    name: Positional[str]
+    """Name that the supervisor gets: marlms, rlms."""
+    overwrite: bool = False
+    """Replace the one that is there."""
+
+    def run(self) -> None:
+        """Copy, write the card, say where."""
+        from marlbc_mj.training.shipped import ship
+
+        print(ship(self.run_folder, self.name, overwrite=self.overwrite))

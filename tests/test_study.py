@@ -1,0 +1,294 @@
+"""Studies of learners: what is run, skipped, continued and reported, on runs of seconds."""
+
+import csv
+import json
+import shutil
+import signal
+import threading
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from marlbc_mj.cli import main, study
+from marlbc_mj.cli.study import Job, plan, run_job, run_study
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.report.table import to_markdown
+from marlbc_mj.training import run
+from marlbc_mj.training.config import CARE, TrainConfig
+from marlbc_mj.training.study import (
+    COLUMNS,
+    DONE,
+    FAILED,
+    GOAL_SWITCHES,
+    UNFINISHED,
+    VARIANTS,
+    WIDE,
+    by_variant,
+    collect,
+    meets_goal,
+    read_study,
+    scripted_return,
+    study_table,
+    write_csvs,
+    write_report,
+)
+from marlbc_mj.training.trainer import Trainer
+
+TINY = {"worlds": 8, "hidden": (8,), "batch": 16, "updates": 1, "capacity": 400, "start_length": 1.0, "evaluate_every": 1_600}
+SETTINGS = [f"{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in TINY.items()]
+REPORT = {"study.csv", "curves.csv", "study.md", "study.tex", "curves.pdf", "curves.png"}
+
+
+def tiny(config: TrainConfig) -> TrainConfig:
+    return replace(config, **TINY)
+
+
+def jobs_of(out: Path, *variants: str, seeds: int = 1, budget: int = 1_600) -> list[Job]:
+    return plan(variants, seeds, budget, out, tiny)
+
+
+def evaluations(folder: Path) -> list[dict[str, str]]:
+    with (folder / "eval.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def quiet(line: str) -> None:
+    assert "\n" not in line
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two variants on two seeds in this process, from the command line."""
+    out = tmp_path_factory.mktemp("study") / "out"
+    arguments = ["--variants", "marlms", "vdn", "--seeds", "2", "--budget", "1600", "--workers", "1"]
+    main(["study", *arguments, "--out", str(out), "--set", *SETTINGS])
+    return out
+
+
+def test_a_study_leaves_what_it_promises(finished: Path) -> None:
+    """The report, and of every run its evaluations, progress, configuration and best checkpoint."""
+    assert {p.name for p in finished.iterdir()} == REPORT | {"marlms", "vdn"}
+    for variant in ("marlms", "vdn"):
+        for seed in ("0", "1"):
+            folder = finished / variant / seed
+            assert {p.name for p in folder.iterdir()} == {"eval.csv", "progress.csv", "config.json", "checkpoint", DONE}
+            assert {p.name for p in (folder / "checkpoint").iterdir()} == {"best.safetensors", "best.json"}
+            assert json.loads((folder / "config.json").read_text())["train"]["threads"] == 1
+    rows, curves = read_study(finished)
+    assert [(row["variant"], row["seed"]) for row in rows] == [(v, s) for v in ("marlms", "vdn") for s in ("0", "1")]
+    assert all(row["failure"] == "" and row["goal_mission_steps"] == "" for row in rows)
+    assert {row["goal_return"] for row in rows} == {f"{scripted_return('paper', 'sorlc'):.6g}"}
+    last = evaluations(finished / "vdn" / "1")[-1]
+    assert (rows[-1]["final_return"], rows[-1]["wall_s"]) == (last["return"], last["wall_s"])
+    assert rows[-1]["final_switches"] == "/".join(last[f"switches_{i}"] for i in range(1, 5))
+    assert curves[-1]["mission_steps"] == last["mission_steps"]
+    assert float(curves[-1]["switches"]) == sum(float(last[f"switches_{i}"]) for i in range(1, 5))
+
+
+def test_finished_runs_are_skipped(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is trained again; another budget in the same folder is refused before anything runs."""
+    monkeypatch.setattr(run, "train", None)
+    monkeypatch.setattr(run, "resume", None)
+    said: list[str] = []
+    assert run_study(jobs_of(finished, "marlms", "vdn", seeds=2), 1, said.append) == 0
+    assert len(said) == 4 and all(line.endswith(": found") for line in said)
+    with pytest.raises(ConfigurationError, match="other settings"):
+        jobs_of(finished, "vdn", budget=5_000)
+
+
+def test_table_and_figure_from_csv_alone(finished: Path, tmp_path: Path) -> None:
+    """The two CSV files are enough for the same table, LaTeX and figure, byte for byte."""
+    for name in ("study.csv", "curves.csv"):
+        shutil.copy(finished / name, tmp_path)
+    main(["study", "--from", str(tmp_path)])
+    assert {p.name for p in tmp_path.iterdir()} == REPORT
+    for name in REPORT:
+        assert (tmp_path / name).read_bytes() == (finished / name).read_bytes(), name
+
+
+def interrupted(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave what a run killed after its save leaves."""
+    with monkeypatch.context() as patch:
+        original, calls = Trainer.advance, []
+
+        def advance(self):
+            calls.append(None)
+            if len(calls) == 10:
+                signal.raise_signal(signal.SIGTERM)
+            return original(self)
+
+        patch.setattr(Trainer, "advance", advance)
+        assert run_job(job, quiet).how == "stopped"
+    assert (job.folder / run.RESUME).is_file() and not (job.folder / DONE).exists()
+
+
+def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is reported as unfinished, then resumed, and ends as the uninterrupted one; other settings do not continue it."""
+    (job,) = jobs_of(tmp_path, "marlms")
+    interrupted(job, monkeypatch)
+    rows, _ = collect(tmp_path)
+    assert rows[0]["failure"] == UNFINISHED
+    assert study_table(rows).rows[0][1:3] == ("0", "0 of 0")
+    with pytest.raises(ConfigurationError, match="other settings"):
+        jobs_of(tmp_path, "marlms", budget=9_000)
+    said: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "train", None)
+        assert run_job(job, said.append).how == "finished"
+    assert said[0] == "marlms seed 0: goes on" and not (job.folder / run.RESUME).exists()
+    one, other = ([{**e, "wall_s": ""} for e in evaluations(out / "marlms" / "0")] for out in (finished, tmp_path))
+    assert len(one) == 2 and one == other
+
+
+def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With its reason in every file, beside those that ran; the next call tries it again, and success removes the reason."""
+    original = run.make_trainer
+
+    def make(config):
+        if config.method == "vdn":
+            raise ConfigurationError("the networks diverged")
+        if config.method == "qmix":
+            raise RuntimeError("shapes\ndiffer")
+        return original(config)
+
+    jobs = jobs_of(tmp_path, "marlms", "vdn", "qmix", budget=400)
+    said: list[str] = []
+    with monkeypatch.context() as patch:
+        patch.setattr(run, "make_trainer", make)
+        run_study(jobs, 1, said.append)
+    assert "[2/3] vdn seed 0: failed: the networks diverged" in said
+    rows, curves = collect(tmp_path)
+    assert [row["failure"] for row in rows] == ["", "the networks diverged", "RuntimeError: shapes differ"]
+    write_csvs(tmp_path, rows, curves)
+    write_report(tmp_path, rows, curves)
+    assert read_study(tmp_path) == (rows, curves)
+    for name in ("study.csv", "study.md", "study.tex"):
+        assert "the networks diverged" in (tmp_path / name).read_text()
+    cells = {row[0]: row[1:] for row in study_table(rows).rows}
+    assert cells["vdn"][:4] == ("1, 1 failed", "0 of 1", "∞", "∞") and cells["vdn"][4] == "–"
+    assert run_job(jobs[1], quiet).how == "finished" and not (jobs[1].folder / FAILED).exists()
+    only = by_variant(rows)["qmix"]
+    write_report(tmp_path, only, [])  # nothing but a failure can still be drawn
+
+
+def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
+    """The study passes it on to its worker processes, which save their runs; what there is can be compared."""
+
+    def interrupt() -> None:
+        while not list(tmp_path.glob("vdn/0/eval.csv")) and not over.is_set():
+            over.wait(0.05)
+        signal.raise_signal(signal.SIGINT)
+
+    over = threading.Event()
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    try:
+        assert run_study(jobs_of(tmp_path, "vdn", budget=900_000_000), 2, quiet) == signal.SIGINT
+    finally:
+        over.set()
+        thread.join()
+    assert (tmp_path / "vdn" / "0" / run.RESUME).is_file()
+    assert [row["failure"] for row in collect(tmp_path)[0]] == [UNFINISHED]
+
+
+def test_a_stopped_study_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
+    """After what there is; the exit status is the signal's."""
+    monkeypatch.setattr(study, "run_study", lambda jobs, workers, say: signal.SIGTERM)
+    with pytest.raises(SystemExit) as stopped:
+        main(["study", "--out", str(tmp_path)])
+    assert stopped.value.code == 128 + signal.SIGTERM
+    assert capsys.readouterr().err == "marlbc: stopped, and every run saved; the same command goes on\n"
+
+
+def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
+    """All can be configured, no two alike, each a switch away from marlms; a group fits a row of the figure."""
+    configs = {job.variant: job.config for job in plan((), 1, 5_000, tmp_path)}
+    assert list(configs) == list(VARIANTS) and len({repr(config) for config in configs.values()}) == len(VARIANTS)
+    assert all((c.budget, c.threads, c.scenario) == (5_000, 1, "paper") for c in configs.values())
+    base = configs["marlms"]
+    switches = {
+        "no-averaging": {"copies": 1},
+        "no-dueling": {"dueling": False},
+        "plain-hash": {"hash": "plain"},
+        "no-leniency": {"method": "iql", "learner": "plain"},
+        "no-risk": CARE,
+        "no-exploring-starts": {"exploring_starts": 0.0},
+        "no-held-exploration": {"hold": 1, "together": 0.0},
+        "printed-state": {"state": "printed"},
+        "no-centring": {"shaping": replace(base.shaping, centre=0.0)},
+    }
+    for name, changes in switches.items():
+        assert configs[name] == replace(base, **changes), name
+    assert configs["paper"].preset == "paper" and configs["paper"].method == "marlms"
+    groups = [variant.group for variant in VARIANTS.values()]
+    assert all(groups.count(group) <= WIDE for group in groups)
+    assert groups == sorted(groups, key=groups.index)
+
+
+def test_the_goal_is_the_scripted_supervisors() -> None:
+    """Which meets it itself; one switch more, any violation or a lower return do not."""
+    goal = scripted_return("paper", "sorlc")
+    good = {f"switches_{i + 1}": str(n) for i, n in enumerate(GOAL_SWITCHES)} | {"violation_time": "0", "return": f"{goal:.6g}"}
+    assert meets_goal(good, goal)
+    for change in ({"switches_2": "3"}, {"violation_time": "0.05"}, {"return": f"{goal - 1:.6g}"}):
+        assert not meets_goal({**good, **change}, goal)
+
+
+def test_a_goal_that_is_never_met_is_infinite() -> None:
+    """The median over runs counts a run that fails or never gets there; the interval may end at infinity."""
+    row = dict.fromkeys(COLUMNS, "")
+    row |= {"variant": "marlms", "budget": "5000000", "goal_return": "15017", "best_switches": "4/2/2/4", "wall_s": "60"}
+    numbers = dict.fromkeys(("best_return", "best_violation_time", "best_clearance_min", "final_return"), "1")
+    met = [{**row, **numbers, "seed": str(k), "goal_mission_steps": f"{k + 1}e6", "goal_wall_s": "60"} for k in range(2)]
+    failed = {**row, "seed": "2", "failure": "diverged"}
+    cells = study_table([*met, failed]).rows[0]
+    assert cells[1:4] == ("3, 1 failed", "2 of 3", "2.00 [1.00, ∞]")
+    assert study_table([*met[:1], failed, {**failed, "seed": "3"}]).rows[0][3] == "∞ [1.00, ∞]"
+    assert "marlms seed 2: diverged" in to_markdown(study_table([*met, failed]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragments"),
+    [
+        (["--variants", "dqn"], ["variant 'dqn'", "marlms", "mappo"]),
+        (["--variants", "vdn", "vdn"], ["twice", "vdn"]),
+        (["--seeds", "0"], ["seeds", "0"]),
+        (["--budget", "0"], ["budget", "0"]),
+        (["--workers", "0"], ["workers", "0"]),
+        (["--set", "gama=1"], ["gama", "gamma"]),
+        (["--from", "nowhere"], ["nowhere", "study.csv"]),
+    ],
+)
+def test_wrong_settings_are_one_line(
+    arguments: list[str],
+    fragments: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stopped:
+        main(["study", *arguments])
+    assert stopped.value.code == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and all(fragment in said for fragment in fragments), said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", ["", "variant,seed\nmarlms,0\n", "unknown", "number"])
+def test_damaged_csv_files_are_one_line(damage: str, finished: Path, tmp_path: Path) -> None:
+    text = (finished / "study.csv").read_text()
+    changed = {"unknown": text.replace("vdn", "dqn"), "number": text.replace("1600", "many")}.get(damage, damage)
+    (tmp_path / "study.csv").write_text(changed)
+    shutil.copy(finished / "curves.csv", tmp_path)
+    with pytest.raises(ConfigurationError) as error:
+        read_study(tmp_path)
+    assert "\n" not in str(error.value)
+
+
+def test_workers_heed_their_study() -> None:
+    """A job that has not begun when the study stops is left alone."""
+    (job,) = jobs_of(Path("nowhere"), "marlms")
+    assert run_job(job, quiet, lambda: True) == study.Ended("marlms seed 0", "stopped")
+    assert not Path("nowhere").exists()

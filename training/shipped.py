@@ -1,0 +1,77 @@
+"""Checkpoints that come with the package, each with a model card; and how a training run becomes one."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.files import check_target, staged_file
+from marlbc_mj.training.checkpoint import read_policy
+
+FOLDER = Path(__file__).parent / "checkpoints"
+
+
+def shipped(name: str) -> Path:
+    """Path of a shipped checkpoint, whether there is one or not."""
+    return FOLDER / f"{name}.safetensors"
+
+
+def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
+    """Copy the best checkpoint of a run and write its model card, ``<name>.md``; returns the checkpoint's path.
+
+    Raises:
+        ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
+    """
+    source = run / "checkpoint" / "best.safetensors"
+    read_policy(source)
+    try:
+        config = json.loads((run / "config.json").read_text())
+        with (run / "eval.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        best = json.loads(source.with_suffix(".json").read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise ConfigurationError(f"{run} is not a finished training run: {error}") from error
+    target = folder / source.with_stem(name).name
+    check_target(target, overwrite=overwrite)
+    folder.mkdir(parents=True, exist_ok=True)
+    for suffix in (".safetensors", ".json"):
+        with staged_file(target.with_suffix(suffix), overwrite=True) as staging:
+            shutil.copyfile(source.with_suffix(suffix), staging)
+    with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
+        staging.write_text(card(name, config, best["evaluation"], rows))
+    return target
+
+
+def card(name: str, config: dict[str, object], evaluation: dict[str, float], rows: list[dict[str, str]]) -> str:
+    """The model card, Markdown: what it is, how it was made, what it does on the case study, its learning curve."""
+    train = config["train"]
+    assert isinstance(train, dict)
+    versions = config["versions"]
+    assert isinstance(versions, dict)
+    command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
+    switches = "/".join(f"{value:.0f}" for key, value in evaluation.items() if key.startswith("switches_"))
+    lines = [
+        f"# {name}",
+        "",
+        f"Greedy policy of a team on scenario `{train['scenario']}` with controller `{train['controller']}`: every "
+        f"{train['interval']} mission steps one of the {train['actions']} for each agent, from the {train['state']} state. "
+        "Trained on the unperturbed scenario alone; it knows no other team, slots or mission step, and refuses them.",
+        "",
+        f"- Command: `{command}`",
+        f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
+        f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {config['cpu']}.",
+        f"- On the case study: return {evaluation['return']:.0f}, switches {switches}, "
+        f"violation {evaluation['violation_time']:.3f} s, least clearance {evaluation['clearance_min']:.3f} m.",
+        f"- Revision {config['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
+        "",
+        "| mission steps | return | switches | violation [s] | least clearance [m] |",
+        "|---:|---:|---|---:|---:|",
+    ]
+    for row in rows:
+        counts = "/".join(f"{float(value):.0f}" for key, value in row.items() if key.startswith("switches_"))
+        lines.append(
+            f"| {float(row['mission_steps']):.0f} | {float(row['return']):.0f} | {counts} | {float(row['violation_time']):.3f} "
+            f"| {float(row['clearance_min']):.3f} |"
+        )
+    return "\n".join(lines) + "\n"
