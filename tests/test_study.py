@@ -23,16 +23,13 @@ from marlbc_mj.training.study import (
     GOAL_SWITCHES,
     UNFINISHED,
     VARIANTS,
-    WIDE,
-    by_variant,
     collect,
     meets_goal,
     read_study,
     scripted_return,
-    study_table,
     write_csvs,
-    write_report,
 )
+from marlbc_mj.training.study_report import WIDE, by_variant, study_table, write_report
 from marlbc_mj.training.trainer import Trainer
 
 TINY = {"worlds": 8, "hidden": (8,), "batch": 16, "updates": 1, "capacity": 400, "start_length": 1.0, "evaluate_every": 1_600}

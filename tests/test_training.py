@@ -299,7 +299,8 @@ def outcome(**changes):
     fields = {
         "state": None, "final_state": None, "formation": np.array([40.0, 0.0]), "violation": np.array([0.0, -20.0]),
         "switching": np.array([-3.0, 0.0]), "switches": np.array([[True, False, True], [False] * 3]),
-        "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]), "age": np.array([[9.0, 9.0, 1.0], [1.0] * 3]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
+        "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]),
+        "age": np.array([[9.0, 9.0, 1.0], [1.0] * 3]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
     }  # fmt: skip
     return Outcome(**{**fields, **changes})
 

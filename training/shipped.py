@@ -7,7 +7,9 @@ from pathlib import Path
 
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.files import check_target, staged_file
+from marlbc_mj.provenance import plain_data
 from marlbc_mj.training.checkpoint import read_policy
+from marlbc_mj.training.config import METHODS, make_config
 
 FOLDER = Path(__file__).parent / "checkpoints"
 
@@ -50,6 +52,7 @@ def card(name: str, config: dict[str, object], evaluation: dict[str, float], row
     versions = config["versions"]
     assert isinstance(versions, dict)
     command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
+    command += f" --threads {train['threads']}" + "".join(f" {setting}" for setting in _settings(train))
     switches = "/".join(f"{value:.0f}" for key, value in evaluation.items() if key.startswith("switches_"))
     lines = [
         f"# {name}",
@@ -75,3 +78,26 @@ def card(name: str, config: dict[str, object], evaluation: dict[str, float], row
             f"| {float(row['clearance_min']):.3f} |"
         )
     return "\n".join(lines) + "\n"
+
+
+def _settings(train: dict[str, object]) -> list[str]:
+    """``--set`` and what differs from the method's preset, nothing where nothing does."""
+    preset = plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0]))
+    said = {"type", "method", "preset", "seed", "budget", "threads"}
+    changed = [
+        f"{name}={_text(value)}" for name, value in _flat(train).items() if _flat(preset).get(name) != value and name not in said
+    ]
+    return ["--set", *changed] if changed else []
+
+
+def _flat(data: dict[str, object]) -> dict[str, object]:
+    """Nested settings under ``outer.inner``."""
+    flat: dict[str, object] = {}
+    for name, value in data.items():
+        inner = {f"{name}.{key}": entry for key, entry in value.items() if key != "type"} if isinstance(value, dict) else {}
+        flat |= inner or {name: value}
+    return flat
+
+
+def _text(value: object) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)

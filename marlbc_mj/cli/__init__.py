@@ -12,6 +12,7 @@ from tyro.conf import subcommand
 from marlbc_mj.cli.benchmark import Bench, Run
 from marlbc_mj.cli.export import Export
 from marlbc_mj.cli.recordings import Log, Video, View
+from marlbc_mj.cli.ship import Ship
 from marlbc_mj.cli.studies import Ablation, Calibrate, ListAll, OracleSearch, Perf
 from marlbc_mj.cli.study import Study
 from marlbc_mj.cli.training import Train
@@ -22,6 +23,7 @@ Command = (
     Annotated[Bench, subcommand("bench")]
     | Annotated[Run, subcommand("run")]
     | Annotated[Train, subcommand("train")]
+    | Annotated[Ship, subcommand("ship")]
     | Annotated[Export, subcommand("export")]
     | Annotated[Study, subcommand("study")]
     | Annotated[Video, subcommand("video")]

@@ -1,12 +1,13 @@
 """``marlbc bench`` and ``marlbc run``, and the changes to a scenario that they share."""
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.terminal import print_results, progress_bars
 
 if TYPE_CHECKING:
@@ -66,6 +67,8 @@ class Bench:
     """Draw of the scenario; every seed is the same where nothing is perturbed."""
     seeds: int | None = None
     """Number of draws around the scenario, from --seed on: tables with intervals instead of logs and videos."""
+    drag_range: tuple[float, float] | None = None
+    """With --seeds, a draw from this range multiplies the disturbance: 0 2 by default, 5 5 for five times throughout."""
     workers: int = 1
     """Processes that share the methods of --seeds."""
     video: Literal["first", "all", "none"] = "first"
@@ -81,6 +84,7 @@ class Bench:
     def run(self) -> None:
         """Run the matrix, then say where the results are and what they are."""
         from marlbc_mj.bench import BenchConfig, run_bench, run_bench_seeds
+        from marlbc_mj.seeds import CASE_STUDY_PERTURBATION
 
         config = BenchConfig(
             supervisors=self.supervisors,
@@ -93,9 +97,14 @@ class Bench:
             seeds=self.seeds,
             workers=self.workers,
         )
+        if self.drag_range is not None and self.seeds is None:
+            raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
         if self.seeds is not None:
+            scenario = self.options.build(self.scenario)
+            if self.drag_range is not None:
+                scenario = replace(scenario, perturbation=replace(CASE_STUDY_PERTURBATION, drag_scale=self.drag_range))
             with progress_bars() as progress:
-                run_bench_seeds(self.options.build(self.scenario), config, self.out, progress=progress)
+                run_bench_seeds(scenario, config, self.out, progress=progress)
             print(f"{self.out / 'index.html'} shows it all")
             return
         with progress_bars() as progress:

@@ -48,7 +48,7 @@ class Study:
     def run(self) -> None:
         """Train what is missing, then write and print the comparison; a stopped study compares what there is."""
         from marlbc_mj.report.table import to_markdown
-        from marlbc_mj.training import study
+        from marlbc_mj.training import study, study_report
 
         if self.source is not None:
             rows, curves, folder, stopped = *study.read_study(self.source), self.source, 0
@@ -61,8 +61,8 @@ class Study:
             if rows:
                 study.write_csvs(folder, rows, curves)
         if rows:
-            study.write_report(folder, rows, curves)
-            print(to_markdown(study.study_table(rows)))
+            study_report.write_report(folder, rows, curves)
+            print(to_markdown(study_report.study_table(rows)))
             print(f"{folder / 'study.md'} and {folder / 'curves.pdf'} show it all")
         if stopped:
             print("marlbc: stopped, and every run saved; the same command goes on", file=sys.stderr)

@@ -7,9 +7,11 @@ from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, s
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.supervisors.fsams import FSAMS
+from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.supervisors.mpcms import MPCMS
 from marlbc_mj.supervisors.oracle import Oracle
 from marlbc_mj.supervisors.scripted import Scripted
+from marlbc_mj.training.shipped import shipped
 
 SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
     "scripted": (Scripted, "the scenario's schedule: the fewest switches its geometry allows"),
@@ -25,11 +27,17 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
         lambda: MPCMS(prediction="mujoco", horizon=120),
         "the same over 6 s of simulated candidates, which sees the agents lag; minutes an episode",
     ),
+    "marlms": (
+        lambda: Learned.load(shipped("marlms")),
+        "MARLMS: the shipped checkpoint of lenient, dueling, averaged Q-networks, one an agent",
+    ),
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
     "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
 }
 """Factory and one line of description by name."""
+LEARNED = ("marlms",)
+"""Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
 SLOW = ("mpcms-mujoco",)
 """Supervisors that take minutes an episode: a benchmark runs them where they are named, not by default."""
 
@@ -48,6 +56,7 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
 __all__ = [
     "FMS",
     "FSAMS",
+    "LEARNED",
     "MPCMS",
     "SLOW",
     "SUPERVISORS",
@@ -55,6 +64,7 @@ __all__ = [
     "Decision",
     "FuzzyBlend",
     "Layered",
+    "Learned",
     "MotorSchema",
     "Oracle",
     "Scripted",

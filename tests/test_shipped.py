@@ -1,0 +1,46 @@
+"""Shipped checkpoints: what their cards say is what they do; and how a run becomes one."""
+
+import json
+
+import pytest
+
+from marlbc_mj import World, make_supervisor, measure, paper, run_episode
+from marlbc_mj.cli import main
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.supervisors import LEARNED
+from marlbc_mj.training.config import make_config
+from marlbc_mj.training.run import scores, train
+from marlbc_mj.training.shipped import ship, shipped
+
+
+@pytest.mark.parametrize("name", LEARNED)
+def test_a_shipped_policy_does_what_its_card_says(name):
+    path = shipped(name)
+    said = json.loads(path.with_suffix(".json").read_text())["evaluation"]
+    did = scores(measure(run_episode(World(paper(), record=True), make_supervisor(name))))
+    assert did == {key: said[key] for key in did}
+    assert f"return {said['return']:.0f}" in path.with_suffix(".md").read_text()
+    assert path.stat().st_size < 1_000_000
+
+
+def test_marlms_reaches_the_goal():
+    """Safe at every substep, no more switches than the paper's, and not below the scripted supervisor."""
+    metrics = measure(run_episode(World(paper(), record=True), make_supervisor("marlms")))
+    assert all(a["violation_time"] == 0.0 for a in metrics["agents"])
+    assert all(a["switches"] <= most for a, most in zip(metrics["agents"], (4, 2, 2, 4), strict=True))
+    assert metrics["team"]["return"] >= 15_017
+
+
+def test_a_run_becomes_a_shipped_checkpoint(tmp_path, capsys):
+    config = make_config("fast", worlds=64, hidden=(8,), capacity=7_000, budget=1_000, evaluate_every=1_000, threads=1)
+    train(config, tmp_path / "run")
+    path = ship(tmp_path / "run", "mine", tmp_path / "shipped")
+    assert {p.name for p in path.parent.iterdir()} == {"mine.safetensors", "mine.json", "mine.md"}
+    card = path.with_suffix(".md").read_text()
+    assert "marlbc train marlms --preset fast --seed 0 --budget 1000 --threads 1 --set worlds=64 hidden=8 capacity=7000" in card
+    assert "torch" in card
+    with pytest.raises(ConfigurationError, match="exists"):
+        ship(tmp_path / "run", "mine", tmp_path / "shipped")
+    with pytest.raises(SystemExit):
+        main(["ship", str(tmp_path / "nowhere"), "mine"])
+    assert "nowhere" in capsys.readouterr().err
