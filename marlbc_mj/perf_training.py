@@ -81,7 +81,7 @@ def _environment(config: TrainConfig) -> FormationBatch:
         interval=config.interval,
         state="extended",
         actions=config.actions,
-        starts=Starts(config.exploring_starts, config.start_length),
+        starts=Starts(config.exploring_starts, config.start_length, config.focus),
     )
     batch.reset(config.seed)
     return batch

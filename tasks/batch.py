@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.behaviors import clearances
 from marlbc_mj.controllers import Controller
 from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
 from marlbc_mj.engine.world import World
@@ -44,15 +45,21 @@ class Starts:
     """Where episodes begin: this share of them anywhere along the route, in formation or in column, at rest in the slots.
 
     An exploring start lasts ``length`` and then ends without being terminal. A formation whose slots come within the safe
-    distance of an obstacle starts as a column.
+    distance of an obstacle starts as a column. Where a slot becomes blocked or free is where orders have to change: decisions are
+    rare elsewhere, so that a uniform start spends most of its time where there is nothing to learn.
     """
 
     exploring: float = 0.0  # share of episodes in [0, 1]
     length: float = 20.0  # [s]
+    focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
+    lead: float = 8.0  # how long before, at the most [s]
 
     def __post_init__(self) -> None:
-        if not 0 <= self.exploring <= 1:
-            raise ConfigurationError(f"exploring starts are a share between 0 and 1, got {self.exploring}")
+        for name, value in (("exploring starts", self.exploring), ("focused starts", self.focus)):
+            if not 0 <= value <= 1:
+                raise ConfigurationError(f"{name} are a share between 0 and 1, got {value}")
+        if not self.lead >= 0:
+            raise ConfigurationError(f"the lead of a focused start must not be negative, got {self.lead} s")
         if not self.length > 0:
             raise ConfigurationError(f"the length of an exploring start must be positive, got {self.length} s")
 
@@ -130,6 +137,7 @@ class FormationBatch:
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
         self.rng = np.random.default_rng(0)
+        self.critical = self._critical()
         last = [name.split(SEPARATOR)[-1] for name in orders.commands]
         self.keeping = [
             [c for c, name in enumerate(last) if name == kept and c in command_of] or sorted(command_of)
@@ -201,19 +209,37 @@ class FormationBatch:
 
     def _explore(self, b: int) -> None:
         scenario, state = self.scenario, self.world.state
-        last = scenario.mission_steps // self.interval - 1
-        step = int(self.rng.integers(last)) * self.interval
-        time = step * scenario.mission_step
-        centre = np.array(scenario.path_origin) + time * np.array(scenario.path_velocity)
+        step = self._start() * self.interval
         which = int(self.rng.integers(2))
+        centre = self._centre(step)
         positions = centre + scenario.formations[which]
-        if which == 0 and self._blocked(positions, state.obstacles[b]):
+        if which == 0 and self._blocked(positions, state.obstacles[b]).any():
             which = 1
             positions = centre + scenario.formations[1]
         commands = self.rng.choice(self.keeping[which], size=scenario.agents)
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
 
-    def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> bool:
-        gaps = np.linalg.norm(positions[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
-        return bool((gaps <= self.scenario.safe_distance).any())
+    def _start(self) -> int:
+        """The decision with which an exploring start begins."""
+        last = self.scenario.mission_steps // self.interval - 1
+        if len(self.critical) and self.rng.random() < self.starts.focus:
+            lead = self.rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
+            return min(max(round(self.rng.choice(self.critical) - lead), 0), last - 1)
+        return int(self.rng.integers(last))
+
+    def _critical(self) -> np.ndarray:
+        """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
+        decisions = np.arange(self.scenario.mission_steps // self.interval) * self.interval
+        slots = [self._centre(step) + self.scenario.formations[0] for step in decisions]
+        blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
+        return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
+
+    def _centre(self, step: int) -> np.ndarray:
+        """(2,) desired centroid at a mission step [m]."""
+        scenario = self.scenario
+        return np.array(scenario.path_origin) + step * scenario.mission_step * np.array(scenario.path_velocity)
+
+    def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+        """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
+        return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)

@@ -113,6 +113,20 @@ def test_exploring_starts_lie_on_the_route_and_are_cut():
     assert (outcome.state[outcome.ended] != outcome.final_state[outcome.ended]).any()
 
 
+def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives():
+    """A slot passes a point at 1 m, sqrt(3) m on either side; a disc's edge of safety is 7 m around its centre, slots pass at 3 m."""
+    points = [20.0 - np.sqrt(3.0), 20.0 + np.sqrt(3.0), 45.0 - np.sqrt(3.0), 45.0 + np.sqrt(3.0)]
+    gate = [60.0 - np.sqrt(40.0), 65.0 - np.sqrt(40.0), 70.0 + np.sqrt(40.0), 75.0 + np.sqrt(40.0)]
+    batch = FormationBatch(paper(), worlds=200, interval=1, starts=Starts(exploring=1.0, focus=1.0, lead=3.0))
+    found = batch.critical * batch.scenario.mission_step
+    assert np.allclose(found, points + gate, atol=0.051)
+    batch.reset(0)
+    time = batch.world.state.steps * batch.scenario.mission_step
+    ahead = found - time[:, None]
+    assert (((ahead > -0.03) & (ahead < 3.03)).any(axis=1)).all()
+    assert (((ahead > -0.03) & (ahead < 3.03)).any(axis=0)).all()
+
+
 @given(
     st.lists(st.tuples(*[st.floats(-50, 50)] * 2), min_size=1, max_size=4),
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(0, 5)), max_size=5),
@@ -160,6 +174,8 @@ def test_ages_count_from_the_last_change_of_command():
         (lambda: PaperFormation("maze"), ["maze", "paper"]),
         (lambda: Starts(exploring=1.5), ["1.5"]),
         (lambda: Starts(length=0.0), ["0.0"]),
+        (lambda: Starts(focus=1.2), ["focused", "1.2"]),
+        (lambda: Starts(lead=-1.0), ["-1.0"]),
     ],
 )
 def test_wrong_settings_are_named(build, fragments):

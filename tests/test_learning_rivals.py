@@ -237,26 +237,28 @@ def test_importance_weights_and_errors_go_through_an_update():
 
 @pytest.mark.parametrize("name", STATES)
 def test_the_own_entries_of_a_state_are_the_agents_own(name):
-    """An agent's velocity and command change its own entries and nobody else's."""
+    """An agent's velocity, command and its age change its own entries and nobody else's."""
     scenario = paper()
     state, rng = make_state(name, scenario), np.random.default_rng(0)
     mask = own_entries(state, 4).astype(bool)
 
-    def read(velocity, command):
+    def read(velocity, command, age):
         position = np.arange(8.0).reshape(1, 4, 2)
         observation = Observation(
             np.zeros(1), position, velocity, np.ones((1, 4)), np.zeros(1, dtype=np.int64), command, position
         )
-        return state(observation, np.zeros((1, 1, 3)))[0]
+        return state(observation, np.zeros((1, 1, 3)), age)[0]
 
-    velocity, command = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64)
+    velocity, command, age = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64), np.ones((1, 4))
+    seen = 3 if name == "printed" else 5  # the printed state has no age
     assert (mask.sum(axis=0) <= 1).all() and mask.sum() == state.size - (1 if name == "printed" else 3)
     for j in range(4):
-        faster, other = velocity.copy(), command.copy()
+        faster, other, older = velocity.copy(), command.copy(), age.copy()
         faster[0, j] += 0.1
         other[0, j] = 1
-        changed = read(velocity, command) != read(faster, other)
-        assert changed.sum() >= 3 and (changed <= mask[j]).all()
+        older[0, j] += 1.0
+        changed = read(velocity, command, age) != read(faster, other, older)
+        assert changed.sum() >= seen and (changed <= mask[j]).all()
 
 
 def test_an_agent_on_its_own_does_not_see_the_others():

@@ -36,7 +36,7 @@ class BaseTrainer(ABC):
             interval=config.interval,
             state=config.state,
             actions=config.actions,
-            starts=Starts(config.exploring_starts, config.start_length),
+            starts=Starts(config.exploring_starts, config.start_length, config.focus),
         )
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)

@@ -97,6 +97,8 @@ class TrainConfig:
     """Share of episodes that begin anywhere along the route."""
     start_length: float = 20.0
     """Length of those episodes [s]."""
+    focus: float = 0.0
+    """Share of them that begin shortly before a slot of the formation comes too close to an obstacle, or is free again."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""
@@ -163,7 +165,7 @@ class TrainConfig:
         for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("exploring_starts", "together", "least_exploration", "smoothing", "risk_gamma", "risk_limit"):
+        for name in ("exploring_starts", "focus", "together", "least_exploration", "smoothing", "risk_gamma", "risk_limit"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
