@@ -17,8 +17,8 @@ from marlbc_mj.perf import interleaved, ratio
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.supervisors import situation
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.tasks.batch import FormationBatch, Starts
-from marlbc_mj.training.base import BaseTrainer
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.training.base import BaseTrainer, make_starts
 from marlbc_mj.training.checkpoint import signature
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.run import make_trainer
@@ -81,7 +81,7 @@ def _environment(config: TrainConfig) -> FormationBatch:
         interval=config.interval,
         state="extended",
         actions=config.actions,
-        starts=Starts(config.exploring_starts, config.start_length, config.focus),
+        starts=make_starts(config),
     )
     batch.reset(config.seed)
     return batch

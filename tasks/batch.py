@@ -53,11 +53,12 @@ class Starts:
     length: float = 20.0  # [s]
     focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
     lead: float = 8.0  # how long before, at the most [s]
+    turning: float = 0.0  # share of the exploring starts at which the whole team has just been told to take the other formation
 
     def __post_init__(self) -> None:
-        for name, value in (("exploring starts", self.exploring), ("focused starts", self.focus)):
-            if not 0 <= value <= 1:
-                raise ConfigurationError(f"{name} are a share between 0 and 1, got {value}")
+        for name in ("exploring", "focus", "turning"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigurationError(f"{name} is a share of starts between 0 and 1, got {getattr(self, name)}")
         if not self.lead >= 0:
             raise ConfigurationError(f"the lead of a focused start must not be negative, got {self.lead} s")
         if not self.length > 0:
@@ -138,11 +139,11 @@ class FormationBatch:
         self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
         self.rng = np.random.default_rng(0)
         self.critical = self._critical()
-        last = [name.split(SEPARATOR)[-1] for name in orders.commands]
+        parts = [name.split(SEPARATOR) for name in orders.commands]
+        known = sorted(command_of, key=lambda c: len(parts[c]))
         self.keeping = [
-            [c for c, name in enumerate(last) if name == kept and c in command_of] or sorted(command_of)
-            for kept in scenario.formation_names
-        ]  # commands that an exploring start in each formation has, as far as the action set has them
+            [c for c in known if parts[c][-1] == kept] or known for kept in scenario.formation_names
+        ]  # commands that an exploring start in each formation has, the shortest first, as far as the action set has them
 
     @property
     def actions(self) -> int:
@@ -217,6 +218,9 @@ class FormationBatch:
             which = 1
             positions = centre + scenario.formations[1]
         commands = self.rng.choice(self.keeping[which], size=scenario.agents)
+        if self.rng.random() < self.starts.turning:
+            commands = np.full(scenario.agents, self.keeping[1 - which][0])
+            self.age[b] = 0.0
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
 

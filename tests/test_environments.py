@@ -114,7 +114,7 @@ def test_exploring_starts_lie_on_the_route_and_are_cut():
 
 
 def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives():
-    """A slot passes a point at 1 m, sqrt(3) m on either side; a disc's edge of safety is 7 m around its centre, slots pass at 3 m."""
+    """Slots pass a point at 1 m, sqrt(3) m to either side; the gate is unsafe within 7 m of a disc, which slots pass at 3 m."""
     points = [20.0 - np.sqrt(3.0), 20.0 + np.sqrt(3.0), 45.0 - np.sqrt(3.0), 45.0 + np.sqrt(3.0)]
     gate = [60.0 - np.sqrt(40.0), 65.0 - np.sqrt(40.0), 70.0 + np.sqrt(40.0), 75.0 + np.sqrt(40.0)]
     batch = FormationBatch(paper(), worlds=200, interval=1, starts=Starts(exploring=1.0, focus=1.0, lead=3.0))
@@ -125,6 +125,18 @@ def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives()
     ahead = found - time[:, None]
     assert (((ahead > -0.03) & (ahead < 3.03)).any(axis=1)).all()
     assert (((ahead > -0.03) & (ahead < 3.03)).any(axis=0)).all()
+
+
+def test_a_turning_start_has_the_whole_team_told_to_take_the_other_formation():
+    batch = FormationBatch(paper(), worlds=60, starts=Starts(exploring=1.0, turning=0.5))
+    batch.reset(0)
+    commands = np.array(batch.scenario.orders.commands)[batch.world.state.command]
+    turning = (batch.age == 0.0).all(axis=1)
+    assert 15 < turning.sum() < 45
+    formation = batch.world.state.formation[:, None]
+    assert (commands[turning] == np.where(formation == 2, "FR", "FM")[turning]).all()
+    kept = np.where(formation == 2, "FM", "FR")[~turning]
+    assert np.char.endswith(commands[~turning], kept).all() and (batch.age[~turning] > 0.0).all()
 
 
 @given(
@@ -174,7 +186,7 @@ def test_ages_count_from_the_last_change_of_command():
         (lambda: PaperFormation("maze"), ["maze", "paper"]),
         (lambda: Starts(exploring=1.5), ["1.5"]),
         (lambda: Starts(length=0.0), ["0.0"]),
-        (lambda: Starts(focus=1.2), ["focused", "1.2"]),
+        (lambda: Starts(focus=1.2), ["focus", "1.2"]),
         (lambda: Starts(lead=-1.0), ["-1.0"]),
     ],
 )

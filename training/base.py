@@ -36,7 +36,7 @@ class BaseTrainer(ABC):
             interval=config.interval,
             state=config.state,
             actions=config.actions,
-            starts=Starts(config.exploring_starts, config.start_length, config.focus),
+            starts=make_starts(config),
         )
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -126,6 +126,11 @@ class BaseTrainer(ABC):
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
         return [(self, "state"), *((self.batch, name) for name in ("cut", "last", "age"))]
+
+
+def make_starts(config: TrainConfig) -> Starts:
+    """Where a run's episodes begin."""
+    return Starts(config.exploring_starts, config.start_length, config.focus, turning=config.turning)
 
 
 def prefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:

@@ -99,6 +99,8 @@ class TrainConfig:
     """Length of those episodes [s]."""
     focus: float = 0.0
     """Share of them that begin shortly before a slot of the formation comes too close to an obstacle, or is free again."""
+    turning: float = 0.0
+    """Share of them at which the whole team has just been told to take the other formation: what a joint change leads to."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""
@@ -133,6 +135,8 @@ class TrainConfig:
 
     learner: str = "lenient"
     """What becomes of a negative TD error: lenient, hysteretic (half of it counts), plain."""
+    least_leniency: float = 0.0
+    """L never falls below it: what cold states still overlook. Others' exploration is noise that never ends."""
     hash: str = "autoencoder"
     """States are hashed by the codes of an auto-encoder (autoencoder) or as they are (plain)."""
     bits: int = 16
@@ -143,6 +147,8 @@ class TrainConfig:
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.5
     """Share of explorations in which the whole team takes one random order."""
+    subsets: float = 0.0
+    """Share of these in which every agent stays out with probability 1/2: what happens when some lead and others must follow."""
     least_exploration: float = 0.03
     """Exploration never falls below it."""
     switching_margin: float = 0.1
@@ -165,7 +171,18 @@ class TrainConfig:
         for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in ("exploring_starts", "focus", "together", "least_exploration", "smoothing", "risk_gamma", "risk_limit"):
+        for name in (
+            "exploring_starts",
+            "focus",
+            "turning",
+            "together",
+            "subsets",
+            "least_leniency",
+            "least_exploration",
+            "smoothing",
+            "risk_gamma",
+            "risk_limit",
+        ):
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:

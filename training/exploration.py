@@ -1,4 +1,4 @@
-"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the whole team."""
+"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the team or a part of it."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ class Exploration:
     """Replaces a share T^zeta of the greedy actions by random ones. With ``hold=1, together=0`` it does so as printed.
 
     Args:
-        config: hold, together and least_exploration of it are used.
+        config: hold, together, subsets and least_exploration of it are used.
         agents: N.
         actions: A.
     """
@@ -30,7 +30,8 @@ class Exploration:
         free = self.left == 0
         team = (rng.random(len(chance)) < config.together * chance.mean(axis=1)) & free.all(axis=1)
         alone = (rng.random(chance.shape) < (1.0 - config.together) * chance) & free
-        begin = team[:, None] | alone
+        some = (rng.random(len(chance)) < config.subsets)[:, None] & (rng.random(chance.shape) < 0.5)
+        begin = (team[:, None] & ~some) | alone
         one = np.broadcast_to(rng.integers(self.actions, size=(len(chance), 1)), chance.shape)
         order = np.where(team[:, None], one, rng.integers(self.actions, size=chance.shape))
         one = np.broadcast_to(rng.integers(1, config.hold + 1, size=(len(chance), 1)), chance.shape)

@@ -71,6 +71,7 @@ class Trainer(BaseTrainer):
         best = greedy(self.learner.values(self.state), self.batch.last, self.batch.fresh, config.switching_margin)
         actions = self.exploration(best, warmth.mean(axis=-1), self.rng)
         self.explored = float((actions != best).mean())
+        lenient = leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0])
         outcome = self.batch.step(actions)
         reward, over, gone = self.judge(outcome)
         replay.store(
@@ -78,7 +79,7 @@ class Trainer(BaseTrainer):
             final=outcome.final_state,
             action=actions,
             reward=reward,
-            leniency=leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0]),
+            leniency=np.maximum(lenient, config.least_leniency),
             lost=gone,
             code=codes,
             ended=outcome.ended,
