@@ -53,7 +53,7 @@ class Starts:
     length: float = 20.0  # [s]
     focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
     lead: float = 8.0  # how long before, at the most [s]
-    turning: float = 0.0  # share of the exploring starts at which the whole team has just been told to take the other formation
+    turning: float = 0.0  # share of the exploring starts that are to begin with the whole team changing to the other formation
 
     def __post_init__(self) -> None:
         for name in ("exploring", "focus", "turning"):
@@ -137,6 +137,7 @@ class FormationBatch:
         self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which an episode ends
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
+        self.turn = np.full(worlds, -1)  # action with which the whole team is to begin the episode, by Starts.turning; -1: none
         self.rng = np.random.default_rng(0)
         self.critical = self._critical()
         parts = [name.split(SEPARATOR) for name in orders.commands]
@@ -203,6 +204,7 @@ class FormationBatch:
         state = self.world.state
         self.cut[mask] = self.scenario.mission_steps
         self.age[mask] = OLD
+        self.turn[mask] = -1
         for b in np.flatnonzero(mask):
             if self.rng.random() < self.starts.exploring:
                 self._explore(int(b))
@@ -219,8 +221,7 @@ class FormationBatch:
             positions = centre + scenario.formations[1]
         commands = self.rng.choice(self.keeping[which], size=scenario.agents)
         if self.rng.random() < self.starts.turning:
-            commands = np.full(scenario.agents, self.keeping[1 - which][0])
-            self.age[b] = 0.0
+            self.turn[b] = self.action_of[self.keeping[1 - which][0]]
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
 

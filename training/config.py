@@ -100,7 +100,8 @@ class TrainConfig:
     focus: float = 0.0
     """Share of them that begin shortly before a slot of the formation comes too close to an obstacle, or is free again."""
     turning: float = 0.0
-    """Share of them at which the whole team has just been told to take the other formation: what a joint change leads to."""
+    """Share of them that begin with the whole team changing to the other formation: what a joint change leads to. Nobody gains
+    from changing alone, so that without them a bad habit of the team can be everyone's best answer to it."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""

@@ -42,6 +42,12 @@ class Exploration:
         self.left = np.maximum(self.left - 1, 0)
         return np.asarray(chosen)
 
+    def begin(self, orders: np.ndarray, rng: np.random.Generator) -> None:
+        """Have whole teams take one order for 1 to ``hold`` decisions; ``orders`` (B,), -1 for teams that go on as they are."""
+        teams = orders >= 0
+        self.held[teams] = orders[teams, None]
+        self.left[teams] = rng.integers(1, self.config.hold + 1, size=(int(teams.sum()), 1))
+
     def forget(self, ended: np.ndarray) -> None:
         """Drop held orders of worlds whose episode ended; ``ended`` (B,)."""
         self.left[ended] = 0

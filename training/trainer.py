@@ -42,6 +42,7 @@ class Trainer(BaseTrainer):
         self.hash = StateHash(read.size, config.bits, config.hash, self.rng)
         self.temperatures = Temperatures(agents, 1 << config.bits, actions)
         self.exploration = Exploration(config, agents, actions)
+        self.exploration.begin(self.batch.turn, self.rng)
         self.first = np.zeros(config.worlds, dtype=np.int64)  # row at which each world's episode began
 
     @property
@@ -103,6 +104,7 @@ class Trainer(BaseTrainer):
             self.temperatures.cool(replay.arrays["code"], replay.arrays["action"], int(b), first, replay.count - 1)
         self.first[ended] = replay.count
         self.exploration.forget(ended)
+        self.exploration.begin(np.where(ended, self.batch.turn, -1), self.rng)
 
     def _learn(self, share: float) -> None:
         config = self.config
