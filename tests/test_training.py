@@ -13,11 +13,12 @@ from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import Shaping, TrainConfig, from_json, make_config
 from marlbc_mj.training.exploration import Exploration
-from marlbc_mj.training.learner import HYSTERESIS, Learner, td_weight
+from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.policy import Policy, admissible, greedy
 from marlbc_mj.training.replay import Batch, Replay
+from marlbc_mj.training.rivals import RLMS, VDN
 from marlbc_mj.training.trainer import lost, shaped_reward
 
 N, S, A = 3, 5, 4
@@ -192,6 +193,45 @@ def test_one_update_by_hand():
     assert reported == pytest.approx(error.abs().mean().item(), rel=1e-5)
     for p, gradient in zip(learner.network.parameters(), expected, strict=True):
         assert torch.allclose(p.grad, gradient, atol=1e-6)
+
+
+def gradients(net):
+    """(N, P) of every network in a row."""
+    return torch.cat([p.grad.flatten(start_dim=1) for p in net.parameters()], dim=1)
+
+
+@pytest.mark.parametrize("kind", [Learner, RLMS, VDN])
+def test_a_large_error_shortens_the_steps_of_its_own_network_only(kind):
+    """Each agent's gradient is clipped by itself where agents learn apart, all together where one loss trains them."""
+
+    def step(reward):
+        config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", risk_gamma=0.0)
+        learner = kind(config, 2, A, np.ones(S), generator())
+        rng = np.random.default_rng(0)
+        shape = (2, 8, S) if kind is RLMS else (8, S)
+        state = (100.0 * rng.normal(size=shape)).astype(np.float32)  # so that gradients are large
+        state[..., 0, :] *= 10.0
+        reward, none = np.tile(np.float32(reward), (8, 1)), np.zeros((8, 2), np.float32)
+        learner.update(Batch(state, rng.integers(A, size=(8, 2)), reward, none, state, none), 1e-3)
+        return gradients(learner.network)
+
+    calm, wild = step([0.0, 0.0]), step([0.0, 1e6])
+    assert wild[1].norm() > 9.9 or kind is VDN
+    if kind is VDN:
+        assert wild.norm() == pytest.approx(LARGEST_GRADIENT, rel=1e-4)
+    else:
+        assert torch.equal(calm[0], wild[0]) and (wild.norm(dim=1) <= LARGEST_GRADIENT * (1 + 1e-4)).all()
+
+
+@given(st.integers(0, 2**31 - 1), st.floats(0.01, 100.0))
+def test_clipping_keeps_each_direction_and_bounds_each_norm(seed, size):
+    net = network()
+    for p in net.parameters():
+        p.grad = size * torch.randn(p.shape, generator=generator(seed)) * torch.tensor([1e-3, 1.0, 10.0])[:, None, None]
+    before = gradients(net)
+    clip_each(net.parameters(), 5.0)
+    norms = before.norm(dim=1)
+    assert torch.allclose(gradients(net), before * (5.0 / norms).clamp(max=1.0)[:, None], rtol=1e-5)
 
 
 def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
