@@ -146,9 +146,10 @@ class TrainConfig:
     hold: int = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.5
-    """Share of explorations in which the whole team takes one random order."""
+    """Share of an agent's explorations in which it takes one random order with the whole team."""
     subsets: float = 0.0
-    """Share of these in which every agent stays out with probability 1/2: what happens when some lead and others must follow."""
+    """Share of joint explorations in which every agent stays out with probability 1/2 and acts as if there were none: what
+    happens when some lead and others must follow."""
     least_exploration: float = 0.03
     """Exploration never falls below it."""
     switching_margin: float = 0.1

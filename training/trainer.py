@@ -137,4 +137,4 @@ class Trainer(BaseTrainer):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
-        return [*super().plain_arrays(), (self, "first"), (self.exploration, "left"), (self.exploration, "held")]
+        return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held", "joins"))]
