@@ -151,6 +151,11 @@ class FormationBatch:
         return len(self.order_of)
 
     @property
+    def decisions(self) -> int:
+        """Decisions of a whole mission."""
+        return self.scenario.mission_steps // self.interval
+
+    @property
     def fresh(self) -> np.ndarray:
         """(B,) bool, no action is in force yet: the mission has just begun."""
         return np.asarray(self.world.state.steps == 0)
@@ -230,7 +235,7 @@ class FormationBatch:
 
     def _start(self, rng: np.random.Generator) -> int:
         """The decision with which an exploring start begins."""
-        last = self.scenario.mission_steps // self.interval - 1
+        last = self.decisions - 1
         if len(self.critical) and happens(self.starts.focus, rng):
             lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
             return min(max(round(rng.choice(self.critical) - lead), 0), last - 1)
@@ -238,7 +243,7 @@ class FormationBatch:
 
     def _critical(self) -> np.ndarray:
         """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
-        decisions = np.arange(self.scenario.mission_steps // self.interval) * self.interval
+        decisions = np.arange(self.decisions) * self.interval
         slots = [self._centre(step) + self.scenario.formations[0] for step in decisions]
         blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
         return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1

@@ -1,5 +1,6 @@
 """Parts of MARLMS against hand arithmetic and closed forms."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
-from marlbc_mj.training.config import Shaping, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import METHODS, PRESETS, Shaping, TrainConfig, from_json, make_config
 from marlbc_mj.training.exploration import Exploration, shares
 from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
@@ -19,7 +20,7 @@ from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.policy import Policy, admissible, greedy
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import RLMS, VDN
-from marlbc_mj.training.trainer import lost, shaped_reward
+from marlbc_mj.training.trainer import WARM_UP, Trainer, lost, shaped_reward
 
 N, S, A = 3, 5, 4
 
@@ -172,9 +173,10 @@ def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
         assert batch.action[m, 0] == start and batch.leniency[m, 0] == np.float32(0.1 * start)
 
 
-def test_one_update_by_hand():
+@pytest.mark.parametrize("huber", [1.0, 0.25, np.inf])
+def test_one_update_by_hand(huber):
     """Target r + gamma^n max of the averaged network, Huber slope, weight 0 for a negative error at L = 1."""
-    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0)
+    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0, huber=huber)
     learner = Learner(config, 2, A, np.ones(S), generator())
     rng = np.random.default_rng(0)
     state, after = (rng.normal(size=(2, S)).astype(np.float32) for _ in range(2))
@@ -187,7 +189,7 @@ def test_one_update_by_hand():
     target = torch.from_numpy(reward.T) + torch.from_numpy(discount.T) * ahead
     chosen = torch.stack([torch.stack([q[i, m, action[m, i]] for m in range(2)]) for i in range(2)])
     error = (target - chosen).detach()
-    slope = -torch.where(error > 0, error.clamp(-1, 1), torch.zeros(())) / 2  # mean over the batch
+    slope = -torch.where(error > 0, error.clamp(-huber, huber), torch.zeros(())) / 2  # mean over the batch
     expected = torch.autograd.grad(chosen, list(learner.network.parameters()), slope)
     reported = learner.update(batch, 0.0)
     assert reported == pytest.approx(error.abs().mean().item(), rel=1e-5)
@@ -434,6 +436,18 @@ def test_presets_and_json():
 
     config = make_config("fast", seed=4, hidden=(8, 9))
     assert from_json(plain_data(config)) == config
+    assert paper.huber == np.inf and from_json(json.loads(json.dumps(plain_data(paper), allow_nan=False))) == paper
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("method", METHODS)
+def test_no_own_cost_is_worth_paying(method, preset):
+    """The discounted cost of being out of formation for ever, sum of gamma^k centre interval, is below that of being lost."""
+    config = make_config(preset, **METHODS[method][0])
+    if config.shaping.own_violation_cost:
+        worst = sum(config.gamma**k * config.shaping.centre * config.interval for k in range(10_000))
+        assert worst == pytest.approx(config.shaping.centre * config.interval / (1 - config.gamma))
+        assert worst < config.shaping.own_violation_cost
 
 
 @pytest.mark.parametrize(
@@ -444,6 +458,7 @@ def test_presets_and_json():
         ({"state": "pixels"}, ["state", "pixels", "extended"]),
         ({"learner": "bold"}, ["learner", "bold", "lenient"]),
         ({"learning_rate": 0.0}, ["learning_rate", "0.0"]),
+        ({"huber": 0.0}, ["huber", "0.0"]),
         ({"hidden": ()}, ["hidden"]),
         ({"seed": -1}, ["seed", "-1"]),
         ({"capacity": 128}, ["capacity", "128"]),
@@ -460,3 +475,28 @@ def test_wrong_settings_are_named(changes, fragments):
 def test_unknown_preset():
     with pytest.raises(ConfigurationError, match="fast, paper"):
         make_config("slow")
+
+
+@pytest.mark.parametrize(("exploring_starts", "capacity", "rows"), [(0.0, 9_000, 100), (0.0, 5_400, 90), (0.5, 9_000, 84)])
+def test_states_are_hashed_once_the_buffer_has_seen_the_mission(exploring_starts, capacity, rows):
+    """After a whole mission's decisions where all episodes begin at the start, after the warm-up otherwise; only decisions that
+    have a code of their own cool a temperature.
+    """
+    config = make_config(
+        "fast", worlds=60, interval=20, hidden=(4,), batch=8, updates=1, capacity=capacity, threads=1,
+        exploring_starts=exploring_starts, start_length=20.0, hash="plain",
+    )  # fmt: skip
+    assert -(-WARM_UP // 60) == 84
+    trainer = Trainer(config)
+    for _ in range(rows):
+        trainer.advance()
+        assert not trainer.hash.fitted and np.isinf(trainer.temperatures.table).all()
+    trainer.advance()
+    assert trainer.hash.fitted
+    for _ in range(125 - rows):
+        trainer.advance()
+    coded = set(zip(*(a.ravel().tolist() for a in np.nonzero(np.isfinite(trainer.temperatures.table))), strict=True))
+    ring = np.arange(rows, trainer.replay.count) % trainer.replay.rows
+    codes, actions = (trainer.replay.arrays[name][ring] for name in ("code", "action"))
+    seen = {(i, int(c), int(a)) for i in range(4) for c, a in zip(codes.ravel(), actions[..., i].ravel(), strict=True)}
+    assert coded <= seen and (coded or not exploring_starts)
