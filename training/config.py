@@ -1,5 +1,6 @@
 """What a training run is: one frozen dataclass, and the presets of it."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -124,6 +125,8 @@ class TrainConfig:
     """Updates after each decision of all worlds."""
     capacity: int = 100_000
     """Transitions in the replay buffer."""
+    huber: float = 1.0
+    """TD errors beyond it count linearly in the loss instead of squared; inf is the squared error of (17)."""
 
     smoothing: float = 0.998
     """Of the running mean of the weights, which the greedy policy is made of; 0 takes the present ones."""
@@ -188,7 +191,7 @@ class TrainConfig:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
             raise ConfigurationError(f"gamma must be at least 0 and below 1, got {self.gamma}")
-        for name in ("learning_rate", "final_learning_rate", "cool_by", "start_length"):
+        for name in ("learning_rate", "final_learning_rate", "cool_by", "start_length", "huber"):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)}")
         for name, choices in CHOICES.items():
@@ -226,11 +229,11 @@ CHOICES = {
 
 CARE: dict[str, Any] = {
     "risk_gamma": 0.0,
-    "gamma": 0.95,
+    "gamma": 0.94,
     "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_violation_cost=2000.0, own_switch_cost=40.0),
 }
 """For methods without risks of every agent's orders: coming too close ends the agent's return with a cost that nothing exceeds,
-which bounds the discount factor: 2000 must be more than being out of formation for ever, 10 * interval / (1 - gamma)."""
+which bounds the discount factor: the cost must be more than being out of formation for ever, centre * interval / (1 - gamma)."""
 
 METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one an agent"),
@@ -281,6 +284,7 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             learning_rate=1e-4,
             final_learning_rate=1e-4,
             capacity=50_000,
+            huber=math.inf,
             worlds=16,
             batch=64,
             updates=1,
@@ -308,6 +312,7 @@ def from_json(data: dict[str, Any]) -> TrainConfig:
     try:
         shaping = Shaping(**_fields(data.pop("shaping")))
         ppo = PPO(**_fields(data.pop("ppo", {})))  # runs from before MAPPO have none
+        data = {name: math.inf if value == "inf" else value for name, value in data.items()}  # JSON has no infinity
         return TrainConfig(**{**data, "hidden": tuple(data["hidden"])}, shaping=shaping, ppo=ppo)
     except (KeyError, TypeError) as error:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error

@@ -94,7 +94,8 @@ class Learner:
         weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
         if batch.weight is not None:
             weight = weight * self._tensor(batch.weight.T)
-        loss = (nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
+        errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)
+        loss = (errors * weight).sum(dim=0).mean()
         if self.network.risk:
             loss = loss + self.risk_loss(batch, logits, least)
         self.optimiser.zero_grad()
