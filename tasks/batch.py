@@ -138,7 +138,7 @@ class FormationBatch:
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
         self.turn = np.full(worlds, -1)  # action with which the whole team is to begin the episode, by Starts.turning; -1: none
-        self.rng = np.random.default_rng(0)
+        self.rngs = streams(0, worlds)  # of the episodes that each world begins
         self.critical = self._critical()
         parts = [name.split(SEPARATOR) for name in orders.commands]
         known = sorted(command_of, key=lambda c: len(parts[c]))
@@ -152,13 +152,22 @@ class FormationBatch:
         return len(self.order_of)
 
     @property
+    def decisions(self) -> int:
+        """Decisions of a whole mission."""
+        return self.scenario.mission_steps // self.interval
+
+    @property
     def fresh(self) -> np.ndarray:
         """(B,) bool, no action is in force yet: the mission has just begun."""
         return np.asarray(self.world.state.steps == 0)
 
     def reset(self, seed: int = 0) -> np.ndarray:
-        """Start all episodes anew; (B, S) states."""
-        self.rng = np.random.default_rng(seed)
+        """Start all episodes anew; (B, S) states.
+
+        World b draws this and all later episodes from its own stream, (seed, b), so what it does depends on neither B nor the
+        other worlds.
+        """
+        self.rngs = streams(seed, self.world.worlds)
         self._restart(np.ones(self.world.worlds, dtype=bool))
         return self.states()
 
@@ -200,42 +209,42 @@ class FormationBatch:
 
     def _restart(self, mask: np.ndarray) -> None:
         """New episodes where ``mask`` is true."""
-        self.world.reset(int(self.rng.integers(2**31)), mask)
-        state = self.world.state
         self.cut[mask] = self.scenario.mission_steps
         self.age[mask] = OLD
         self.turn[mask] = -1
         for b in np.flatnonzero(mask):
-            if self.rng.random() < self.starts.exploring:
-                self._explore(int(b))
-            self.last[b] = self.action_of[state.command[b]]
+            rng = self.rngs[b]
+            self.world.reset(int(rng.integers(2**31)), np.arange(len(mask)) == b)
+            if happens(self.starts.exploring, rng):
+                self._explore(int(b), rng)
+            self.last[b] = self.action_of[self.world.state.command[b]]
 
-    def _explore(self, b: int) -> None:
+    def _explore(self, b: int, rng: np.random.Generator) -> None:
         scenario, state = self.scenario, self.world.state
-        step = self._start() * self.interval
-        which = int(self.rng.integers(2))
+        step = self._start(rng) * self.interval
+        which = int(rng.integers(2))
         centre = self._centre(step)
         positions = centre + scenario.formations[which]
         if which == 0 and self._blocked(positions, state.obstacles[b]).any():
             which = 1
             positions = centre + scenario.formations[1]
-        commands = self.rng.choice(self.keeping[which], size=scenario.agents)
-        if self.rng.random() < self.starts.turning:
+        commands = rng.choice(self.keeping[which], size=scenario.agents)
+        if happens(self.starts.turning, rng):
             self.turn[b] = self.action_of[self.keeping[1 - which][0]]
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
 
-    def _start(self) -> int:
+    def _start(self, rng: np.random.Generator) -> int:
         """The decision with which an exploring start begins."""
-        last = self.scenario.mission_steps // self.interval - 1
-        if len(self.critical) and self.rng.random() < self.starts.focus:
-            lead = self.rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
-            return min(max(round(self.rng.choice(self.critical) - lead), 0), last - 1)
-        return int(self.rng.integers(last))
+        last = self.decisions - 1
+        if len(self.critical) and happens(self.starts.focus, rng):
+            lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
+            return min(max(round(rng.choice(self.critical) - lead), 0), last - 1)
+        return int(rng.integers(last))
 
     def _critical(self) -> np.ndarray:
         """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
-        decisions = np.arange(self.scenario.mission_steps // self.interval) * self.interval
+        decisions = np.arange(self.decisions) * self.interval
         slots = [self._centre(step) + self.scenario.formations[0] for step in decisions]
         blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
         return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
@@ -248,3 +257,13 @@ class FormationBatch:
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
         """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
         return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
+
+
+def streams(seed: int, worlds: int) -> list[np.random.Generator]:
+    """A random stream for each of B worlds, (seed, b)."""
+    return [np.random.default_rng(np.random.SeedSequence([seed, b])) for b in range(worlds)]
+
+
+def happens(share: float, rng: np.random.Generator) -> bool:
+    """True in this share of all calls; what never happens draws no number, so that it leaves the stream to the rest."""
+    return share > 0 and rng.random() < share

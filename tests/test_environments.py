@@ -96,6 +96,36 @@ def test_worlds_of_a_vector_env_do_not_depend_on_their_number():
         assert (a[1] == b[1][:2]).all()
 
 
+@pytest.mark.parametrize("starts", [Starts(), Starts(0.7, 1.0), Starts(0.7, 0.5, focus=0.5, turning=0.5)])
+def test_worlds_do_not_depend_on_the_others_over_many_episodes(starts):
+    """World b does the same whatever B is and whatever orders the others get, over dozens of restarts of different lengths."""
+    small, large = (FormationBatch(paper(duration=4.0, perturbation=AROUND), worlds=n, starts=starts) for n in (2, 5))
+    assert (small.reset(4) == large.reset(4)[:2]).all()
+    rng, ends = np.random.default_rng(0), np.zeros(2, dtype=int)
+    for _ in range(120):
+        actions = rng.integers(4, size=(5, 4))
+        a, b = small.step(actions[:2]), large.step(actions)
+        ends += a.ended
+        for one, other in zip(a, b, strict=True):
+            assert np.array_equal(one, other[:2])
+    assert ends.min() >= 6
+
+
+def test_a_feature_that_never_happens_draws_no_number():
+    """Starts with a share of 0 leave the random stream as if they did not exist."""
+
+    def drawn(**shares):
+        batch = FormationBatch(paper(perturbation=AROUND), starts=Starts(**shares))
+        batch.reset(1)
+        return batch.rngs[0].bit_generator.state
+
+    plain = np.random.default_rng(np.random.SeedSequence([1, 0]))
+    plain.integers(2**31)
+    assert drawn() == plain.bit_generator.state != drawn(exploring=0.5)
+    assert drawn(exploring=1.0) != drawn(exploring=1.0, focus=0.5)
+    assert drawn(exploring=1.0) != drawn(exploring=1.0, turning=0.5)
+
+
 def test_exploring_starts_lie_on_the_route_and_are_cut():
     batch = FormationBatch(paper(), worlds=40, starts=Starts(exploring=1.0, length=2.0))
     batch.reset(0)

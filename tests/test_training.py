@@ -1,5 +1,6 @@
 """Parts of MARLMS against hand arithmetic and closed forms."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +12,15 @@ from hypothesis import strategies as st
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
-from marlbc_mj.training.config import Shaping, TrainConfig, from_json, make_config
-from marlbc_mj.training.exploration import Exploration
-from marlbc_mj.training.learner import HYSTERESIS, Learner, td_weight
+from marlbc_mj.training.config import METHODS, PRESETS, Shaping, TrainConfig, from_json, make_config
+from marlbc_mj.training.exploration import Exploration, shares
+from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.policy import Policy, admissible, greedy
 from marlbc_mj.training.replay import Batch, Replay
-from marlbc_mj.training.trainer import lost, shaped_reward
+from marlbc_mj.training.rivals import RLMS, VDN
+from marlbc_mj.training.trainer import WARM_UP, Trainer, lost, shaped_reward
 
 N, S, A = 3, 5, 4
 
@@ -171,9 +173,10 @@ def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
         assert batch.action[m, 0] == start and batch.leniency[m, 0] == np.float32(0.1 * start)
 
 
-def test_one_update_by_hand():
+@pytest.mark.parametrize("huber", [1.0, 0.25, np.inf])
+def test_one_update_by_hand(huber):
     """Target r + gamma^n max of the averaged network, Huber slope, weight 0 for a negative error at L = 1."""
-    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0)
+    config = replace(TrainConfig(), hidden=(6,), copies=2, capacity=4000, risk_gamma=0.0, huber=huber)
     learner = Learner(config, 2, A, np.ones(S), generator())
     rng = np.random.default_rng(0)
     state, after = (rng.normal(size=(2, S)).astype(np.float32) for _ in range(2))
@@ -186,12 +189,51 @@ def test_one_update_by_hand():
     target = torch.from_numpy(reward.T) + torch.from_numpy(discount.T) * ahead
     chosen = torch.stack([torch.stack([q[i, m, action[m, i]] for m in range(2)]) for i in range(2)])
     error = (target - chosen).detach()
-    slope = -torch.where(error > 0, error.clamp(-1, 1), torch.zeros(())) / 2  # mean over the batch
+    slope = -torch.where(error > 0, error.clamp(-huber, huber), torch.zeros(())) / 2  # mean over the batch
     expected = torch.autograd.grad(chosen, list(learner.network.parameters()), slope)
     reported = learner.update(batch, 0.0)
     assert reported == pytest.approx(error.abs().mean().item(), rel=1e-5)
     for p, gradient in zip(learner.network.parameters(), expected, strict=True):
         assert torch.allclose(p.grad, gradient, atol=1e-6)
+
+
+def gradients(net):
+    """(N, P) of every network in a row."""
+    return torch.cat([p.grad.flatten(start_dim=1) for p in net.parameters()], dim=1)
+
+
+@pytest.mark.parametrize("kind", [Learner, RLMS, VDN])
+def test_a_large_error_shortens_the_steps_of_its_own_network_only(kind):
+    """Each agent's gradient is clipped by itself where agents learn apart, all together where one loss trains them."""
+
+    def step(reward):
+        config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", risk_gamma=0.0)
+        learner = kind(config, 2, A, np.ones(S), generator())
+        rng = np.random.default_rng(0)
+        shape = (2, 8, S) if kind is RLMS else (8, S)
+        state = (100.0 * rng.normal(size=shape)).astype(np.float32)  # so that gradients are large
+        state[..., 0, :] *= 10.0
+        reward, none = np.tile(np.float32(reward), (8, 1)), np.zeros((8, 2), np.float32)
+        learner.update(Batch(state, rng.integers(A, size=(8, 2)), reward, none, state, none), 1e-3)
+        return gradients(learner.network)
+
+    calm, wild = step([0.0, 0.0]), step([0.0, 1e6])
+    assert wild[1].norm() > 9.9 or kind is VDN
+    if kind is VDN:
+        assert wild.norm() == pytest.approx(LARGEST_GRADIENT, rel=1e-4)
+    else:
+        assert torch.equal(calm[0], wild[0]) and (wild.norm(dim=1) <= LARGEST_GRADIENT * (1 + 1e-4)).all()
+
+
+@given(st.integers(0, 2**31 - 1), st.floats(0.01, 100.0))
+def test_clipping_keeps_each_direction_and_bounds_each_norm(seed, size):
+    net = network()
+    for p in net.parameters():
+        p.grad = size * torch.randn(p.shape, generator=generator(seed)) * torch.tensor([1e-3, 1.0, 10.0])[:, None, None]
+    before = gradients(net)
+    clip_each(net.parameters(), 5.0)
+    norms = before.norm(dim=1)
+    assert torch.allclose(gradients(net), before * (5.0 / norms).clamp(max=1.0)[:, None], rtol=1e-5)
 
 
 def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
@@ -254,6 +296,51 @@ def test_exploration_follows_the_temperature():
         chosen = explore(best, np.full(best.shape, temperature), rng)
         assert (chosen != 9).mean() == pytest.approx(temperature**0.999, abs=0.02)
         assert set(np.unique(chosen)) <= {0, 1, 2, 3, 9}
+
+
+@pytest.mark.parametrize("temperature", [[0.03] * N, [0.5] * N, [1.0] * N, [0.1, 0.6, 0.9]])
+@pytest.mark.parametrize(("hold", "together"), [(1, 0.0), (1, 0.5), (6, 0.0), (6, 0.5), (3, 1.0)])
+@pytest.mark.parametrize("subsets", [0.0, 0.4, 1.0])
+def test_the_share_of_random_orders_is_the_temperature(hold, together, subsets, temperature):
+    """In every decision of an episode, the first as well as later ones, for each agent, whatever is held and shared."""
+    worlds, decisions = 3000, 14
+    config = replace(
+        TrainConfig(), worlds=worlds, hold=hold, together=together, subsets=subsets, least_exploration=0.0, capacity=30_000
+    )
+    explore, rng, best = Exploration(config, N, A), np.random.default_rng(3), np.full((worlds, N), 9)
+    explore(best, np.ones(best.shape), rng)
+    explore.forget(np.ones(worlds, dtype=bool))
+    found = np.array([explore(best, np.tile(temperature, (worlds, 1)), rng) for _ in range(decisions)]) != 9
+    share = np.array(temperature) ** 0.999
+    error = np.sqrt(share * (1 - share) / worlds)
+    assert (abs(found.mean(axis=1) - share) <= 4.5 * error + 1e-9).all()
+    assert (abs(found.mean(axis=(0, 1)) - share) <= 4.5 * error * np.sqrt(min(hold, decisions) / decisions) + 1e-9).all()
+
+
+@given(st.lists(st.floats(0, 1), min_size=N, max_size=N), st.floats(0, 1), st.floats(0, 1))
+def test_joint_and_own_shares_make_up_the_whole(share, together, subsets):
+    joint, alone = shares(np.array([share]), together, subsets)
+    taking = joint[0] * (1.0 - subsets / 2)
+    assert 0 <= joint[0] <= 1 and (alone >= 0).all() and (alone <= 1).all()
+    assert np.allclose(taking + (1 - taking) * alone, share, atol=1e-9)
+    if max(share) == min(share) and joint[0] < 1:
+        assert taking == pytest.approx(together * share[0])
+
+
+def test_of_equal_agents_explorations_the_share_together_is_joint():
+    """A share ``together`` of an agent's random orders are the team's; with subsets, some agents are left to themselves."""
+    best, rng = np.full((3000, N), 9), np.random.default_rng(0)
+    for together, subsets in ((0.5, 0.0), (0.3, 1.0)):
+        config = replace(TrainConfig(), worlds=3000, hold=4, together=together, subsets=subsets, capacity=30_000)
+        explore = Exploration(config, N, 10_000)
+        explored = joint = 0
+        for _ in range(20):
+            chosen = explore(best, np.full(best.shape, 0.4), rng)
+            mine = chosen[:, 0] != 9
+            explored += mine.sum()
+            joint += (mine & (chosen[:, :1] == chosen[:, 1:]).any(axis=1)).sum()
+        seen = 1.0 if subsets == 0.0 else 1.0 - 0.5 ** (N - 1)  # of the joint ones, how many have a second member
+        assert joint / explored == pytest.approx(together * seen, abs=0.02)
 
 
 def test_held_orders_last_and_are_shared():
@@ -349,6 +436,18 @@ def test_presets_and_json():
 
     config = make_config("fast", seed=4, hidden=(8, 9))
     assert from_json(plain_data(config)) == config
+    assert paper.huber == np.inf and from_json(json.loads(json.dumps(plain_data(paper), allow_nan=False))) == paper
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("method", METHODS)
+def test_no_own_cost_is_worth_paying(method, preset):
+    """The discounted cost of being out of formation for ever, sum of gamma^k centre interval, is below that of being lost."""
+    config = make_config(preset, **METHODS[method][0])
+    if config.shaping.own_violation_cost:
+        worst = sum(config.gamma**k * config.shaping.centre * config.interval for k in range(10_000))
+        assert worst == pytest.approx(config.shaping.centre * config.interval / (1 - config.gamma))
+        assert worst < config.shaping.own_violation_cost
 
 
 @pytest.mark.parametrize(
@@ -359,6 +458,7 @@ def test_presets_and_json():
         ({"state": "pixels"}, ["state", "pixels", "extended"]),
         ({"learner": "bold"}, ["learner", "bold", "lenient"]),
         ({"learning_rate": 0.0}, ["learning_rate", "0.0"]),
+        ({"huber": 0.0}, ["huber", "0.0"]),
         ({"hidden": ()}, ["hidden"]),
         ({"seed": -1}, ["seed", "-1"]),
         ({"capacity": 128}, ["capacity", "128"]),
@@ -375,3 +475,28 @@ def test_wrong_settings_are_named(changes, fragments):
 def test_unknown_preset():
     with pytest.raises(ConfigurationError, match="fast, paper"):
         make_config("slow")
+
+
+@pytest.mark.parametrize(("exploring_starts", "capacity", "rows"), [(0.0, 9_000, 100), (0.0, 5_400, 90), (0.5, 9_000, 84)])
+def test_states_are_hashed_once_the_buffer_has_seen_the_mission(exploring_starts, capacity, rows):
+    """After a whole mission's decisions where all episodes begin at the start, after the warm-up otherwise; only decisions that
+    have a code of their own cool a temperature.
+    """
+    config = make_config(
+        "fast", worlds=60, interval=20, hidden=(4,), batch=8, updates=1, capacity=capacity, threads=1,
+        exploring_starts=exploring_starts, start_length=20.0, hash="plain",
+    )  # fmt: skip
+    assert -(-WARM_UP // 60) == 84
+    trainer = Trainer(config)
+    for _ in range(rows):
+        trainer.advance()
+        assert not trainer.hash.fitted and np.isinf(trainer.temperatures.table).all()
+    trainer.advance()
+    assert trainer.hash.fitted
+    for _ in range(125 - rows):
+        trainer.advance()
+    coded = set(zip(*(a.ravel().tolist() for a in np.nonzero(np.isfinite(trainer.temperatures.table))), strict=True))
+    ring = np.arange(rows, trainer.replay.count) % trainer.replay.rows
+    codes, actions = (trainer.replay.arrays[name][ring] for name in ("code", "action"))
+    seen = {(i, int(c), int(a)) for i in range(4) for c, a in zip(codes.ravel(), actions[..., i].ravel(), strict=True)}
+    assert coded <= seen and (coded or not exploring_starts)

@@ -107,7 +107,7 @@ class BaseTrainer(ABC):
         }
         scalars = {
             "rng": self.rng.bit_generator.state,
-            "starts_rng": self.batch.rng.bit_generator.state,
+            "starts_rngs": [rng.bit_generator.state for rng in self.batch.rngs],
             "steps": self.steps,
             "error": self.error,
         }
@@ -120,7 +120,8 @@ class BaseTrainer(ABC):
             setattr(owner, name, arrays[name].copy())
         self.generator.set_state(torch.from_numpy(arrays["generator"].copy()))
         self.rng.bit_generator.state = scalars["rng"]
-        self.batch.rng.bit_generator.state = scalars["starts_rng"]
+        for rng, state in zip(self.batch.rngs, scalars["starts_rngs"], strict=True):
+            rng.bit_generator.state = state
         self.steps, self.error = scalars["steps"], scalars["error"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:

@@ -34,6 +34,11 @@ class StateHash:
             "fitted": np.zeros(1, dtype=np.float32),
         }
 
+    @property
+    def fitted(self) -> bool:
+        """Whether codes tell states apart yet."""
+        return bool(self.arrays["fitted"][0])
+
     def fit(self, states: np.ndarray, generator: torch.Generator) -> float:
         """Train the auto-encoder on states (M, S), then keep it; returns the last reconstruction error (mean square)."""
         error = 0.0
@@ -74,7 +79,7 @@ class StateHash:
 
     def __call__(self, states: np.ndarray) -> np.ndarray:
         """(B,) int64 codes of scaled states (B, S)."""
-        if not self.arrays["fitted"][0]:
+        if not self.fitted:
             return np.zeros(len(states), dtype=np.int64)
         signs = (self._encode(states) - self.arrays["mean"]) @ self.arrays["projection"] > 0
         return np.asarray(signs @ (1 << np.arange(self.bits)))

@@ -1,5 +1,6 @@
 """What a training run is: one frozen dataclass, and the presets of it."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -125,6 +126,8 @@ class TrainConfig:
     """Updates after each decision of all worlds."""
     capacity: int = 100_000
     """Transitions in the replay buffer."""
+    huber: float = 1.0
+    """TD errors beyond it count linearly in the loss instead of squared; inf is the squared error of (17)."""
 
     smoothing: float = 0.998
     """Of the running mean of the weights, which the greedy policy is made of; 0 takes the present ones."""
@@ -147,9 +150,10 @@ class TrainConfig:
     hold: int = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.5
-    """Share of explorations in which the whole team takes one random order."""
+    """Share of an agent's explorations in which it takes one random order with the whole team."""
     subsets: float = 0.0
-    """Share of these in which every agent stays out with probability 1/2: what happens when some lead and others must follow."""
+    """Share of joint explorations in which every agent stays out with probability 1/2 and acts as if there were none: what
+    happens when some lead and others must follow."""
     least_exploration: float = 0.03
     """Exploration never falls below it."""
     switching_margin: float = 0.1
@@ -188,7 +192,7 @@ class TrainConfig:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
             raise ConfigurationError(f"gamma must be at least 0 and below 1, got {self.gamma}")
-        for name in ("learning_rate", "final_learning_rate", "cool_by", "start_length"):
+        for name in ("learning_rate", "final_learning_rate", "cool_by", "start_length", "huber"):
             if not getattr(self, name) > 0:
                 raise ConfigurationError(f"{name} must be positive, got {getattr(self, name)}")
         for name, choices in CHOICES.items():
@@ -226,11 +230,11 @@ CHOICES = {
 
 CARE: dict[str, Any] = {
     "risk_gamma": 0.0,
-    "gamma": 0.95,
+    "gamma": 0.94,
     "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_violation_cost=2000.0, own_switch_cost=40.0),
 }
 """For methods without risks of every agent's orders: coming too close ends the agent's return with a cost that nothing exceeds,
-which bounds the discount factor: 2000 must be more than being out of formation for ever, 10 * interval / (1 - gamma)."""
+which bounds the discount factor: the cost must be more than being out of formation for ever, centre * interval / (1 - gamma)."""
 
 METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one an agent"),
@@ -281,6 +285,7 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             learning_rate=1e-4,
             final_learning_rate=1e-4,
             capacity=50_000,
+            huber=math.inf,
             worlds=16,
             batch=64,
             updates=1,
@@ -308,6 +313,7 @@ def from_json(data: dict[str, Any]) -> TrainConfig:
     try:
         shaping = Shaping(**_fields(data.pop("shaping")))
         ppo = PPO(**_fields(data.pop("ppo", {})))  # runs from before MAPPO have none
+        data = {name: math.inf if value == "inf" else value for name, value in data.items()}  # JSON has no infinity
         return TrainConfig(**{**data, "hidden": tuple(data["hidden"])}, shaping=shaping, ppo=ppo)
     except (KeyError, TypeError) as error:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error

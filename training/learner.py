@@ -15,7 +15,8 @@ from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
 """Weight of a negative TD error of a hysteretic learner (Omidshafiei et al. 2017)."""
-LARGEST_GRADIENT = 10.0  # norm
+LARGEST_GRADIENT = 10.0
+"""Norm that a gradient is scaled down to: of each network where they learn apart, of all parameters where one loss trains all."""
 
 
 class Learner:
@@ -29,6 +30,7 @@ class Learner:
         mask: (N, S) of 0 and 1, the entries of the state that each agent's network sees; all by default.
     """
 
+    joint = False  # whether one loss trains all networks
     own_state = False  # whether the networks want a mask of each agent's own entries
     prioritised = False  # whether transitions are to be drawn by their TD errors
 
@@ -92,13 +94,14 @@ class Learner:
         weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
         if batch.weight is not None:
             weight = weight * self._tensor(batch.weight.T)
-        loss = (nn.functional.smooth_l1_loss(chosen, target, reduction="none") * weight).sum(dim=0).mean()
+        errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)
+        loss = (errors * weight).sum(dim=0).mean()
         if self.network.risk:
             loss = loss + self.risk_loss(batch, logits, least)
         self.optimiser.zero_grad()
         loss.backward()
         self.network.forget_unseen()
-        nn.utils.clip_grad_norm_(self.parameters, LARGEST_GRADIENT)
+        self._clip()
         self.optimiser.step()
         self.updates += 1
         self._smooth()
@@ -106,6 +109,12 @@ class Learner:
             self.push()
         self.errors = error.abs().cpu().numpy()
         return float(error.abs().mean())
+
+    def _clip(self) -> None:
+        if self.joint:
+            nn.utils.clip_grad_norm_(self.parameters, LARGEST_GRADIENT)
+        else:
+            clip_each(self.parameters, LARGEST_GRADIENT)
 
     @torch.no_grad()
     def _smooth(self) -> None:
@@ -169,6 +178,19 @@ class Learner:
 
     def _tensor(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
+
+
+@torch.no_grad()
+def clip_each(parameters: Iterable[nn.Parameter], largest: float) -> None:
+    """Scale every network's gradient down to the norm ``largest``; parameters (N, ., .) hold network i at index i.
+
+    The networks of agents that learn apart so stay apart: one's large error leaves the others' steps alone.
+    """
+    gradients = [p.grad for p in parameters if p.grad is not None]
+    norm = torch.stack([g.square().sum(dim=(1, 2)) for g in gradients]).sum(dim=0).sqrt()  # (N,)
+    factor = (largest / (norm + 1e-6)).clamp(max=1.0)[:, None, None]
+    for gradient in gradients:
+        gradient *= factor
 
 
 def td_weight(error: Tensor, leniency: Tensor, kind: str, generator: torch.Generator) -> Tensor:

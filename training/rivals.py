@@ -24,6 +24,8 @@ class VDN(Learner):
     Target: sum over the agents of r_i + gamma_i max_b Q_i(s', b), Q_i averaged over the past networks.
     """
 
+    joint = True
+
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the team's action and its target."""
         chosen, target = super().estimates(batch, now, ahead)
@@ -76,6 +78,8 @@ class QMIX(Learner):
     max_b Q_i(s', b), averaged over past networks, by a mixer that is copied whenever a network joins the past ones.
     """
 
+    joint = True
+
     def __init__(
         self,
         config: TrainConfig,
@@ -120,6 +124,8 @@ class Central(Learner):
     Target: r + gamma Q(s', argmax_b Q(s', b)), the argmax by the present network, its value by the averaged past ones; reward
     and end of the team's return as in :class:`QMIX`.
     """
+
+    joint = True
 
     def __init__(
         self,

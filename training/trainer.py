@@ -20,7 +20,7 @@ from marlbc_mj.training.rivals import learner_class, own_entries
 __all__ = ["LATE_TEMPERATURE", "WARM_UP", "Trainer", "lost", "shaped_reward"]
 
 WARM_UP = 5_000
-"""Transitions before the states are hashed and the networks updated."""
+"""Transitions before the networks are updated, and the states hashed at the earliest."""
 LATE_TEMPERATURE = 0.05
 """The largest temperature after ``cool_by`` of the budget."""
 
@@ -65,7 +65,7 @@ class Trainer(BaseTrainer):
         config, replay = self.config, self.replay
         share = self.steps / config.budget
         self.temperatures.nu = max(math.exp(math.log(LATE_TEMPERATURE) * share / config.cool_by), 1e-6)
-        if not self.hash.arrays["fitted"][0] and replay.count * config.worlds >= WARM_UP:
+        if not self.hash.fitted and self._seen_enough():
             self._fit_hash()
         codes = self.hash((self.state / self.batch.read.scale).astype(np.float32))
         warmth = self.temperatures.read(codes)
@@ -93,13 +93,23 @@ class Trainer(BaseTrainer):
             self._learn(share)
         return outcome
 
+    def _seen_enough(self) -> bool:
+        """Whether the buffer holds states of the whole mission: after WARM_UP transitions where episodes begin anywhere, else
+        after a whole one, or as much of it as the buffer has room for.
+        """
+        mission = 0 if self.config.exploring_starts else self.batch.decisions
+        rows = self.replay.count
+        return rows * self.config.worlds >= WARM_UP and rows >= min(mission, self.replay.rows)
+
     def _fit_hash(self) -> None:
+        """Fit the hash to the buffer's states; episodes count as begun now, so that decisions without a code cool nothing."""
+        self.first[:] = self.replay.count
         states = self.replay.arrays["state"][: self.replay.count].reshape(-1, self.batch.read.size)
         self.hash.fit((states / self.batch.read.scale).astype(np.float32), self.generator)
 
     def _end_episodes(self, ended: np.ndarray) -> None:
         replay = self.replay
-        for b in np.flatnonzero(ended):
+        for b in np.flatnonzero(ended) if self.hash.fitted else ():
             first = max(int(self.first[b]), replay.count - replay.rows)
             self.temperatures.cool(replay.arrays["code"], replay.arrays["action"], int(b), first, replay.count - 1)
         self.first[ended] = replay.count
@@ -139,4 +149,4 @@ class Trainer(BaseTrainer):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
-        return [*super().plain_arrays(), (self, "first"), (self.exploration, "left"), (self.exploration, "held")]
+        return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held", "joins"))]
