@@ -238,13 +238,13 @@ class FormationBatch:
         last = self.decisions - 1
         if len(self.critical) and happens(self.starts.focus, rng):
             lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
-            return min(max(round(rng.choice(self.critical) - lead), 0), last - 1)
+            return min(max(round(float(rng.choice(self.critical)) - lead), 0), last - 1)
         return int(rng.integers(last))
 
     def _critical(self) -> np.ndarray:
         """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
         decisions = np.arange(self.decisions) * self.interval
-        slots = [self._centre(step) + self.scenario.formations[0] for step in decisions]
+        slots = [self._centre(int(step)) + self.scenario.formations[0] for step in decisions]
         blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
         return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
 
