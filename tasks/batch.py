@@ -125,6 +125,10 @@ class FormationBatch:
             raise ConfigurationError(
                 f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
             )
+        if starts and starts.exploring and interval == scenario.mission_steps:
+            raise ConfigurationError(
+                f"exploring starts need more than one decision in a mission of {interval} mission steps, got interval {interval}"
+            )
         orders = scenario.orders
         self.scenario = scenario
         self.interval = interval

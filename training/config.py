@@ -1,6 +1,7 @@
 """What a training run is: one frozen dataclass, and the presets of it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +13,9 @@ class Shaping:
     """The reward that a learner sees, made from the printed terms. The defaults leave the printed reward as it is.
 
     Evaluation never uses it: returns are those of (13).
+
+    Raises:
+        ConfigurationError: a value that cannot be run.
     """
 
     centre: float = 0.0
@@ -33,6 +37,10 @@ class Shaping:
     """What a switch costs more where the order before has been in force for less than ``dwell``."""
     dwell: float = 4.0
     """How long an order should be in force [s]."""
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise ConfigurationError(f"shaping.scale must be positive, got {self.scale}")
 
 
 @dataclass(frozen=True)
@@ -172,21 +180,12 @@ class TrainConfig:
     """Device of the networks: cpu or cuda."""
 
     def __post_init__(self) -> None:
-        for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
+        for name in AT_LEAST_ONE:
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in (
-            "exploring_starts",
-            "focus",
-            "turning",
-            "together",
-            "subsets",
-            "least_leniency",
-            "least_exploration",
-            "smoothing",
-            "risk_gamma",
-            "risk_limit",
-        ):
+        if self.bits > MOST_BITS:
+            raise ConfigurationError(f"bits must be at most {MOST_BITS}, got {self.bits}: the tables have 2^bits rows an agent")
+        for name in SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
@@ -203,6 +202,12 @@ class TrainConfig:
             raise ConfigurationError(
                 f"risks are learned from single decisions: n_step must be 1 with risk_gamma, got {self.n_step}"
             )
+        if self.risk_gamma and self.method in WITHOUT_RISKS:
+            raise ConfigurationError(f"method {self.method} learns no risks: risk_gamma must be 0, got {self.risk_gamma}")
+        if self.risk_gamma and not self.risk_limit:
+            raise ConfigurationError(f"risk_limit must be above 0 with risk_gamma {self.risk_gamma}, got {self.risk_limit}")
+        if not self.save_every >= 0:
+            raise ConfigurationError(f"save_every must not be negative, got {self.save_every}")
         if not self.hidden or min(self.hidden) < 1:
             raise ConfigurationError(f"hidden layers must have at least one unit, got {self.hidden}")
         if self.seed < 0:
@@ -218,6 +223,18 @@ class TrainConfig:
         """Decisions of all worlds that the replay buffer holds."""
         return self.capacity // self.worlds
 
+
+AT_LEAST_ONE = (
+    *("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "updates", "bits", "hold", "evaluate_every"),
+    "threads",
+)
+SHARES = (
+    *("exploring_starts", "focus", "turning", "together", "subsets", "least_leniency", "least_exploration", "smoothing"),
+    *("risk_gamma", "risk_limit"),
+)
+MOST_BITS = 24
+WITHOUT_RISKS = ("central", "rlms", "mappo")
+"""Methods whose networks have no risks of every agent's orders, or none that anything is learned from."""
 
 CHOICES = {
     "state": ("extended", "printed"),
@@ -318,7 +335,15 @@ def from_json(data: dict[str, Any]) -> TrainConfig:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error
 
 
-def _fields(data: dict[str, Any]) -> dict[str, Any]:
+def flat_settings(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON data of a configuration with nested settings under ``outer.inner``, without the types' names."""
+    flat: dict[str, Any] = {}
+    for name, value in _fields(data).items():
+        flat |= {f"{name}.{key}": entry for key, entry in _fields(value).items()} if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in data.items() if name != "type"}
 
 
