@@ -11,6 +11,9 @@ from typing import Any
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.provenance import plain_data
 
+PARTIAL = ".partial-"
+"""In the name of what is not whole yet, before the number of the process that writes it."""
+
 
 @contextmanager
 def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
@@ -20,7 +23,7 @@ def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         ConfigurationError: ``out`` is not empty (and ``overwrite`` is off), is a file, or cannot be written.
     """
     check_folder(out, overwrite=overwrite)
-    staging = out.with_name(f"{out.name}.partial-{os.getpid()}")
+    staging = out.with_name(f"{out.name}{PARTIAL}{os.getpid()}")
     _begin(out, staging.mkdir)
     try:
         yield staging
@@ -40,11 +43,27 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 def _begin(out: Path, create: Callable[[], None]) -> None:
     """Make the folder of ``out``, then what stands in for it; ConfigurationError where that cannot be done."""
-    try:
+    with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         create()
+
+
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """What the system refuses inside the block, no space left for example, is one line about ``out``."""
+    try:
+        yield
     except OSError as error:
-        raise ConfigurationError(f"cannot write {out}: {error.strerror}") from error
+        raise ConfigurationError(f"cannot write {out}: {error.strerror or error}") from error
+
+
+def _sync(path: Path) -> None:
+    """Have a file or a folder on the disk, so that it outlives a loss of power."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _replace(out: Path, staging: Path) -> None:
@@ -58,19 +77,34 @@ def _replace(out: Path, staging: Path) -> None:
 
 @contextmanager
 def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary path beside ``path``, with its suffix, that becomes ``path`` when the block ends well.
+    """A temporary path beside ``path``, with its suffix, that becomes ``path``, on the disk, when the block ends well.
 
     Raises:
-        ConfigurationError: ``path`` exists (and ``overwrite`` is off) or its folder cannot be written.
+        ConfigurationError: ``path`` exists (and ``overwrite`` is off), or the system refuses what the block or this does to
+            write it.
     """
     check_target(path, overwrite=overwrite)
-    staging = path.with_name(f".{path.stem}.partial-{os.getpid()}{path.suffix}")
+    staging = path.with_name(f".{path.stem}{PARTIAL}{os.getpid()}{path.suffix}")
     _begin(path, staging.touch)
     try:
-        yield staging
-        staging.replace(path)
+        with writing(path):
+            yield staging
+            _sync(staging)
+            staging.replace(path)
+            _sync(path.parent)
     finally:
         staging.unlink(missing_ok=True)
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Remove what :func:`staged_file` left in ``folder`` and below where a process was killed while it wrote.
+
+    Raises:
+        ConfigurationError: the system refuses it.
+    """
+    for path in folder.rglob(f".*{PARTIAL}*"):
+        with writing(path):
+            path.unlink(missing_ok=True)
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:

@@ -1,7 +1,8 @@
 """B missions at once for a learner: a decision every few mission steps, rewards by term, episodes that restart by themselves."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -124,6 +125,10 @@ class FormationBatch:
             raise ConfigurationError(
                 f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
             )
+        if starts and starts.exploring and interval == scenario.mission_steps:
+            raise ConfigurationError(
+                f"exploring starts need more than one decision in a mission of {interval} mission steps, got interval {interval}"
+            )
         orders = scenario.orders
         self.scenario = scenario
         self.interval = interval
@@ -138,7 +143,7 @@ class FormationBatch:
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.age = np.full((worlds, scenario.agents), OLD)  # how long every command has been in force [s]; at first, long
         self.turn = np.full(worlds, -1)  # action with which the whole team is to begin the episode, by Starts.turning; -1: none
-        self.rngs = streams(0, worlds)  # of the episodes that each world begins
+        self.rngs = [stream(0, b) for b in range(worlds)]  # of the episodes that each world begins
         self.critical = self._critical()
         parts = [name.split(SEPARATOR) for name in orders.commands]
         known = sorted(command_of, key=lambda c: len(parts[c]))
@@ -161,14 +166,32 @@ class FormationBatch:
         """(B,) bool, no action is in force yet: the mission has just begun."""
         return np.asarray(self.world.state.steps == 0)
 
-    def reset(self, seed: int = 0) -> np.ndarray:
-        """Start all episodes anew; (B, S) states.
+    def reset(self, seed: int | Sequence[int | None] = 0, mask: np.ndarray | None = None) -> np.ndarray:
+        """Start episodes anew; (B, S) states.
 
         World b draws this and all later episodes from its own stream, (seed, b), so what it does depends on neither B nor the
         other worlds.
+
+        Args:
+            seed: of all worlds, or one for each; where it is None, the world's stream goes on.
+            mask: (B,) bool, the worlds that start anew; all by default.
+
+        Raises:
+            ConfigurationError: a negative seed, another number of seeds than worlds, or a mask that is not (B,) bool.
         """
-        self.rngs = streams(seed, self.world.worlds)
-        self._restart(np.ones(self.world.worlds, dtype=bool))
+        worlds = self.world.worlds
+        seeds = [seed] * worlds if isinstance(seed, int | np.integer) else list(seed)
+        if len(seeds) != worlds or any(s is not None and s < 0 for s in seeds):
+            raise ConfigurationError(f"a seed must not be negative, and a list of them must have {worlds}, got {seed}")
+        chosen = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask)
+        if chosen.shape != (worlds,) or chosen.dtype != np.bool_:
+            raise ConfigurationError(
+                f"the mask of a reset must be bool with shape ({worlds},), got {chosen.dtype} with shape {chosen.shape}"
+            )
+        for b in np.flatnonzero(chosen).tolist():
+            given = seeds[b]
+            self.rngs[b] = self.rngs[b] if given is None else stream(given, b)
+        self._restart(chosen)
         return self.states()
 
     def states(self) -> np.ndarray:
@@ -176,10 +199,16 @@ class FormationBatch:
         return self.read(self.world.observe(), self.world.state.obstacles, self.age)
 
     def step(self, actions: np.ndarray) -> Outcome:
-        """One decision of every team; ``actions`` (B, N) are indices into the action set."""
+        """One decision of every team; ``actions`` (B, N) are indices into the action set.
+
+        Raises:
+            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+            SimulationError: a world diverged.
+        """
+        actions = self._checked(actions)
         state = self.world.state
         orders = self.order_of[actions]
-        self.last = actions.copy()
+        self.last = actions
         before, started = state.command.copy(), state.steps > 0
         worlds = self.world.worlds
         reward, formation, violation = np.zeros(worlds), np.zeros(worlds), np.zeros(worlds)
@@ -206,6 +235,23 @@ class FormationBatch:
             now, final, formation, violation, reward - formation - violation, switches, clearance, age,
             np.full(worlds, self.interval), terminal, truncated,
         )  # fmt: skip
+
+    def _checked(self, actions: Any) -> np.ndarray:
+        """A copy of ``actions`` as (B, N) int64, because the compiled loop trusts what it is given."""
+        shape, most = self.last.shape, self.actions - 1
+        try:
+            given = np.asarray(actions)
+        except ValueError:
+            raise ConfigurationError(f"actions must have shape {shape} (worlds, agents), got {actions}") from None
+        if given.dtype.kind not in "iu":
+            raise ConfigurationError(f"actions must be whole numbers from 0 to {most}, got {given.dtype}: {given.tolist()}")
+        if given.shape != shape:
+            raise ConfigurationError(f"actions must have shape {shape} (worlds, agents), got {given.shape}")
+        wrong = np.argwhere((given < 0) | (given > most))
+        if len(wrong):
+            b, i = wrong[0].tolist()
+            raise ConfigurationError(f"actions must be from 0 to {most}, got {given[b, i]} for world {b}, agent {i + 1}")
+        return given.astype(np.int64)
 
     def _restart(self, mask: np.ndarray) -> None:
         """New episodes where ``mask`` is true."""
@@ -239,13 +285,13 @@ class FormationBatch:
         last = self.decisions - 1
         if len(self.critical) and happens(self.starts.focus, rng):
             lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
-            return min(max(round(rng.choice(self.critical) - lead), 0), last - 1)
+            return min(max(round(float(rng.choice(self.critical)) - lead), 0), last - 1)
         return int(rng.integers(last))
 
     def _critical(self) -> np.ndarray:
         """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
         decisions = np.arange(self.decisions) * self.interval
-        slots = [self._centre(step) + self.scenario.formations[0] for step in decisions]
+        slots = [self._centre(int(step)) + self.scenario.formations[0] for step in decisions]
         blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
         return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
 
@@ -259,9 +305,9 @@ class FormationBatch:
         return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
 
 
-def streams(seed: int, worlds: int) -> list[np.random.Generator]:
-    """A random stream for each of B worlds, (seed, b)."""
-    return [np.random.default_rng(np.random.SeedSequence([seed, b])) for b in range(worlds)]
+def stream(seed: int, world: int) -> np.random.Generator:
+    """The random stream of one world, (seed, b)."""
+    return np.random.default_rng(np.random.SeedSequence([seed, world]))
 
 
 def happens(share: float, rng: np.random.Generator) -> bool:

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from marlbc_mj.controllers import Controller
+from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
 from marlbc_mj.tasks.states import State
@@ -73,8 +74,12 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.batch.reset(int(self.np_random.integers(2**31)))[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One decision; ``action`` (N,)."""
-        outcome = self.batch.step(np.asarray(action, dtype=np.int64)[None])
+        """One decision; ``action`` (N,).
+
+        Raises:
+            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+        """
+        outcome = self.batch.step(np.asarray(action)[None])
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
         return outcome.final_state[0], float(outcome.reward[0]), bool(outcome.terminal[0]), False, info
 
@@ -82,7 +87,8 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
 class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """B teams in one World, stepped by the compiled loop; episodes restart in the step that ends them (same-step autoreset).
 
-    The state that an episode ended in is ``infos["final_obs"]``, valid where ``infos["_final_obs"]`` is true.
+    As Gymnasium's SyncVectorEnv has it: what the last decision of an episode led to is in ``infos["final_obs"]`` and
+    ``infos["final_info"]``, valid where ``infos["_final_obs"]`` is true; the terms in ``infos`` itself are of the other worlds.
 
     Args:
         num_envs: B.
@@ -127,20 +133,43 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin B episodes. World b of one ``seed`` does the same for any B."""
-        first = seed[0] if isinstance(seed, list) else seed
-        super().reset(seed=first)
-        return self.batch.reset(int(self.np_random.integers(2**31))), {}
+        """Begin episodes. World b of one ``seed`` does the same for any B.
+
+        Args:
+            seed: of all worlds, or a list with one for each; a world whose entry is None goes on with its random numbers.
+            options: ``"reset_mask"`` (B,) bool chooses the worlds that begin anew; all by default.
+
+        Raises:
+            ConfigurationError: a list or a mask of another length than B, or a mask without a world.
+        """
+        mask = (options or {}).get("reset_mask")
+        if mask is not None and not np.any(mask):
+            raise ConfigurationError("options['reset_mask'] must be true for at least one world")
+        if isinstance(seed, list):
+            return self.batch.reset(seed, mask), {}
+        super().reset(seed=seed)
+        return self.batch.reset(int(self.np_random.integers(2**31)), mask), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One decision of every team; ``actions`` (B, N)."""
-        outcome = self.batch.step(np.asarray(actions, dtype=np.int64))
-        infos: dict[str, Any] = {}
-        for name, values in terms(outcome, self.batch.scenario.safe_distance).items():
-            infos[name], infos[f"_{name}"] = values, np.ones(self.num_envs, dtype=bool)
-        if outcome.ended.any():
+        """One decision of every team; ``actions`` (B, N).
+
+        Raises:
+            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+        """
+        outcome = self.batch.step(actions)
+        found, ended = terms(outcome, self.batch.scenario.safe_distance), outcome.ended
+        infos = where(found, ~ended)
+        if ended.any():
             final = np.empty(self.num_envs, dtype=object)
-            for b in np.flatnonzero(outcome.ended):
+            for b in np.flatnonzero(ended):
                 final[b] = outcome.final_state[b]
-            infos["final_obs"], infos["_final_obs"] = final, outcome.ended
+            infos |= {"final_obs": final, "_final_obs": ended, "final_info": where(found, ended), "_final_info": ended}
         return outcome.state, outcome.reward, outcome.terminal, outcome.truncated, infos
+
+
+def where(found: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
+    """Infos of the worlds in ``mask`` (B,) as a vector environment gives them: zeros elsewhere, and the mask under ``_name``."""
+    if not mask.any():
+        return {}
+    given = {name: np.where(mask, values, np.zeros_like(values)) for name, values in found.items()}
+    return given | {f"_{name}": mask.copy() for name in found}

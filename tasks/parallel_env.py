@@ -7,6 +7,7 @@ from gymnasium.spaces import Discrete, Space
 from pettingzoo import ParallelEnv
 
 from marlbc_mj.controllers import Controller
+from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
@@ -74,9 +75,15 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """One decision of every agent; the reward (13) is the same for all."""
-        joint = np.array([[int(actions[agent]) for agent in self.possible_agents]])
-        outcome = self.batch.step(joint)
+        """One decision of every agent; the reward (13) is the same for all.
+
+        Raises:
+            ConfigurationError: an agent without an action, no whole number, or an index that is no action.
+        """
+        missing = [agent for agent in self.possible_agents if agent not in actions]
+        if missing:
+            raise ConfigurationError(f"every agent needs an action, there is none for {', '.join(missing)}")
+        outcome = self.batch.step(np.array([[actions[agent] for agent in self.possible_agents]]))
         self._state = outcome.final_state[0]
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
         agents, over = self.agents, bool(outcome.terminal[0])

@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from pettingzoo.test import parallel_api_test
 
@@ -124,6 +124,118 @@ def test_a_feature_that_never_happens_draws_no_number():
     assert drawn() == plain.bit_generator.state != drawn(exploring=0.5)
     assert drawn(exploring=1.0) != drawn(exploring=1.0, focus=0.5)
     assert drawn(exploring=1.0) != drawn(exploring=1.0, turning=0.5)
+
+
+@given(st.integers(0, 3), st.integers(0, 3), st.sampled_from([-1, 4, 2**40, -(2**40)]))
+@settings(max_examples=20)
+def test_actions_that_are_none_are_named(world, agent, value):
+    """Any index outside the action set is refused, wherever it stands, before a world has moved."""
+    batch = FormationBatch(paper(duration=1.0), worlds=4)
+    actions = np.zeros((4, 4), dtype=np.int64)
+    actions[world, agent] = value
+    with pytest.raises(ConfigurationError, match=rf"from 0 to 3, got {value} for world {world}, agent {agent + 1}"):
+        batch.step(actions)
+    assert (batch.world.state.steps == 0).all() and (batch.last == batch.action_of[batch.world.state.command]).all()
+
+
+@pytest.mark.parametrize(
+    ("actions", "fragment"),
+    [
+        (np.zeros((2, 3), dtype=int), r"\(2, 4\).*got \(2, 3\)"),
+        (np.zeros(4, dtype=int), r"\(2, 4\).*got \(4,\)"),
+        (np.zeros((2, 4)), "whole numbers from 0 to 3, got float64"),
+        (np.zeros((2, 4), dtype=bool), "whole numbers from 0 to 3, got bool"),
+        ([[0, 1], [0]], r"\(2, 4\)"),
+        (np.full((2, 4), "a"), "whole numbers"),
+        (np.full((2, 4), 2**64 - 1, dtype=np.uint64), "got 18446744073709551615"),
+    ],
+)
+def test_actions_of_another_shape_or_kind_are_named(actions, fragment):
+    vector = PaperFormationVector(2, duration=1.0)
+    vector.reset(seed=0)
+    for step in (vector.step, vector.batch.step):
+        with pytest.raises(ConfigurationError, match=fragment):
+            step(actions)
+
+
+def test_every_view_refuses_wrong_actions():
+    env, parallel = PaperFormation(duration=1.0), PaperFormationParallel(duration=1.0)
+    env.reset(seed=0), parallel.reset(seed=0)
+    for action in ([0, 1, 2], [0, 1, 2, 7], [0.5, 1, 2, 3], 1):
+        with pytest.raises(ConfigurationError, match="actions must"):
+            env.step(action)
+    some = dict.fromkeys(parallel.possible_agents, 1)
+    for wrong, fragment in (({"agent_2": -1}, "-1 for world 0, agent 2"), ({"agent_3": 1.5}, "1.5")):
+        with pytest.raises(ConfigurationError, match=fragment):
+            parallel.step({**some, **wrong})
+    with pytest.raises(ConfigurationError, match="agent_4"):
+        parallel.step(dict.fromkeys(parallel.possible_agents[:3], 0))
+    assert not any(parallel.step(some)[2].values())
+
+
+def test_a_mask_chooses_the_worlds_that_begin_anew():
+    vector = PaperFormationVector(4, duration=1.0, perturbation=AROUND)
+    begun, _ = vector.reset(seed=3)
+    actions = np.tile([0, 1, 2, 3], (4, 1))
+    moved = vector.step(actions)[0]
+    mask = np.array([True, False, False, True])
+    state, infos = vector.reset(seed=3, options={"reset_mask": mask})
+    assert (state[mask] == begun[mask]).all() and (state[~mask] == moved[~mask]).all() and infos == {}
+    other, _ = vector.reset(options={"reset_mask": ~mask})
+    assert (other[mask] == begun[mask]).all() and (other[~mask] != begun[~mask]).any(axis=1).all()
+    ends = [vector.step(actions)[2] for _ in range(20)]
+    assert (ends[19] == True).all() and not np.any(ends[:19])  # noqa: E712  # all had the same time left
+
+
+def test_a_list_has_a_seed_for_every_world():
+    vector = PaperFormationVector(3, duration=1.0, perturbation=AROUND)
+    one, again = vector.reset(seed=[5, 6, 7])[0], vector.reset(seed=[5, 8, 7])[0]
+    assert (one[[0, 2]] == again[[0, 2]]).all() and (one[1] != again[1]).any()
+    later = vector.reset(seed=[None, 8, 7])[0]
+    assert (later[1:] == again[1:]).all() and (later[0] != again[0]).any()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fragment"),
+    [
+        ({"seed": [1, 2]}, r"must have 3, got \[1, 2\]"),
+        ({"seed": [1, 2, -3]}, "negative"),
+        ({"options": {"reset_mask": np.array([True, False])}}, r"shape \(3,\), got bool with shape \(2,\)"),
+        ({"options": {"reset_mask": np.array([0, 1, 2])}}, "bool with shape"),
+        ({"options": {"reset_mask": np.zeros(3, dtype=bool)}}, "at least one world"),
+    ],
+)
+def test_wrong_resets_are_named(arguments, fragment):
+    with pytest.raises(ConfigurationError, match=fragment):
+        PaperFormationVector(3, duration=1.0).reset(**arguments)
+
+
+def test_infos_are_those_of_gymnasiums_own_vector_env():
+    """Step by step, over an episode's end: the same keys, masks and masked values as a SyncVectorEnv of single environments."""
+    same = gymnasium.vector.AutoresetMode.SAME_STEP
+    reference = gymnasium.vector.SyncVectorEnv([lambda: PaperFormation(duration=0.5)] * 2, autoreset_mode=same)
+    vector = PaperFormationVector(2, duration=0.5)
+    reference.reset(seed=0), vector.reset(seed=0)
+
+    def equal(one, other):
+        assert {*one} == {*other}
+        for name in one:
+            if name.startswith("_"):
+                assert (one[name] == other[name]).all()
+            elif isinstance(one[name], dict):
+                equal(one[name], other[name])
+            else:
+                for a, b, valid in zip(one[name], other[name], other[f"_{name}"], strict=True):
+                    assert not valid or np.array_equal(a, b)
+
+    rng = np.random.default_rng(0)
+    for k in range(22):
+        actions = rng.integers(4, size=(2, 4))
+        expected, found = reference.step(actions), vector.step(actions)
+        for a, b in zip(expected[:4], found[:4], strict=True):
+            assert np.array_equal(a, b)
+        equal(expected[4], found[4])
+        assert ("final_info" in found[4]) == (k % 10 == 9)
 
 
 def test_exploring_starts_lie_on_the_route_and_are_cut():

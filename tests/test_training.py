@@ -464,12 +464,34 @@ def test_no_own_cost_is_worth_paying(method, preset):
         ({"capacity": 128}, ["capacity", "128"]),
         ({"together": 2.0}, ["together", "2.0"]),
         ({"n_step": 3}, ["n_step", "3", "risk_gamma"]),
+        ({"risk_limit": 0.0}, ["risk_limit", "0.0", "risk_gamma"]),
+        ({"evaluate_every": 0}, ["evaluate_every", "0"]),
+        ({"save_every": -1.0}, ["save_every", "-1.0"]),
+        ({"updates": 0}, ["updates", "0"]),
+        ({"updates": -1}, ["updates", "-1"]),
+        ({"bits": 25}, ["bits", "24", "25"]),
+        ({"method": "central", "learner": "plain"}, ["central", "risk_gamma", "0.8"]),
+        ({"method": "rlms", "learner": "plain"}, ["rlms", "risk_gamma", "0.8"]),
+        ({"method": "mappo", "learner": "plain"}, ["mappo", "risk_gamma", "0.8"]),
     ],
 )
 def test_wrong_settings_are_named(changes, fragments):
     with pytest.raises(ConfigurationError) as error:
         make_config("fast", **changes)
     assert all(fragment in str(error.value) for fragment in fragments)
+
+
+@pytest.mark.parametrize("scale", [0.0, -1.0, float("nan")])
+def test_rewards_are_divided_by_something_positive(scale):
+    with pytest.raises(ConfigurationError, match=f"shaping.scale must be positive, got {scale}"):
+        Shaping(scale=scale)
+
+
+@pytest.mark.parametrize("interval", [2000, 4000])
+def test_a_decision_is_shorter_than_the_mission(interval):
+    with pytest.raises(ConfigurationError, match=str(interval)) as error:
+        Trainer(make_config("fast", interval=interval, worlds=2, threads=1))
+    assert "\n" not in str(error.value)
 
 
 def test_unknown_preset():

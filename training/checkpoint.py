@@ -28,8 +28,8 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[st
     try:
         with staged_file(path, overwrite=True) as staging:
             staging.write_bytes(serialise({name: np.ascontiguousarray(array) for name, array in arrays.items()}, header))
-    except (OSError, SafetensorError) as error:
-        raise ConfigurationError(f"cannot write {path}: {getattr(error, 'strerror', None) or error}") from error
+    except SafetensorError as error:
+        raise ConfigurationError(f"cannot write {path}: {error}") from error
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

@@ -1,6 +1,7 @@
 """What a training run is: one frozen dataclass, and the presets of it."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -12,6 +13,9 @@ class Shaping:
     """The reward that a learner sees, made from the printed terms. The defaults leave the printed reward as it is.
 
     Evaluation never uses it: returns are those of (13).
+
+    Raises:
+        ConfigurationError: a value that cannot be run.
     """
 
     centre: float = 0.0
@@ -33,6 +37,10 @@ class Shaping:
     """What a switch costs more where the order before has been in force for less than ``dwell``."""
     dwell: float = 4.0
     """How long an order should be in force [s]."""
+
+    def __post_init__(self) -> None:
+        if not self.scale > 0:
+            raise ConfigurationError(f"shaping.scale must be positive, got {self.scale}")
 
 
 @dataclass(frozen=True)
@@ -83,7 +91,7 @@ class TrainConfig:
     """Scenario that is trained on."""
     controller: str = "sorlc"
     """Controller that tracks the references."""
-    budget: int = 4_000_000
+    budget: int = 2_000_000
     """Mission steps, over all worlds."""
 
     worlds: int = 128
@@ -94,13 +102,13 @@ class TrainConfig:
     """Action set: commands (the distinct ones), orders (all permutations) or avoidance (formation, with obstacles or not)."""
     interval: int = 10
     """Mission steps that a decision holds for."""
-    exploring_starts: float = 0.8
+    exploring_starts: float = 0.95
     """Share of episodes that begin anywhere along the route."""
-    start_length: float = 20.0
+    start_length: float = 12.0
     """Length of those episodes [s]."""
-    focus: float = 0.0
+    focus: float = 0.7
     """Share of them that begin shortly before a slot of the formation comes too close to an obstacle, or is free again."""
-    turning: float = 0.0
+    turning: float = 0.5
     """Share of them that begin with the whole team changing to the other formation: what a joint change leads to. Nobody gains
     from changing alone, so that without them a bad habit of the team can be everyone's best answer to it."""
 
@@ -112,7 +120,7 @@ class TrainConfig:
     """Past networks that a target is averaged over; 1 switches averaging off."""
     push_every: int = 10
     """Updates after which the present network joins the past ones."""
-    gamma: float = 0.99
+    gamma: float = 0.98
     """Discount factor of a decision."""
     n_step: int = 1
     """Decisions whose rewards are summed before the bootstrap."""
@@ -122,9 +130,9 @@ class TrainConfig:
     """Of Adam, at the end; linear in between."""
     batch: int = 256
     """Transitions of an update."""
-    updates: int = 8
+    updates: int = 4
     """Updates after each decision of all worlds."""
-    capacity: int = 100_000
+    capacity: int = 50_000
     """Transitions in the replay buffer."""
     huber: float = 1.0
     """TD errors beyond it count linearly in the loss instead of squared; inf is the squared error of (17)."""
@@ -149,16 +157,16 @@ class TrainConfig:
     """Share of the budget after which the largest temperature is 0.05."""
     hold: int = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
-    together: float = 0.5
+    together: float = 0.7
     """Share of an agent's explorations in which it takes one random order with the whole team."""
     subsets: float = 0.0
     """Share of joint explorations in which every agent stays out with probability 1/2 and acts as if there were none: what
     happens when some lead and others must follow."""
-    least_exploration: float = 0.03
+    least_exploration: float = 0.01
     """Exploration never falls below it."""
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by this."""
-    shaping: Shaping = Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_switch_cost=40.0, haste_cost=200.0)
+    shaping: Shaping = Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.05, own_switch_cost=40.0, haste_cost=400.0)
     """The reward that is learned from."""
     ppo: PPO = PPO()
     """Of MAPPO alone."""
@@ -173,21 +181,12 @@ class TrainConfig:
     """Device of the networks: cpu or cuda."""
 
     def __post_init__(self) -> None:
-        for name in ("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "bits", "hold", "threads"):
+        for name in AT_LEAST_ONE:
             if getattr(self, name) < 1:
                 raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
-        for name in (
-            "exploring_starts",
-            "focus",
-            "turning",
-            "together",
-            "subsets",
-            "least_leniency",
-            "least_exploration",
-            "smoothing",
-            "risk_gamma",
-            "risk_limit",
-        ):
+        if self.bits > MOST_BITS:
+            raise ConfigurationError(f"bits must be at most {MOST_BITS}, got {self.bits}: the tables have 2^bits rows an agent")
+        for name in SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigurationError(f"{name} must be between 0 and 1, got {getattr(self, name)}")
         if not 0 <= self.gamma < 1:
@@ -204,6 +203,12 @@ class TrainConfig:
             raise ConfigurationError(
                 f"risks are learned from single decisions: n_step must be 1 with risk_gamma, got {self.n_step}"
             )
+        if self.risk_gamma and self.method in WITHOUT_RISKS:
+            raise ConfigurationError(f"method {self.method} learns no risks: risk_gamma must be 0, got {self.risk_gamma}")
+        if self.risk_gamma and not self.risk_limit:
+            raise ConfigurationError(f"risk_limit must be above 0 with risk_gamma {self.risk_gamma}, got {self.risk_limit}")
+        if not self.save_every >= 0:
+            raise ConfigurationError(f"save_every must not be negative, got {self.save_every}")
         if not self.hidden or min(self.hidden) < 1:
             raise ConfigurationError(f"hidden layers must have at least one unit, got {self.hidden}")
         if self.seed < 0:
@@ -220,6 +225,18 @@ class TrainConfig:
         return self.capacity // self.worlds
 
 
+AT_LEAST_ONE = (
+    *("budget", "worlds", "interval", "copies", "push_every", "n_step", "batch", "updates", "bits", "hold", "evaluate_every"),
+    "threads",
+)
+SHARES = (
+    *("exploring_starts", "focus", "turning", "together", "subsets", "least_leniency", "least_exploration", "smoothing"),
+    *("risk_gamma", "risk_limit"),
+)
+MOST_BITS = 24
+WITHOUT_RISKS = ("central", "rlms", "mappo")
+"""Methods whose networks have no risks of every agent's orders, or none that anything is learned from."""
+
 CHOICES = {
     "state": ("extended", "printed"),
     "actions": ("commands", "orders", "avoidance"),
@@ -231,7 +248,7 @@ CHOICES = {
 CARE: dict[str, Any] = {
     "risk_gamma": 0.0,
     "gamma": 0.94,
-    "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.03, own_violation_cost=2000.0, own_switch_cost=40.0),
+    "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.05, own_violation_cost=2000.0, own_switch_cost=40.0),
 }
 """For methods without risks of every agent's orders: coming too close ends the agent's return with a cost that nothing exceeds,
 which bounds the discount factor: the cost must be more than being out of formation for ever, centre * interval / (1 - gamma)."""
@@ -280,6 +297,8 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             actions="orders",
             interval=1,
             exploring_starts=0.0,
+            focus=0.0,
+            turning=0.0,
             gamma=0.99,
             n_step=1,
             learning_rate=1e-4,
@@ -319,7 +338,15 @@ def from_json(data: dict[str, Any]) -> TrainConfig:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error
 
 
-def _fields(data: dict[str, Any]) -> dict[str, Any]:
+def flat_settings(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The JSON data of a configuration with nested settings under ``outer.inner``, without the types' names."""
+    flat: dict[str, Any] = {}
+    for name, value in _fields(data).items():
+        flat |= {f"{name}.{key}": entry for key, entry in _fields(value).items()} if isinstance(value, dict) else {name: value}
+    return flat
+
+
+def _fields(data: Mapping[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in data.items() if name != "type"}
 
 

@@ -1,15 +1,15 @@
 """Checkpoints that come with the package, each with a model card; and how a training run becomes one."""
 
 import csv
-import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import check_target, staged_file
+from marlbc_mj.files import check_target, staged_file, write_json
 from marlbc_mj.provenance import plain_data
 from marlbc_mj.training.checkpoint import read_policy
-from marlbc_mj.training.config import METHODS, make_config
+from marlbc_mj.training.config import METHODS, flat_settings, make_config
 
 FOLDER = Path(__file__).parent / "checkpoints"
 
@@ -26,31 +26,32 @@ def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False
         ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
     """
     source = run / "checkpoint" / "best.safetensors"
-    read_policy(source)
+    _, description = read_policy(source)
     try:
-        config = json.loads((run / "config.json").read_text())
         with (run / "eval.csv").open() as file:
             rows = list(csv.DictReader(file))
-        best = json.loads(source.with_suffix(".json").read_text())
-    except (OSError, json.JSONDecodeError) as error:
-        raise ConfigurationError(f"{run} is not a finished training run: {error}") from error
+        text = card(name, description, rows)
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigurationError(f"{run} is not a finished training run: {error!r}") from error
     target = folder / source.with_stem(name).name
     check_target(target, overwrite=overwrite)
-    folder.mkdir(parents=True, exist_ok=True)
-    for suffix in (".safetensors", ".json"):
-        with staged_file(target.with_suffix(suffix), overwrite=True) as staging:
-            shutil.copyfile(source.with_suffix(suffix), staging)
+    with staged_file(target, overwrite=True) as staging:
+        shutil.copyfile(source, staging)
+    write_json(target.with_suffix(".json"), description)
     with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
-        staging.write_text(card(name, config, best["evaluation"], rows))
+        staging.write_text(text)
     return target
 
 
-def card(name: str, config: dict[str, object], evaluation: dict[str, float], rows: list[dict[str, str]]) -> str:
-    """The model card, Markdown: what it is, how it was made, what it does on the case study, its learning curve."""
-    train = config["train"]
-    assert isinstance(train, dict)
-    versions = config["versions"]
-    assert isinstance(versions, dict)
+def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
+    """The model card, Markdown: what it is, how it was made, what it does on the case study, its learning curve.
+
+    Args:
+        name: of the shipped checkpoint.
+        description: of the checkpoint, from its header.
+        rows: of the run's evaluations.
+    """
+    train, versions, evaluation = description["train"], description["versions"], description["evaluation"]
     command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
     command += f" --threads {train['threads']}" + "".join(f" {setting}" for setting in _settings(train))
     switches = "/".join(f"{value:.0f}" for key, value in evaluation.items() if key.startswith("switches_"))
@@ -63,10 +64,10 @@ def card(name: str, config: dict[str, object], evaluation: dict[str, float], row
         "",
         f"- Command: `{command}`",
         f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
-        f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {config['cpu']}.",
+        f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {description['cpu']}.",
         f"- On the case study: return {evaluation['return']:.0f}, switches {switches}, "
         f"violation {evaluation['violation_time']:.3f} s, least clearance {evaluation['clearance_min']:.3f} m.",
-        f"- Revision {config['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
+        f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
         "",
         "| mission steps | return | switches | violation [s] | least clearance [m] |",
         "|---:|---:|---|---:|---:|",
@@ -82,21 +83,12 @@ def card(name: str, config: dict[str, object], evaluation: dict[str, float], row
 
 def _settings(train: dict[str, object]) -> list[str]:
     """``--set`` and what differs from the method's preset, nothing where nothing does."""
-    preset = plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0]))
-    said = {"type", "method", "preset", "seed", "budget", "threads"}
+    preset = flat_settings(plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0])))
+    said = {"method", "preset", "seed", "budget", "threads"}
     changed = [
-        f"{name}={_text(value)}" for name, value in _flat(train).items() if _flat(preset).get(name) != value and name not in said
+        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if preset.get(name) != value and name not in said
     ]
     return ["--set", *changed] if changed else []
-
-
-def _flat(data: dict[str, object]) -> dict[str, object]:
-    """Nested settings under ``outer.inner``."""
-    flat: dict[str, object] = {}
-    for name, value in data.items():
-        inner = {f"{name}.{key}": entry for key, entry in value.items() if key != "type"} if isinstance(value, dict) else {}
-        flat |= inner or {name: value}
-    return flat
 
 
 def _text(value: object) -> str:

@@ -95,7 +95,7 @@ class Trainer(BaseTrainer):
 
     def _seen_enough(self) -> bool:
         """Whether the buffer holds states of the whole mission: after WARM_UP transitions where episodes begin anywhere, else
-        after a whole one, or as much of it as the buffer has room for.
+        after a whole mission, or as much of it as there is room for.
         """
         mission = 0 if self.config.exploring_starts else self.batch.decisions
         rows = self.replay.count
