@@ -25,16 +25,29 @@ def versions() -> dict[str, str]:
     return found
 
 
+UNKNOWN = "unknown"
+"""The revision where the package was not installed from a repository."""
+
+
 def git_revision() -> str:
-    """Revision of the source tree, ``-dirty`` if it has changes; ``unknown`` when installed from a wheel."""
+    """Revision of the source tree; with changes ``-dirty`` and a digest of them, so that equal texts mean equal tracked files.
+
+    ``unknown`` when installed from a wheel.
+    """
     root = Path(__file__).resolve().parent.parent
     if not (root / ".git").exists():
-        return "unknown"
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+        return UNKNOWN
+
+    def git(*arguments: str) -> bytes:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, check=True, timeout=10).stdout
+
     try:
-        return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        revision = git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*").decode().strip()
+        if not revision.endswith("-dirty"):
+            return revision
+        return f"{revision}-{hashlib.sha256(git('diff', '--binary', '--no-ext-diff', 'HEAD')).hexdigest()[:8]}"
     except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        return UNKNOWN
 
 
 def cpu() -> str:

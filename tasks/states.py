@@ -33,6 +33,7 @@ class State(Protocol):
     scale: np.ndarray  # (S,) what a network divides the state by
     low: np.ndarray  # (S,)
     high: np.ndarray  # (S,)
+    layout: dict[str, float]  # what a policy's weights depend on; ``version`` is raised when numbers change their meaning
 
     def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
         """(B, S) float32 states from a batch observation, obstacles (B, K, 3) [m] and how long every command has been in force,
@@ -48,6 +49,7 @@ class PrintedState:
         agents = scenario.agents
         self.size = 5 * agents + 1
         self.scale = np.array([50.0, 50.0, 10.0, 10.0] * agents + [len(scenario.orders.commands)] * agents + [2.0])
+        self.layout = {"version": 1, "size": self.size}
         self.low = np.array([-np.inf] * 4 * agents + [0.0] * (agents + 1))
         self.high = np.array([np.inf] * 4 * agents + [len(scenario.orders.commands) - 1.0] * agents + [2.0])
 
@@ -71,6 +73,7 @@ class ExtendedState:
         self.velocity = np.array(scenario.path_velocity)
         self.safe = np.array([0.0, 0.0, scenario.safe_distance])
         self.size = scenario.agents * (2 * LENGTHS + 3 + self.commands) + 3
+        self.layout = {"version": 1, "size": self.size, "range": RANGE, "close": CLOSE, "speed": SPEED, "old": OLD}
         self.scale = np.ones(self.size)
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
 

@@ -255,6 +255,29 @@ def test_exploring_starts_lie_on_the_route_and_are_cut():
     assert (outcome.state[outcome.ended] != outcome.final_state[outcome.ended]).any()
 
 
+def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
+    """Against copies of the worlds that go on past the ends: in worlds that end it is the old episode's, in others the state."""
+    batch = FormationBatch(paper(perturbation=AROUND), worlds=12, interval=2, starts=Starts(exploring=0.5, length=1.0))
+    batch.reset(5)
+    twin, rng, partial = World(paper(perturbation=AROUND), worlds=12), np.random.default_rng(0), 0
+    batch.cut[batch.cut < 2000] += rng.integers(10, size=(batch.cut < 2000).sum())  # so that they end apart
+    for _ in range(25):
+        twin.restore(batch.world.snapshot())
+        actions, before = rng.integers(4, size=(12, 4)), batch.age
+        outcome = batch.step(actions)
+        commands = twin.state.command.copy()
+        begun = twin.state.steps > 0
+        for _ in range(2):
+            twin.step(batch.order_of[actions])
+        age = np.where((twin.state.command != commands) & begun[:, None], 0.0, before) + 0.1
+        assert (outcome.final_state == batch.read(twin.observe(), twin.state.obstacles, age)).all()
+        ended = outcome.ended
+        assert (outcome.final_state[~ended] == outcome.state[~ended]).all()
+        assert (outcome.final_state[ended] != outcome.state[ended]).any(axis=1).all()
+        partial += bool(ended.any() and not ended.all() and (outcome.truncated == ended).all())
+    assert partial >= 5
+
+
 def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives():
     """Slots pass a point at 1 m, sqrt(3) m to either side; the gate is unsafe within 7 m of a disc, which slots pass at 3 m."""
     points = [20.0 - np.sqrt(3.0), 20.0 + np.sqrt(3.0), 45.0 - np.sqrt(3.0), 45.0 + np.sqrt(3.0)]

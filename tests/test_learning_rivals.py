@@ -1,6 +1,8 @@
 """The rivals in learning against hand arithmetic, closed forms and plain loops; every one learns and goes on bit for bit."""
 
 import json
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +18,7 @@ from marlbc_mj.provenance import plain_data
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.tasks.batch import ACTIONS, FormationBatch, Starts, order_of
 from marlbc_mj.tasks.states import STATES, make_state
+from marlbc_mj.training.checkpoint import read_arrays
 from marlbc_mj.training.config import METHODS, PPO, TrainConfig, from_json, make_config
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss, log_probability
@@ -23,7 +26,7 @@ from marlbc_mj.training.policy import greedy
 from marlbc_mj.training.prioritised import ALPHA, BETA, LEAST_ERROR, PrioritisedReplay
 from marlbc_mj.training.replay import Batch
 from marlbc_mj.training.rivals import LEARNERS, QMIX, RLMS, VDN, Central, Mixer, learner_class, own_entries
-from marlbc_mj.training.run import make_trainer, resume, train
+from marlbc_mj.training.run import RESUME, Interrupted, make_trainer, resume, train
 
 N, S, A = 3, 5, 4
 
@@ -404,10 +407,21 @@ def test_every_rival_goes_on_bit_for_bit(method):
 
 @pytest.mark.parametrize(("method", "state"), [("rlms", "printed"), ("central", "extended"), ("mappo", "extended")])
 def test_a_checkpoint_of_a_rival_gives_the_evaluated_episode(method, state, tmp_path):
-    """From train to the supervisor, and once more from what was saved for --resume."""
-    config = small(method, state=state, budget=4_000, ppo=PPO(rollout=4, epochs=1))
+    """From train to the supervisor; a run that was interrupted while it learnt ends with the same networks, to the bit."""
+    config = small(method, state=state, budget=12_800, ppo=PPO(rollout=4, epochs=1))
+
+    def interrupt(trainer, row):
+        if trainer.updates > 3:
+            os.kill(os.getpid(), signal.SIGTERM)
+
     rows = train(config, tmp_path / "run")
-    assert rows and rows == resume(tmp_path / "run")
+    stopped = train(config, tmp_path / "stopped", progress=interrupt)
+    assert stopped == Interrupted(signal.SIGTERM)
+    saved = read_arrays(tmp_path / "stopped" / RESUME)[1]["scalars"]
+    assert saved["updates"] > 3 and saved["steps"] < 12_800
+    resumed = resume(tmp_path / "stopped")
+    assert [{**row, "wall_s": 0.0} for row in rows] == [{**row, "wall_s": 0.0} for row in resumed]
+    assert equal(*(read_arrays(tmp_path / name / RESUME)[0] for name in ("run", "stopped")))
     learned = Learned.load(tmp_path / "run" / "checkpoint" / "last.safetensors")
     scenario = paper()
     chosen = set(learned.start(scenario).order_of.tolist())

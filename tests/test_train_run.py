@@ -5,6 +5,7 @@ import json
 import os
 import pickle
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from marlbc_mj import World, paper, run_episode
+from marlbc_mj import World, paper, provenance, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.cli.training import with_settings
 from marlbc_mj.errors import ConfigurationError
@@ -28,7 +29,10 @@ from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.run import RESUME, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
 
-SMALL = {"worlds": 64, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1, "start_length": 5.0}
+SMALL = {
+    "worlds": 128, "interval": 2, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1,
+    "start_length": 2.0,
+}  # fmt: skip
 
 
 def small(**changes) -> TrainConfig:
@@ -97,24 +101,33 @@ def test_a_checkpoint_gives_the_evaluated_episode(finished):
 
 
 def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
-    """kill -9 at any moment: what was saved last is enough to end with the same networks, to the bit."""
+    """kill -9 at any moment while it learns: what was saved last is enough to end with the same networks, to the bit."""
     settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in SMALL.items() if k != "threads"]
     folder = tmp_path / "run"
     command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "40000"]
     command += ["--set", *settings, "evaluate_every=20000", "save_every=0.05"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    while not (folder / RESUME).exists() and process.poll() is None:
+
+    def updates():
+        return read_arrays(folder / RESUME)[1]["scalars"]["updates"] if (folder / RESUME).exists() else 0
+
+    while not updates() and process.poll() is None:
         time.sleep(0.02)
-    time.sleep(0.3 * np.random.default_rng().random())
+    time.sleep(0.1 * np.random.default_rng().random())
     process.kill()
-    process.wait()
-    assert not (process.returncode == 0 and not (folder / RESUME).exists())
+    assert process.wait() == -signal.SIGKILL
+    saved = read_arrays(folder / RESUME)[1]["scalars"]
+    assert saved["updates"] > 0 and saved["steps"] < 40_000
+    config = json.loads((folder / "config.json").read_text())
     resume(folder)
+    assert json.loads((folder / "config.json").read_text()) == config and not list(folder.rglob("*partial*"))
     for name in ("best", "last"):
         a, b = (load_file(where / "checkpoint" / f"{name}.safetensors") for where in (finished, folder))
         assert equal(a, b)
-    (a, _), (b, _) = (read_arrays(where / RESUME) for where in (finished, folder))
-    assert equal(a, b)
+    (a, _), (b, description) = (read_arrays(where / RESUME) for where in (finished, folder))
+    assert equal(a, b) and description["scalars"]["updates"] > saved["updates"]
+    learnt = {"learner.network0", "learner.adam0.exp_avg", "learner.adam0.exp_avg_sq", "learner.target0", "hash.mean", "table"}
+    assert learnt <= a.keys() and all(a[name].any() for name in learnt) and a["hash.fitted"][0] and np.isfinite(a["table"]).any()
 
 
 def test_a_signal_saves_and_says_how_to_go_on(tmp_path, capsys, monkeypatch):
@@ -192,6 +205,11 @@ def test_runs_have_folders_of_their_own(arguments, folder, monkeypatch, capsys):
         (["train", "--budget", "0"], ["budget", "0"]),
         (["train", "--resume", "nowhere"], ["nowhere", RESUME]),
         (["train", "--device", "cuda"], ["cuda"]),
+        (
+            ["train", "--resume", "x", "--budget", "9", "--threads", "1", "--device", "cpu", "--set", "gamma=0.9", "--out", "y"],
+            ["--resume", "--budget, --threads, --device, --set", "--out"],
+        ),
+        (["train", "vdn", "--resume", "x", "--seed", "3", "--overwrite"], ["leave out method, --seed, --overwrite"]),
     ],
 )
 def test_wrong_settings_are_one_line(arguments, fragments, tmp_path, monkeypatch, capsys):
@@ -270,6 +288,127 @@ def test_a_run_of_other_versions_or_a_torn_one_is_not_resumed(finished, tmp_path
     with pytest.raises(ConfigurationError, match="resume.safetensors"):
         resume(tmp_path)
     assert arrays
+
+
+class Stopped(Exception):
+    """Stands in for a crash."""
+
+
+def stop(trainer, row):
+    raise Stopped
+
+
+def test_overwriting_leaves_nothing_of_the_old_run(finished, tmp_path):
+    """Not even where the new run dies before it has saved anything: there is then nothing to resume, least of all the old run."""
+    folder = shutil.copytree(finished, tmp_path / "run")
+    (folder / "tensorboard").mkdir(exist_ok=True)
+    (folder / "tensorboard" / "events.old").write_text("old")
+    (folder / "checkpoint" / ".best.partial-1.json").write_text("torn")
+    (folder / "notes.txt").write_text("mine")
+    with pytest.raises(Stopped):
+        train(small(seed=9), folder, overwrite=True, progress=stop)
+    assert json.loads((folder / "config.json").read_text())["train"]["seed"] == 9
+    assert not (folder / "tensorboard" / "events.old").exists() and not list(folder.rglob("*partial*"))
+    assert len((folder / "eval.csv").read_text().splitlines()) == 2 and (folder / "notes.txt").read_text() == "mine"
+    assert read_policy(folder / "checkpoint" / "best.safetensors")[1]["train"]["seed"] == 9
+    with pytest.raises(ConfigurationError, match=f"no {RESUME}"):
+        resume(folder)
+
+
+def test_a_run_that_cannot_be_made_leaves_the_old_one(finished, tmp_path):
+    folder = shutil.copytree(finished, tmp_path / "run")
+    with pytest.raises(ConfigurationError):
+        train(small(scenario="nowhere"), folder, overwrite=True)
+    assert {p.relative_to(folder) for p in folder.rglob("*")} == {p.relative_to(finished) for p in finished.rglob("*")}
+
+
+def without(data, *path):
+    """JSON data less the entry at ``path``."""
+    name, *rest = path
+    return {k: without(v, *rest) if k == name else v for k, v in data.items() if rest or k != name}
+
+
+def put(data, value, *path):
+    """JSON data with ``value`` at ``path``."""
+    name, *rest = path
+    return {**data, name: put(data[name], value, *rest) if rest else value}
+
+
+DAMAGED_RUNS = {
+    "missing array": (lambda a, d: (without(a, "learner.network0"), d), "learner.network0 is missing"),
+    "missing moments": (lambda a, d: (without(a, "learner.adam1.exp_avg"), d), "adam1.exp_avg is missing"),
+    "foreign array": (lambda a, d: ({**a, "x": np.zeros(2)}, d), "array x is not of such a run"),
+    "shape": (lambda a, d: ({**a, "table": a["table"][1:]}, d), "table is float32 (3, "),
+    "type": (lambda a, d: ({**a, "cut": a["cut"].astype(np.float64)}, d), "cut is float64"),
+    "stream": (lambda a, d: ({**a, "generator": 0 * a["generator"]}, d), "does not fit"),
+    "number": (lambda a, d: (a, put(d, "many", "scalars", "steps")), "scalars.steps is 'many'"),
+    "negative": (lambda a, d: (a, put(d, -1, "scalars", "rows")), "scalars.rows is -1"),
+    "missing number": (lambda a, d: (a, without(d, "scalars", "updates")), "scalars must have"),
+    "streams": (lambda a, d: (a, put(d, [], "scalars", "starts_rngs")), "starts_rngs must have 128"),
+    "other stream": (lambda a, d: (a, put(d, "MT19937", "scalars", "rng", "bit_generator")), "MT19937"),
+    "no scalars": (lambda a, d: (a, without(d, "scalars")), "not a saved run: it says no scalars"),
+    "no versions": (lambda a, d: (a, without(d, "versions")), "not a saved run: it says no versions"),
+    "table": (lambda a, d: (a, put(d, [{"return": "high"}], "curve")), "tables are damaged"),
+    "revision": (lambda a, d: (a, put(d, "0123456789ab", "git_revision")), "revision 0123456789ab"),
+    "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
+    "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
+    "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
+    "other setting": (lambda a, d: (a, put(d, 0.5, "train", "gamma")), "gamma 0.99 instead of 0.5"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGED_RUNS)
+def test_saved_runs_that_cannot_go_on_are_one_line(kind, finished, tmp_path, monkeypatch):
+    monkeypatch.setattr("marlbc_mj.provenance.git_revision", lambda: "abc")
+    change, fragment = DAMAGED_RUNS[kind]
+    arrays, description = read_arrays(finished / RESUME)
+    arrays, description = change(arrays, {**description, "git_revision": "abc"})
+    write_arrays(tmp_path / RESUME, arrays, description)
+    shutil.copy(finished / "config.json", tmp_path)
+    with pytest.raises(ConfigurationError, match=re.escape(fragment)) as error:
+        resume(tmp_path)
+    assert "\n" not in str(error.value)
+    assert {p.name for p in tmp_path.iterdir()} == {RESUME, "config.json"}
+
+
+def test_a_renamed_policy_or_a_lost_configuration_is_one_line(finished, tmp_path):
+    shutil.copy(finished / "checkpoint" / "best.safetensors", tmp_path / RESUME)
+    with pytest.raises(ConfigurationError, match="not a saved run"):
+        resume(tmp_path)
+    shutil.copy(finished / RESUME, tmp_path)
+    with pytest.raises(ConfigurationError, match=r"config\.json"):
+        resume(tmp_path)
+
+
+@pytest.mark.parametrize("revisions", [("unknown", "abc"), ("abc", "unknown"), ("abc", "abc")])
+def test_an_unknown_revision_is_no_obstacle(revisions, finished, tmp_path, monkeypatch):
+    arrays, description = read_arrays(finished / RESUME)
+    write_arrays(tmp_path / RESUME, arrays, {**description, "git_revision": revisions[0]})
+    shutil.copy(finished / "config.json", tmp_path)
+    monkeypatch.setattr("marlbc_mj.provenance.git_revision", lambda: revisions[1])
+    assert len(resume(tmp_path)) == len(description["evaluations"])
+
+
+def test_equal_revisions_mean_equal_files(tmp_path, monkeypatch):
+    """In a repository of its own: every change of a tracked file changes the text, and undoing it brings the old one back."""
+    package = tmp_path / "marlbc_mj"
+    package.mkdir()
+    source = package / "provenance.py"
+    source.write_text("one")
+
+    def git(*arguments):
+        subprocess.run(
+            ["git", "-c", "user.name=a", "-c", "user.email=a@b", *arguments], cwd=tmp_path, check=True, capture_output=True
+        )
+
+    git("init")
+    git("add", "."), git("commit", "-m", "first")
+    monkeypatch.setattr(provenance, "__file__", str(source))
+    clean = provenance.git_revision()
+    texts = ["two", "three", "two", "one"]
+    said = [(source.write_text(text), provenance.git_revision())[1] for text in texts]
+    assert said[0] == said[2] != said[1] and said[3] == clean and len(clean) == 12
+    assert all(text.startswith(f"{clean}-dirty-") for text in said[:3])
 
 
 def test_no_space_left_is_one_line_and_keeps_the_old_file(tmp_path, monkeypatch):

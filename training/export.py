@@ -53,7 +53,7 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     model = build(policy, agents, metadata, onnx)
     with staged_file(out, overwrite=overwrite) as staging:
         staging.write_bytes(model.SerializeToString())
-    networks, values = policy.weights[-1].shape[0], _columns(policy)
+    networks, values = policy.weights[-1].shape[0], policy.columns
     return (
         f"{out}: state (batch, {len(policy.scale)}) and last (batch, {agents}) give "
         f"values (batch, {networks}, {values}) and orders (batch, {agents})"
@@ -70,11 +70,6 @@ def _onnx() -> ModuleType:
         return import_module("onnx")
     except ImportError:
         raise ConfigurationError("marlbc export needs the onnx package: pip install 'marlbc-mj[onnx]'") from None
-
-
-def _columns(policy: Policy) -> int:
-    """Values that a network gives for a state."""
-    return int((policy.biases[-1].shape[-1] - policy.dueling) // (2 if policy.risk else 1))
 
 
 class _Graph:
@@ -116,7 +111,7 @@ def build(policy: Policy, agents: int, metadata: dict[str, str], onnx: ModuleTyp
             helper.make_tensor_value_info("last", kinds.INT64, ["batch", agents]),
         ],
         [
-            helper.make_tensor_value_info("values", kinds.FLOAT, ["batch", networks, _columns(policy)]),
+            helper.make_tensor_value_info("values", kinds.FLOAT, ["batch", networks, policy.columns]),
             helper.make_tensor_value_info("orders", kinds.INT64, ["batch", agents]),
         ],
         graph.constants,
@@ -135,7 +130,7 @@ def _values(graph: _Graph, policy: Policy) -> str:
         y = graph.add("Relu", y) if k else y
         y = graph.add("Add", graph.add("MatMul", y, graph.constant(weight)), graph.constant(bias))
     y = graph.add("Transpose", y, perm=[1, 0, 2])
-    actions, first = _columns(policy), int(policy.dueling)
+    actions, first = policy.columns, int(policy.dueling)
     end = first + actions
     values = graph.columns(y, first, end)
     if policy.dueling:
@@ -156,7 +151,7 @@ def _greedy(graph: _Graph, policy: Policy, values: str, agents: int) -> None:
     fresh = graph.add("Less", graph.add("ReduceMin", "last", axes=[-1], keepdims=1), graph.whole(0))
     kept = graph.add("Max", "last", graph.whole(0))
     if joint:  # actions of the agents are digits of the joint one
-        each = round(_columns(policy) ** (1 / agents))
+        each = round(policy.columns ** (1 / agents))
         strides = graph.whole(*(each ** (agents - 1 - i) for i in range(agents)))
         kept = graph.add("ReduceSum", graph.add("Mul", kept, strides), graph.whole(-1), keepdims=1)
     best = graph.add("ArgMax", values, axis=-1, keepdims=1)

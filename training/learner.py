@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved
+from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved, with_moments
 from marlbc_mj.training.policy import admissible
 from marlbc_mj.training.replay import Batch
 
@@ -70,7 +70,7 @@ class Learner:
     def optimise(self, parameters: Iterable[nn.Parameter]) -> None:
         """Make these the parameters that are trained, with a fresh optimiser."""
         self.parameters = list(parameters)
-        self.optimiser = self.make_optimiser()
+        self.optimiser = with_moments(self.make_optimiser())
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Of ``parameters``."""

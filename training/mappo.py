@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TeamNetwork, restore, saved
+from marlbc_mj.training.networks import TeamNetwork, restore, saved, with_moments
 
 LAST_LAYER = 0.01
 """An actor's last layer starts this much smaller, so that all actions are about equally likely."""
@@ -43,7 +43,7 @@ class MAPPO(BaseTrainer):
         self.actors.weights[-1].data *= LAST_LAYER
         self.critic = network(1, agents)
         self.parameters = [*self.actors.parameters(), *self.critic.parameters()]
-        self.optimiser = torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5)
+        self.optimiser = with_moments(torch.optim.Adam(self.parameters, lr=config.learning_rate, eps=1e-5))
         self.scaling = ValueScale(agents)
         rows, worlds = config.ppo.rollout, config.worlds
         self.rows: dict[str, np.ndarray] = {

@@ -128,11 +128,22 @@ class TargetRing:
         return values.mean(dim=0), torch.sigmoid(risks).mean(dim=0)
 
 
+def with_moments(optimiser: torch.optim.Optimizer) -> torch.optim.Optimizer:
+    """The optimiser as it is before its first step, but with its moments in place, so that it is always saved whole."""
+    for parameter in (p for group in optimiser.param_groups for p in group["params"]):
+        parameter.grad = torch.zeros_like(parameter)
+    optimiser.step()  # by nothing
+    for moments in optimiser.state.values():
+        moments["step"].zero_()
+    optimiser.zero_grad()
+    return optimiser
+
+
 def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
     """Parameters and the optimiser's moments by name, not copied; ``adam`` is in the names whatever the optimiser is."""
     tensors = {f"network{k}": p.detach() for k, p in enumerate(parameters)}
     for k, p in enumerate(parameters):
-        tensors |= {f"adam{k}.{name}": value for name, value in optimiser.state.get(p, {}).items()}
+        tensors |= {f"adam{k}.{name}": value for name, value in optimiser.state[p].items()}
     return tensors
 
 
@@ -142,7 +153,6 @@ def restore(arrays: Mapping[str, np.ndarray], parameters: Sequence[nn.Parameter]
         p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
         prefix = f"adam{k}."
         moments = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-        if moments:
-            optimiser.state[p] = {
-                name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device) for name, array in moments.items()
-            }
+        optimiser.state[p] = {
+            name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device) for name, array in moments.items()
+        }

@@ -23,6 +23,15 @@ class Policy(NamedTuple):
     margin: float
     risk: float = 0.0  # largest admissible risk; 0 where the networks have no risks
 
+    @property
+    def columns(self) -> int:
+        """Values that a network gives for a state."""
+        return int((self.biases[-1].shape[-1] - self.dueling) // (2 if self.risk else 1))
+
+    def width(self, columns: int) -> int:
+        """Outputs that the last layer needs for so many values."""
+        return int(self.dueling) + columns * (2 if self.risk else 1)
+
     def values(self, state: np.ndarray) -> np.ndarray:
         """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
         first = self.weights[0]
@@ -32,7 +41,7 @@ class Policy(NamedTuple):
         for weight, bias in zip(self.weights[1:], self.biases[1:], strict=True):
             y = np.matmul(np.maximum(y, 0.0), weight) + bias
         y = y.transpose(1, 0, 2)
-        actions = (y.shape[-1] - self.dueling) // (2 if self.risk else 1)
+        actions = self.columns
         values, logits = y[..., self.dueling : self.dueling + actions], y[..., self.dueling + actions :]
         if self.dueling:
             values = y[..., :1] + values - values.mean(axis=-1, keepdims=True)

@@ -1,7 +1,7 @@
 """A training run on disk: evaluations, curves, best and last checkpoints, and what ``--resume`` continues from."""
 
 import csv
-import dataclasses
+import shutil
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -15,22 +15,22 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import check_folder, staged_file, write_json
+from marlbc_mj.files import check_folder, remove_leftovers, staged_file, write_json, writing
 from marlbc_mj.metrics import Metrics, measure
 from marlbc_mj.provenance import provenance
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.checkpoint import read_arrays, signature, write_arrays, write_policy
-from marlbc_mj.training.config import TrainConfig, from_json
+from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
 from marlbc_mj.training.policy import Policy
+from marlbc_mj.training.saved import CONFIG, check_origin, check_snapshot, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
 
 RESUME = "resume.safetensors"
-SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
-"""A run continues bit for bit only under the same versions of these."""
-
+TABLES = ("eval.csv", "progress.csv")
+CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
 Row = dict[str, float]
 
 
@@ -83,34 +83,43 @@ def train(
     """
     check_folder(out, overwrite=overwrite)
     run = Run(make_trainer(config), out)
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigurationError(f"cannot write {out}: {error.strerror}") from error
-    write_json(out / "config.json", {**run.origin, "train": config})
+        remove_run(out)
+    write_json(out / CONFIG, {**run.origin, "train": config})
     return run.go(progress)
+
+
+def remove_run(out: Path) -> None:
+    """Remove what a run leaves in its folder, first of all what a later :func:`resume` would take for the new run's."""
+    for name in (RESUME, CONFIG, *TABLES):
+        (out / name).unlink(missing_ok=True)
+    for name in (CHECKPOINT, TENSORBOARD):
+        if (out / name).is_dir():
+            shutil.rmtree(out / name)
+    remove_leftovers(out)
 
 
 def resume(out: Path, *, progress: Callable[[BaseTrainer, Row], None] | None = None) -> Interrupted | list[Row]:
     """Continue the run in ``out`` where it was last saved, bit for bit.
 
     Raises:
-        ConfigurationError: no run to continue there, torn, or made with other versions.
+        ConfigurationError: no run to continue there, torn, not of this code, or not of the configuration beside it.
     """
     path = out / RESUME
     if not path.is_file():
         raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
     arrays, description = read_arrays(path)
-    here = provenance()["versions"]
-    for name in SAME:
-        if description["versions"].get(name) != here[name]:
-            raise ConfigurationError(
-                f"{out} was trained with {name} {description['versions'].get(name)}, here is {here[name]}; "
-                "a run resumes only under the same versions"
-            )
-    run = Run(make_trainer(from_json(description["train"])), out)
-    run.trainer.restore(arrays, description["scalars"])
-    run.evaluations, run.curve, run.wall = description["evaluations"], description["curve"], description["wall_s"]
+    check_origin(path, description)
+    run = Run(make_trainer(saved_config(path, description["train"])), out)
+    check_snapshot(path, (arrays, description["scalars"]), run.trainer.snapshot())
+    try:
+        run.trainer.restore(arrays, description["scalars"])
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random stream's own checks
+        raise ConfigurationError(f"{path} does not fit the run that it was saved from: {error}") from error
+    run.evaluations, run.curve = (saved_rows(path, description[name]) for name in ("evaluations", "curve"))
+    run.wall = description["wall_s"]
+    remove_leftovers(out)
     run.write_rows()
     return run.go(progress)
 
@@ -132,7 +141,7 @@ class Run:
         """Run to the end of the budget, or until a signal."""
         config, trainer = self.config, self.trainer
         began, saved = monotonic() - self.wall, monotonic()
-        board = TensorBoard(self.out / "tensorboard")
+        board = TensorBoard(self.out / TENSORBOARD)
         with stopper() as stop:
             while not trainer.finished:
                 outcome = trainer.advance()
@@ -144,11 +153,12 @@ class Run:
                         progress(trainer, row)
                 elif progress:
                     progress(trainer, self.evaluations[-1])
-                if stop.signal or monotonic() - saved > config.save_every:
+                number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
+                if number or monotonic() - saved > config.save_every:
                     self.save()
                     saved = monotonic()
-                if stop.signal:
-                    return Interrupted(stop.signal)
+                if number:
+                    return Interrupted(number)
                 del outcome
         self.save()
         board.close()
@@ -174,9 +184,9 @@ class Run:
         )
         self.write_rows()
         description = self.describe(row)
-        write_policy(self.out / "checkpoint" / "last.safetensors", policy, description)
+        write_policy(self.out / CHECKPOINT / "last.safetensors", policy, description)
         if best is None or rank(row) > best:
-            write_policy(self.out / "checkpoint" / "best.safetensors", policy, description)
+            write_policy(self.out / CHECKPOINT / "best.safetensors", policy, description)
         return row
 
     def measure(self, policy: Policy) -> Metrics:
@@ -194,15 +204,15 @@ class Run:
 
     def write_rows(self) -> None:
         """eval.csv and progress.csv, each replaced by a whole one."""
-        write_table(self.out / "eval.csv", self.evaluations)
-        write_table(self.out / "progress.csv", self.curve)
+        for name, rows in zip(TABLES, (self.evaluations, self.curve), strict=True):
+            write_table(self.out / name, rows)
 
     def save(self) -> None:
         """What :func:`resume` continues from."""
         arrays, scalars = self.trainer.snapshot()
         description = {
             **self.origin,
-            "train": dataclasses.asdict(self.config),
+            "train": self.config,
             "scalars": scalars,
             "evaluations": self.evaluations,
             "curve": self.curve,

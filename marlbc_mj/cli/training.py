@@ -45,6 +45,7 @@ class Train:
 
         with training_display() as progress:
             if self.resume is not None:
+                self.refuse_others()
                 folder, ended = self.resume, run.resume(self.resume, progress=progress)
             else:
                 config = self.config()
@@ -60,6 +61,17 @@ class Train:
             f"return {best['return']:.0f}, switches {switches}, violation {best['violation_time']:.3f} s"
         )
         print(f"{folder / 'checkpoint'} holds the best and the last policy")
+
+    def refuse_others(self) -> None:
+        """A resumed run has its own settings.
+
+        Raises:
+            ConfigurationError: anything else was given with --resume.
+        """
+        given = [f.name for f in fields(self) if f.name != "resume" and getattr(self, f.name) != f.default]
+        if given:
+            names = ", ".join(name if name == "method" else f"--{name}" for name in given)
+            raise ConfigurationError(f"--resume continues a run in its folder with its own settings; leave out {names}")
 
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""

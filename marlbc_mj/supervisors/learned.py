@@ -12,7 +12,7 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.tasks.batch import order_of
 from marlbc_mj.tasks.states import OLD, State, make_state
-from marlbc_mj.training.checkpoint import check_signature, read_policy
+from marlbc_mj.training.checkpoint import check_policy, check_signature, read_policy
 from marlbc_mj.training.policy import Policy, greedy
 
 
@@ -43,7 +43,7 @@ class Learned:
         """From a checkpoint.
 
         Raises:
-            ConfigurationError: the file is missing, torn, or not a checkpoint.
+            ConfigurationError: the file is missing, torn, changed, or not a checkpoint of a policy.
         """
         policy, description = read_policy(path)
         return cls(policy, description["signature"], path)
@@ -52,11 +52,13 @@ class Learned:
         """Check the scenario against what the policy was trained for.
 
         Raises:
-            ConfigurationError: another team, other behaviors, slots or mission step.
+            ConfigurationError: another team, other behaviors, slots, mission step or path, see
+                :func:`~marlbc_mj.training.checkpoint.signature`; or networks that do not fit them.
         """
         check_signature(self.path, self.signature, scenario)
         read = make_state(str(self.signature["state"]), scenario)
         orders = order_of(scenario, str(self.signature["actions"]))
+        check_policy(self.path, self.policy, scenario.agents, len(orders), read.size)
         none = np.zeros((1, scenario.agents), dtype=np.int64)
         return LearnedMemory(read, orders, scenario, none, np.full(none.shape, OLD))
 

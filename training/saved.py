@@ -1,0 +1,115 @@
+"""What a saved run must be before it goes on: of the same code, whole, and made of what a new run is made of."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.provenance import UNKNOWN, plain_data, provenance
+from marlbc_mj.training.config import TrainConfig, flat_settings, from_json
+
+SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
+"""A run continues bit for bit only under the same versions of these, and the same revision where there is one."""
+KINDS: dict[str, type | tuple[type, ...]] = {
+    **{"versions": dict, "git_revision": str, "train": dict, "scalars": dict},
+    **{"evaluations": list, "curve": list, "wall_s": (int, float)},
+}
+"""Types of what a saved run says of itself, by name."""
+CONFIG = "config.json"
+
+Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
+"""Arrays, and the rest as JSON data."""
+
+
+def check_origin(path: Path, description: Mapping[str, Any]) -> None:
+    """Raise ConfigurationError where a file is no saved run, or one of other versions or another revision of the code."""
+    for name, kind in KINDS.items():
+        if not isinstance(description.get(name), kind):
+            raise ConfigurationError(f"{path} is not a saved run: it says no {name}")
+    here = provenance()
+    revisions = description["git_revision"], here["git_revision"]
+    pairs = {name: (description["versions"].get(name), here["versions"][name]) for name in SAME}
+    if UNKNOWN not in revisions:
+        pairs["revision"] = revisions
+    for name, (there, now) in pairs.items():
+        if there != now:
+            raise ConfigurationError(
+                f"{path} was saved with {name} {there}, here is {now}; a run resumes only under the same versions"
+            )
+
+
+def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
+    """The configuration that a run was saved with.
+
+    Raises:
+        ConfigurationError: it has other settings than runs of this version, or other values than ``config.json`` beside it.
+    """
+    config, found = from_json(train), flat_settings(train)
+    odd = sorted(found.keys() ^ flat_settings(plain_data(config)).keys())
+    if odd:
+        raise ConfigurationError(f"{path} was saved by another version: it and this one do not both have {', '.join(odd)}")
+    beside = path.with_name(CONFIG)
+    try:
+        said = flat_settings(json.loads(beside.read_text())["train"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigurationError(f"cannot read the configuration of the run from {beside}: {error}") from error
+    odd = sorted(name for name in found.keys() | said.keys() if found.get(name) != said.get(name))
+    if odd:
+        differences = ", ".join(f"{name} {said.get(name)} instead of {found.get(name)}" for name in odd)
+        raise ConfigurationError(f"{beside} is not of the run that was saved in {path.name}: it says {differences}")
+    return config
+
+
+def saved_rows(path: Path, rows: list[Any]) -> list[dict[str, float]]:
+    """Lines of a run's tables.
+
+    Raises:
+        ConfigurationError: they are none.
+    """
+    try:
+        return [{str(name): float(value) for name, value in row.items()} for row in rows]
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ConfigurationError(f"{path} is not a saved run: its tables are damaged, {error}") from error
+
+
+def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
+    """Raise ConfigurationError where a saved snapshot is not made of what that of a ``new`` run is made of, naming the first
+    difference: arrays of the same names, shapes and types, and numbers of the same names.
+    """
+    (arrays, scalars), (like, numbers) = found, new
+    fault = ""
+    for name in sorted(arrays.keys() | like.keys()):
+        if name not in arrays or name not in like:
+            fault = f"array {name} is {'missing' if name in like else 'not of such a run'}"
+        elif (arrays[name].shape, arrays[name].dtype) != (like[name].shape, like[name].dtype):
+            a, b = arrays[name], like[name]
+            fault = f"array {name} is {a.dtype} {a.shape}, not {b.dtype} {b.shape}"
+        if fault:
+            break
+    fault = fault or _difference(scalars, numbers, "scalars")
+    if fault:
+        raise ConfigurationError(f"{path} does not fit the run that it was saved from: {fault}")
+
+
+def _difference(found: Any, like: Any, where: str) -> str:
+    """Where two pieces of JSON data differ in kind; nothing where they do not. Whole numbers count things: none is negative."""
+    if isinstance(like, dict):
+        if not isinstance(found, dict) or found.keys() != like.keys():
+            return f"{where} must have {', '.join(like)}"
+        return next(filter(None, (_difference(found[name], like[name], f"{where}.{name}") for name in like)), "")
+    if isinstance(like, list):
+        if not isinstance(found, list) or len(found) != len(like):
+            return f"{where} must have {len(like)} entries"
+        pairs = enumerate(zip(found, like, strict=True))
+        return next(filter(None, (_difference(a, b, f"{where}[{k}]") for k, (a, b) in pairs)), "")
+    if isinstance(like, float):
+        fits = isinstance(found, int | float) and math.isfinite(found)
+    elif isinstance(like, int):
+        fits = isinstance(found, int) and found >= 0
+    else:
+        fits = bool(found == like)
+    return "" if fits and not isinstance(found, bool) else f"{where} is {found!r}"
