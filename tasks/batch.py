@@ -54,7 +54,7 @@ class Starts:
     length: float = 20.0  # [s]
     focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
     lead: float = 8.0  # how long before, at the most [s]
-    turning: float = 0.0  # share of the exploring starts that are to begin with the whole team changing to the other formation
+    turning: float = 0.0  # share of the exploring starts that are to begin with the whole team taking one formation, either
 
     def __post_init__(self) -> None:
         for name in ("exploring", "focus", "turning"):
@@ -276,7 +276,7 @@ class FormationBatch:
             positions = centre + scenario.formations[1]
         commands = rng.choice(self.keeping[which], size=scenario.agents)
         if happens(self.starts.turning, rng):
-            self.turn[b] = self.action_of[self.keeping[1 - which][0]]
+            self.turn[b] = self.action_of[self.keeping[int(rng.integers(2))][0]]
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
 

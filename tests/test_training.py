@@ -155,7 +155,7 @@ def test_the_leniency_that_is_stored_is_that_of_the_action_before_it_cooled():
     """Also in decisions whose episode ends in them, so that their temperature falls at once."""
     config = make_config(
         "fast", worlds=250, interval=2, hidden=(4,), batch=8, updates=1, capacity=10_000, threads=1, exploring_starts=1.0,
-        start_length=0.5, hash="plain", bits=4, least_leniency=0.0,
+        start_length=0.5, hash="plain", bits=4,
     )  # fmt: skip
     trainer, cooled = Trainer(config), 0
     for _ in range(32):
@@ -336,13 +336,10 @@ def test_exploration_follows_the_temperature():
 
 @pytest.mark.parametrize("temperature", [[0.03] * N, [0.5] * N, [1.0] * N, [0.1, 0.6, 0.9]])
 @pytest.mark.parametrize(("hold", "together"), [(1, 0.0), (1, 0.5), (6, 0.0), (6, 0.5), (3, 1.0)])
-@pytest.mark.parametrize("subsets", [0.0, 0.4, 1.0])
-def test_the_share_of_random_orders_is_the_temperature(hold, together, subsets, temperature):
+def test_the_share_of_random_orders_is_the_temperature(hold, together, temperature):
     """In every decision of an episode, the first as well as later ones, for each agent, whatever is held and shared."""
     worlds, decisions = 3000, 14
-    config = replace(
-        TrainConfig(), worlds=worlds, hold=hold, together=together, subsets=subsets, least_exploration=0.0, capacity=30_000
-    )
+    config = replace(TrainConfig(), worlds=worlds, hold=hold, together=together, least_exploration=0.0, capacity=30_000)
     explore, rng, best = Exploration(config, N, A), np.random.default_rng(3), np.full((worlds, N), 9)
     explore(best, np.ones(best.shape), rng)
     explore.forget(np.ones(worlds, dtype=bool))
@@ -353,10 +350,10 @@ def test_the_share_of_random_orders_is_the_temperature(hold, together, subsets, 
     assert (abs(found.mean(axis=(0, 1)) - share) <= 4.5 * error * np.sqrt(min(hold, decisions) / decisions) + 1e-9).all()
 
 
-@given(st.lists(st.floats(0, 1), min_size=N, max_size=N), st.floats(0, 1), st.floats(0, 1))
-def test_joint_and_own_shares_make_up_the_whole(share, together, subsets):
-    joint, alone = shares(np.array([share]), together, subsets)
-    taking = joint[0] * (1.0 - subsets / 2)
+@given(st.lists(st.floats(0, 1), min_size=N, max_size=N), st.floats(0, 1))
+def test_joint_and_own_shares_make_up_the_whole(share, together):
+    joint, alone = shares(np.array([share]), together)
+    taking = joint[0]
     assert 0 <= joint[0] <= 1 and (alone >= 0).all() and (alone <= 1).all()
     assert np.allclose(taking + (1 - taking) * alone, share, atol=1e-9)
     if max(share) == min(share) and joint[0] < 1:
@@ -364,10 +361,10 @@ def test_joint_and_own_shares_make_up_the_whole(share, together, subsets):
 
 
 def test_of_equal_agents_explorations_the_share_together_is_joint():
-    """A share ``together`` of an agent's random orders are the team's; with subsets, some agents are left to themselves."""
+    """A share ``together`` of an agent's random orders are the team's."""
     best, rng = np.full((3000, N), 9), np.random.default_rng(0)
-    for together, subsets in ((0.5, 0.0), (0.3, 1.0)):
-        config = replace(TrainConfig(), worlds=3000, hold=4, together=together, subsets=subsets, capacity=30_000)
+    for together in (0.5, 0.3):
+        config = replace(TrainConfig(), worlds=3000, hold=4, together=together, capacity=30_000)
         explore = Exploration(config, N, 10_000)
         explored = joint = 0
         for _ in range(20):
@@ -375,8 +372,7 @@ def test_of_equal_agents_explorations_the_share_together_is_joint():
             mine = chosen[:, 0] != 9
             explored += mine.sum()
             joint += (mine & (chosen[:, :1] == chosen[:, 1:]).any(axis=1)).sum()
-        seen = 1.0 if subsets == 0.0 else 1.0 - 0.5 ** (N - 1)  # of the joint ones, how many have a second member
-        assert joint / explored == pytest.approx(together * seen, abs=0.02)
+        assert joint / explored == pytest.approx(together, abs=0.02)
 
 
 def test_held_orders_last_and_are_shared():

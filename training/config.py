@@ -109,8 +109,11 @@ class TrainConfig:
     focus: float = 0.7
     """Share of them that begin shortly before a slot of the formation comes too close to an obstacle, or is free again."""
     turning: float = 0.5
-    """Share of them that begin with the whole team changing to the other formation: what a joint change leads to. Nobody gains
-    from changing alone, so that without them a bad habit of the team can be everyone's best answer to it."""
+    """Share of them that begin with the whole team taking one formation, either, for 1 to ``hold`` decisions: what changing, or
+    waiting, jointly leads to. Nobody gains from changing alone, so a bad habit of all can be everyone's best answer to it."""
+    turn_until: float = 0.5
+    """Share of the budget after which there are no more of these: from then on, values tell what follows from what the others
+    really do."""
 
     hidden: tuple[int, ...] = (64, 64)
     """Widths of the hidden layers."""
@@ -147,8 +150,6 @@ class TrainConfig:
 
     learner: str = "lenient"
     """What becomes of a negative TD error: lenient, hysteretic (half of it counts), plain."""
-    least_leniency: float = 0.0
-    """L never falls below it: what cold states still overlook. Others' exploration is noise that never ends."""
     hash: str = "autoencoder"
     """States are hashed by the codes of an auto-encoder (autoencoder) or as they are (plain)."""
     bits: int = 16
@@ -159,9 +160,9 @@ class TrainConfig:
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: float = 0.7
     """Share of an agent's explorations in which it takes one random order with the whole team."""
-    subsets: float = 0.0
-    """Share of joint explorations in which every agent stays out with probability 1/2 and acts as if there were none: what
-    happens when some lead and others must follow."""
+    agreement: float = 0.3
+    """Where somebody wants to change its order and not all want the same, the chance that all take one member's, whoever's: they
+    learn what waiting for each other and following each other is worth."""
     least_exploration: float = 0.01
     """Exploration never falls below it."""
     switching_margin: float = 0.1
@@ -230,7 +231,7 @@ AT_LEAST_ONE = (
     "threads",
 )
 SHARES = (
-    *("exploring_starts", "focus", "turning", "together", "subsets", "least_leniency", "least_exploration", "smoothing"),
+    *("exploring_starts", "focus", "turning", "turn_until", "together", "agreement", "least_exploration", "smoothing"),
     *("risk_gamma", "risk_limit"),
 )
 MOST_BITS = 24
@@ -310,6 +311,7 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             updates=1,
             hold=1,
             together=0.0,
+            agreement=0.0,
             least_exploration=0.0,
             switching_margin=0.0,
             smoothing=0.0,

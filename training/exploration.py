@@ -15,11 +15,10 @@ class Exploration:
     Every agent has random orders of its own, and the team has joint ones, which go before: while an agent takes part in a joint
     exploration its own stands still. Each of these is busy for a share of the decisions, see :meth:`_hold`, independently of
     the others, so that an agent's actions are random in exactly the share T^zeta of all decisions, the first of an episode as
-    well as the last, for any ``hold``, ``together`` and ``subsets``. An agent that stays out of a joint exploration
-    acts as if there were none.
+    well as the last, for any ``hold`` and ``together``.
 
     Args:
-        config: hold, together, subsets and least_exploration of it are used.
+        config: hold, together and least_exploration of it are used.
         agents: N.
         actions: A.
     """
@@ -30,31 +29,52 @@ class Exploration:
         shape = config.worlds, agents + 1  # one column an agent, the team's last
         self.left = np.full(shape, BEGINNING, dtype=np.int64)  # decisions that a held order still lasts
         self.held = np.zeros(shape, dtype=np.int64)
-        self.joins = np.ones((config.worlds, agents), dtype=bool)  # who takes part in the joint exploration
         lengths = np.arange(config.hold, 0, -1.0)
         self.rest = lengths / lengths.sum()  # chance that 1, 2, ... decisions are left of an order under way
 
-    def __call__(self, greedy: np.ndarray, temperature: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """(B, N) actions from greedy ones (B, N) and each agent's mean temperature (B, N)."""
-        joint, alone = shares(self._share(temperature), self.config.together, self.config.subsets)
+    def __call__(
+        self,
+        greedy: np.ndarray,
+        temperature: np.ndarray,
+        rng: np.random.Generator,
+        *,
+        last: np.ndarray | None = None,
+        allowed: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """(B, N) actions.
+
+        Args:
+            greedy: (B, N) the best actions.
+            temperature: (B, N) each agent's mean temperature.
+            rng: of all draws.
+            last: (B, N) actions in force, by which a disagreement is told; without them there is none.
+            allowed: (B, N, A) bool; an agent stays out of what the team does jointly while the order is not allowed for it: what
+                the team would gain by endangering a member must not make the order look good to the others.
+        """
+        greedy = greedy if last is None else self._agree(greedy, last, allowed, rng)
+        joint, alone = shares(self._share(temperature), self.config.together)
         inside = np.zeros(greedy.shape, dtype=bool)
         if self.config.together or (self.left[:, -1] > 0).any():
             everybody = np.ones((len(greedy), 1), dtype=bool)
-            busy, begun = self._hold(slice(-1, None), joint[:, None], everybody, rng)
-            if self.config.subsets:
-                some = (rng.random(len(greedy)) < self.config.subsets)[:, None] & (rng.random(greedy.shape) < 0.5)
-                self.joins = np.where(begun, ~some, self.joins)
-            inside = busy & self.joins
-        busy, _ = self._hold(slice(-1), alone, ~inside, rng)
+            inside = np.repeat(self._hold(slice(-1, None), joint[:, None], everybody, rng), greedy.shape[1], axis=1)
+            inside &= _permits(allowed, self.held[:, -1])
+        busy = self._hold(slice(-1), alone, ~inside, rng)
         return np.where(inside, self.held[:, -1:], np.where(busy, self.held[:, :-1], greedy))
+
+    def _agree(self, greedy: np.ndarray, last: np.ndarray, allowed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
+        """Where somebody wants to change its order and not all want the same, all may take one member's instead."""
+        if not self.config.agreement:
+            return greedy
+        torn = (greedy != greedy[:, :1]).any(axis=1) & (greedy != last).any(axis=1)
+        agree = torn & (rng.random(len(greedy)) < self.config.agreement)
+        order = greedy[np.arange(len(greedy)), rng.integers(greedy.shape[1], size=len(greedy))]
+        return np.where(agree[:, None] & _permits(allowed, order), order[:, None], greedy)
 
     def _share(self, temperature: np.ndarray) -> np.ndarray:
         return np.asarray(np.maximum(temperature**ZETA, self.config.least_exploration))
 
-    def _hold(
-        self, columns: slice, share: np.ndarray, runs: np.ndarray, rng: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Bool: where a held order is in force, and where it has just begun; columns of those that do not ``run`` stand still.
+    def _hold(self, columns: slice, share: np.ndarray, runs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Bool: where a held order is in force; columns of those that do not ``run`` stand still.
 
         Orders last m = (hold + 1) / 2 decisions on average, so that one that begins in a free decision with probability
         s / (s + m (1 - s)) is in force in the share s of all decisions. An episode begins amid that: with probability s an order
@@ -69,29 +89,31 @@ class Exploration:
         left = np.where(begun, length, np.where(runs, np.maximum(self.left[:, columns], 0), self.left[:, columns]))
         busy = runs & (left > 0)
         self.left[:, columns] = left - busy
-        return busy, begun
+        return np.asarray(busy)
 
     def begin(self, orders: np.ndarray, rng: np.random.Generator) -> None:
         """Have whole teams take one order for 1 to ``hold`` decisions; ``orders`` (B,), -1 for teams that go on as they are."""
         teams = orders >= 0
         self.held[teams, -1] = orders[teams]
         self.left[teams, -1] = rng.integers(1, self.config.hold + 1, size=int(teams.sum()))
-        self.joins[teams] = True
 
     def forget(self, ended: np.ndarray) -> None:
         """Drop held orders of worlds whose episode ended; ``ended`` (B,)."""
         self.left[ended] = BEGINNING
 
 
-def shares(share: np.ndarray, together: float, subsets: float) -> tuple[np.ndarray, np.ndarray]:
+def _permits(allowed: np.ndarray | None, order: np.ndarray) -> np.ndarray | bool:
+    """(B, N) bool: to which agents each team's ``order`` (B,) is allowed."""
+    return True if allowed is None else np.asarray(allowed[np.arange(len(order)), :, order])
+
+
+def shares(share: np.ndarray, together: float) -> tuple[np.ndarray, np.ndarray]:
     """Shares of joint explorations (B,), and of agents' own (B, N) outside of these, that make up each agent's ``share`` (B, N).
 
-    An agent takes part in p = 1 - subsets / 2 of the joint ones. j p = together * (mean share), or the smallest share where
-    agents differ so much that the joint orders alone would be too many for one, and j <= 1; then s = j p + (1 - j p) alone.
+    j = together * (mean share), or the smallest share where agents differ so much that the joint orders alone would be too many
+    for one; then s = j + (1 - j) alone.
     """
-    taking = 1.0 - subsets / 2
-    joint = np.minimum(np.minimum(together * share.mean(axis=1), share.min(axis=1)) / taking, 1.0)
-    inside = (joint * taking)[:, None]
-    rest = 1.0 - inside
-    alone = np.divide(share - inside, rest, out=np.zeros_like(share), where=rest > 0)
+    joint = np.minimum(together * share.mean(axis=1), share.min(axis=1))
+    rest = 1.0 - joint[:, None]
+    alone = np.divide(share - joint[:, None], rest, out=np.zeros_like(share), where=rest > 0)
     return joint, np.clip(alone, 0.0, 1.0)

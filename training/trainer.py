@@ -69,8 +69,10 @@ class Trainer(BaseTrainer):
             self._fit_hash()
         codes = self.hash((self.state / self.batch.read.scale).astype(np.float32))
         warmth = self.temperatures.read(codes)
-        best = greedy(self.learner.values(self.state), self.batch.last, self.batch.fresh, config.switching_margin)
-        actions = self.exploration(best, warmth.mean(axis=-1), self.rng)
+        values = self.learner.values(self.state)
+        best = greedy(values, self.batch.last, self.batch.fresh, config.switching_margin)
+        allowed = values > -np.inf if config.risk_gamma else None
+        actions = self.exploration(best, warmth.mean(axis=-1), self.rng, last=self.batch.last, allowed=allowed)
         self.explored = float((actions != best).mean())
         lenient = leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0])
         outcome = self.batch.step(actions)
@@ -80,7 +82,7 @@ class Trainer(BaseTrainer):
             final=outcome.final_state,
             action=actions,
             reward=reward,
-            leniency=np.maximum(lenient, config.least_leniency),
+            leniency=lenient,
             lost=gone,
             code=codes,
             ended=outcome.ended,
@@ -114,7 +116,8 @@ class Trainer(BaseTrainer):
             self.temperatures.cool(replay.arrays["code"], replay.arrays["action"], int(b), first, replay.count - 1)
         self.first[ended] = replay.count
         self.exploration.forget(ended)
-        self.exploration.begin(np.where(ended, self.batch.turn, -1), self.rng)
+        if self.steps < self.config.turn_until * self.config.budget:
+            self.exploration.begin(np.where(ended, self.batch.turn, -1), self.rng)
 
     def _learn(self, share: float) -> None:
         config = self.config
@@ -149,4 +152,4 @@ class Trainer(BaseTrainer):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
-        return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held", "joins"))]
+        return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held"))]
