@@ -128,9 +128,19 @@ def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
     return ""
 
 
-KINDS: dict[str, type | tuple[type, ...]] = {
-    **{"agents": int, "commands": list, "slots": list, "mission_step": float, "path_velocity": list, "safe_distance": float},
-    **{"formation_tolerance": float, "reference": str, "state": str, "layout": dict, "actions": str, "interval": int},
+KINDS: dict[str, type] = {
+    "agents": int,
+    "commands": list,
+    "slots": list,
+    "mission_step": float,
+    "path_velocity": list,
+    "safe_distance": float,
+    "formation_tolerance": float,
+    "reference": str,
+    "state": str,
+    "layout": dict,
+    "actions": str,
+    "interval": int,
 }
 """Types of a signature's entries, by name."""
 

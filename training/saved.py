@@ -15,8 +15,13 @@ from marlbc_mj.training.config import TrainConfig, flat_settings, from_json
 SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
 """A run continues bit for bit only under the same versions of these, and the same revision where there is one."""
 KINDS: dict[str, type | tuple[type, ...]] = {
-    **{"versions": dict, "git_revision": str, "train": dict, "scalars": dict},
-    **{"evaluations": list, "curve": list, "wall_s": (int, float)},
+    "versions": dict,
+    "git_revision": str,
+    "train": dict,
+    "scalars": dict,
+    "evaluations": list,
+    "curve": list,
+    "wall_s": (int, float),
 }
 """Types of what a saved run says of itself, by name."""
 CONFIG = "config.json"
