@@ -112,7 +112,7 @@ def _difference(found: Any, like: Any, where: str) -> str:
         pairs = enumerate(zip(found, like, strict=True))
         return next(filter(None, (_difference(a, b, f"{where}[{k}]") for k, (a, b) in pairs)), "")
     if isinstance(like, float):
-        fits = isinstance(found, int | float) and math.isfinite(found)
+        fits = isinstance(found, int | float) and abs(found) < math.inf
     elif isinstance(like, int):
         fits = isinstance(found, int) and found >= 0
     else:
