@@ -111,7 +111,7 @@ def test_types_that_numpy_does_not_have_are_one_line(tmp_path):
     assert str(path) in refusal(lambda: read_policy(path))
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, "[]", "null", '{"format": 2}', '{"format": 1, "sha256": ""}'])
+@pytest.mark.parametrize("text", ["[" * 100_000, "9" * 5_000, "[]", "null", '{"format": 2}', '{"format": 1, "sha256": ""}'])
 def test_headers_of_another_kind_are_one_line(text, tmp_path):
     path = tmp_path / "p.safetensors"
     save_file({"x": np.zeros(3, np.float32)}, path, {"marlbc_mj": text})
@@ -133,6 +133,7 @@ def test_headers_of_another_kind_are_one_line(text, tmp_path):
         ({**SAID, "risk": 2.0, **signed()}, "risk 2.0"),
         ({**SAID, "margin": "wide", **signed()}, "networks of a policy"),
         ({**SAID, "margin": "nan", **signed()}, "margin is nan"),
+        ({**SAID, "margin": 10**400, **signed()}, "networks of a policy"),
         ({**SAID, "dueling": False, **signed()}, "9 outputs"),
     ],
 )

@@ -257,7 +257,7 @@ def test_exploring_starts_lie_on_the_route_and_are_cut():
 
 def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
     """Against copies of the worlds that go on past the ends: in worlds that end it is the old episode's, in others the state."""
-    batch = FormationBatch(paper(perturbation=AROUND), worlds=12, interval=2, starts=Starts(exploring=0.5, length=1.0))
+    batch = FormationBatch(paper(perturbation=AROUND), worlds=12, interval=2, starts=Starts(exploring=0.8, length=1.0))
     batch.reset(5)
     twin, rng, partial = World(paper(perturbation=AROUND), worlds=12), np.random.default_rng(0), 0
     batch.cut[batch.cut < 2000] += rng.integers(10, size=(batch.cut < 2000).sum())  # so that they end apart
@@ -275,7 +275,7 @@ def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
         assert (outcome.final_state[~ended] == outcome.state[~ended]).all()
         assert (outcome.final_state[ended] != outcome.state[ended]).any(axis=1).all()
         partial += bool(ended.any() and not ended.all() and (outcome.truncated == ended).all())
-    assert partial >= 5
+    assert partial >= 3
 
 
 def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives():

@@ -353,7 +353,7 @@ DAMAGED_RUNS = {
     "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
     "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
     "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
-    "other setting": (lambda a, d: (a, put(d, 0.5, "train", "gamma")), "gamma 0.99 instead of 0.5"),
+    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 40000 instead of 7"),
 }
 
 

@@ -64,7 +64,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise ConfigurationError(f"cannot read checkpoint {path}: {getattr(error, 'strerror', None) or error}") from error
     try:
         description = json.loads(header or "")
-    except (json.JSONDecodeError, RecursionError):
+    except (ValueError, RecursionError):
         raise ConfigurationError(f"{path} is no checkpoint of marlbc_mj: its header does not describe one") from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else description
@@ -97,7 +97,7 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
         weights = tuple(arrays[f"weight{k}"] for k in range(layers))
         biases = tuple(arrays[f"bias{k}"] for k in range(layers))
         policy = Policy(weights, biases, arrays["scale"], *settings)
-    except (KeyError, TypeError, ValueError):
+    except (KeyError, OverflowError, TypeError, ValueError):
         raise ConfigurationError(f"checkpoint {path} does not hold the networks of a policy") from None
     fault = _fault(policy, arrays) or _unsigned(description.get("signature"))
     if fault:
@@ -128,9 +128,19 @@ def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
     return ""
 
 
-KINDS: dict[str, type | tuple[type, ...]] = {
-    **{"agents": int, "commands": list, "slots": list, "mission_step": float, "path_velocity": list, "safe_distance": float},
-    **{"formation_tolerance": float, "reference": str, "state": str, "layout": dict, "actions": str, "interval": int},
+KINDS: dict[str, type] = {
+    "agents": int,
+    "commands": list,
+    "slots": list,
+    "mission_step": float,
+    "path_velocity": list,
+    "safe_distance": float,
+    "formation_tolerance": float,
+    "reference": str,
+    "state": str,
+    "layout": dict,
+    "actions": str,
+    "interval": int,
 }
 """Types of a signature's entries, by name."""
 

@@ -15,8 +15,13 @@ from marlbc_mj.training.config import TrainConfig, flat_settings, from_json
 SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
 """A run continues bit for bit only under the same versions of these, and the same revision where there is one."""
 KINDS: dict[str, type | tuple[type, ...]] = {
-    **{"versions": dict, "git_revision": str, "train": dict, "scalars": dict},
-    **{"evaluations": list, "curve": list, "wall_s": (int, float)},
+    "versions": dict,
+    "git_revision": str,
+    "train": dict,
+    "scalars": dict,
+    "evaluations": list,
+    "curve": list,
+    "wall_s": (int, float),
 }
 """Types of what a saved run says of itself, by name."""
 CONFIG = "config.json"
@@ -107,7 +112,7 @@ def _difference(found: Any, like: Any, where: str) -> str:
         pairs = enumerate(zip(found, like, strict=True))
         return next(filter(None, (_difference(a, b, f"{where}[{k}]") for k, (a, b) in pairs)), "")
     if isinstance(like, float):
-        fits = isinstance(found, int | float) and math.isfinite(found)
+        fits = isinstance(found, int | float) and abs(found) < math.inf
     elif isinstance(like, int):
         fits = isinstance(found, int) and found >= 0
     else:
