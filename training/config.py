@@ -133,7 +133,7 @@ class TrainConfig:
     """Of Adam, at the end; linear in between."""
     batch: int = 256
     """Transitions of an update."""
-    updates: int = 4
+    updates: int = 8
     """Updates after each decision of all worlds."""
     capacity: int = 50_000
     """Transitions in the replay buffer."""
@@ -167,7 +167,7 @@ class TrainConfig:
     """Exploration never falls below it."""
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by this."""
-    shaping: Shaping = Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.05, own_switch_cost=40.0, haste_cost=400.0)
+    shaping: Shaping = Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.05, own_switch_cost=40.0, haste_cost=300.0)
     """The reward that is learned from."""
     ppo: PPO = PPO()
     """Of MAPPO alone."""
@@ -274,7 +274,9 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
             "final_learning_rate": 5e-3,
             "batch": 32,
             "capacity": 5_000,
+            "turning": 0.0,
             "together": 0.0,
+            "agreement": 0.0,
         },
         "single agents side by side: own state, formation with or without avoidance, prioritised replay",
     ),

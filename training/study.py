@@ -72,8 +72,13 @@ VARIANTS: dict[str, Variant] = {
     "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
     "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
     "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
-    "no-held-exploration": Variant(
-        "a random order lasts one decision, of one agent", "preset", changes={"hold": 1, "together": 0.0}
+    "uniform-starts": Variant(
+        "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
+    ),
+    "no-joint-exploration": Variant(
+        "a random order lasts one decision, of one agent",
+        "preset",
+        changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
     ),
     "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
     "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
