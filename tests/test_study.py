@@ -15,6 +15,7 @@ from marlbc_mj.cli.study import Job, plan, run_job, run_study
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.report.table import to_markdown
 from marlbc_mj.training import run
+from marlbc_mj.training.checkpoint import read_arrays, write_arrays
 from marlbc_mj.training.config import CARE, TrainConfig
 from marlbc_mj.training.study import (
     COLUMNS,
@@ -138,6 +139,16 @@ def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch:
     assert len(one) == 2 and one == other
 
 
+def test_an_interrupted_run_of_other_code_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (job,) = jobs_of(tmp_path, "marlms")
+    interrupted(job, monkeypatch)
+    arrays, description = read_arrays(job.folder / run.RESUME)
+    write_arrays(job.folder / run.RESUME, arrays, {**description, "versions": {}})
+    said: list[str] = []
+    assert run_job(job, said.append).how == "finished"
+    assert said[0] == "marlms seed 0: begins" and len(evaluations(job.folder)) == 2
+
+
 def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With its reason in every file, beside those that ran; the next call tries it again, and success removes the reason."""
     original = run.make_trainer
@@ -211,7 +222,8 @@ def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
         "no-leniency": {"method": "iql", "learner": "plain"},
         "no-risk": CARE,
         "no-exploring-starts": {"exploring_starts": 0.0},
-        "no-held-exploration": {"hold": 1, "together": 0.0},
+        "uniform-starts": {"focus": 0.0, "turning": 0.0},
+        "no-joint-exploration": {"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
         "printed-state": {"state": "printed"},
         "no-centring": {"shaping": replace(base.shaping, centre=0.0)},
     }

@@ -124,6 +124,15 @@ def resume(out: Path, *, progress: Callable[[BaseTrainer, Row], None] | None = N
     return run.go(progress)
 
 
+def resumable(out: Path) -> bool:
+    """Whether ``out`` holds a whole saved run of this code; of any other, a study begins anew."""
+    try:
+        check_origin(out / RESUME, read_arrays(out / RESUME)[1])
+    except ConfigurationError:
+        return False
+    return True
+
+
 class Run:
     """A trainer with its folder: evaluates, logs and saves at set intervals."""
 

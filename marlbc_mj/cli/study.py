@@ -168,7 +168,7 @@ def run_job(job: Job, say: Say, stopping: Callable[[], bool] = lambda: False) ->
     from marlbc_mj.training import run
     from marlbc_mj.training.study import DONE, FAILED
 
-    folder, begun = job.folder, (job.folder / run.RESUME).is_file()
+    folder, begun = job.folder, run.resumable(job.folder)
     if (folder / DONE).is_file():
         _prune(folder)
         return Ended(job.key, "found")
