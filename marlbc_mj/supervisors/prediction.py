@@ -120,10 +120,9 @@ def judge(
 
 def follow(twin: World, situation: Situation) -> None:
     """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
-    state, model = twin.state, twin.plan
+    state = twin.state
     state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
-    twin.data[0].qpos[model.indices[0]] = situation.position
-    twin.data[0].qvel[model.indices[1]] = situation.velocity
+    state.put(0, twin.data[0], situation.position, situation.velocity)
 
 
 def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:
