@@ -86,7 +86,7 @@ def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, robot: Robot)
     as large as the scenario says, on a body that an episode's draw can move.
     """
     radius = max(obstacle.radius, POINT_RADIUS * robot.length)
-    height = OBSTACLE_HEIGHT * robot.length
+    height = max(OBSTACLE_HEIGHT * robot.length, 1.5 * robot.height)
     place, parent = [obstacle.x, obstacle.y, 0.5 * height], spec.worldbody
     if robot.contact:
         parent = spec.worldbody.add_body(name=f"obstacle{k + 1}", pos=[obstacle.x, obstacle.y, 0.0], mocap=True)

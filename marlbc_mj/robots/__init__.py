@@ -5,10 +5,18 @@ from functools import cache
 
 from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.robots.base import MODELS, Robot
+from marlbc_mj.robots.crazyflie import CRAZYFLIE, crazyflie
+from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
+from marlbc_mj.robots.disc import DISC, disc
+from marlbc_mj.robots.omni import OMNI, omni
 from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
 
 ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
     "point_mass": (point_mass, POINT_MASS),
+    "disc": (disc, DISC),
+    "omni": (omni, OMNI),
+    "diff_drive": (diff_drive, DIFF_DRIVE),
+    "crazyflie": (crazyflie, CRAZYFLIE),
 }
 """Factory and one line of description by name."""
 

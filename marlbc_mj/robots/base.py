@@ -54,6 +54,7 @@ class Robot:
     gains: tuple[float, float] = (100.0, 100.0)  # that track a step without overshoot, per unit mass [1/s^2, 1/s]
     length: float = 1.0  # what 1 m of the paper's mission is for this robot [m]
     substep: float = np.inf  # largest that its contacts and inner loops take [s]
+    height: float = 0.0  # that it flies at [m]
     contact: bool = False  # obstacles and other agents are solid
     prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
 
