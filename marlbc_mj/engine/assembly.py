@@ -60,8 +60,8 @@ def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
         setattr(spec.option, name, getattr(child.option, name))
     if not robot.direct or robot.contact:
         spec.memory = MEMORY + agents * MEMORY_OF_CONTACTS
-    if robot.length != 1.0:
-        spec.add_numeric(name="length", data=[robot.length])
+    if robot.mass is not None:
+        spec.add_numeric(name="robot", data=[robot.length, robot.radius])  # the size of marks and cameras
         spec.material("ground").texrepeat = np.array(spec.material("ground").texrepeat) / robot.length
 
 

@@ -59,7 +59,7 @@ def diff_drive() -> Robot:
         mjcf=_MJCF,
         joints=("root",),
         body="body",
-        radius=0.38,  # about the point ahead
+        radius=0.23,  # about the middle of the shell
         description=DIFF_DRIVE,
         drive=diff_drive_drive,
         reading=diff_drive_reading,

@@ -15,7 +15,7 @@ from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behavi
 from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS
 
 LENGTH, ORIGIN = 108.0, -2.5  # of the path, where it starts, in length units
-POINT, COLUMN_IN, COLUMN_OUT = (13.0, 22.0), 28.0, 83.0  # of the path, in length units: schedule of the script
+POINT, COLUMN_IN, COLUMN_OUT = (14.8, 20.5), 36.0, 82.0  # of the path, in length units: schedule of the script
 SAFE = 2.0  # d_OA in length units, as the paper's
 AIR_DRAG = 0.0147  # of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/m]
 
