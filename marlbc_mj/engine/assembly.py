@@ -58,9 +58,11 @@ def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
     child = robot.spec()
     for name in CONTACT_OPTIONS:
         setattr(spec.option, name, getattr(child.option, name))
-    if not robot.direct or robot.contact:
-        spec.memory = MEMORY + agents * MEMORY_OF_CONTACTS
+    if robot.ground:
+        ground = spec.geom("ground")
+        ground.contype = ground.conaffinity = 1
     if robot.mass is not None:
+        spec.memory = MEMORY + agents * MEMORY_OF_CONTACTS
         spec.add_numeric(name="robot", data=[robot.length, robot.radius])  # the size of marks and cameras
         spec.material("ground").texrepeat = np.array(spec.material("ground").texrepeat) / robot.length
 

@@ -104,9 +104,9 @@ POSE = Topic(
         **{f"q{part}": Field("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
     },
 )
-TOPICS = (STATE, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS, POSE)
+TOPICS = (STATE, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE, REFERENCE, FORCE, PRIORITIES, METRICS)
-"""Topics without which a log cannot be read back; the weights are there for SORLC only, poses for robots with a free joint."""
+"""Topics without which a log cannot be read back; the weights are there for SORLC only. Robots with a free joint have ``POSE`` too."""
 
 
 def json_schema(topic: Topic) -> dict[str, Any]:

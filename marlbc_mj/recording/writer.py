@@ -171,8 +171,8 @@ class LogWriter:
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
-        for topic in schemas.TOPICS:
-            if {schemas.WEIGHTS.name: self._weighted, schemas.POSE.name: self._posed}.get(topic.name, True):
+        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed):
+            if topic is not schemas.WEIGHTS or self._weighted:
                 text = json.dumps(schemas.json_schema(topic)).encode()
                 schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
                 channels[topic.name] = self._mcap.register_channel(topic.name, schemas.MESSAGE_ENCODING, schema)

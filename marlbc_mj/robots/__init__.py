@@ -10,6 +10,7 @@ from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
 from marlbc_mj.robots.disc import DISC, disc
 from marlbc_mj.robots.omni import OMNI, omni
 from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
+from marlbc_mj.robots.user import is_file, load
 
 ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
     "point_mass": (point_mass, POINT_MASS),
@@ -21,6 +22,7 @@ ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
 """Factory and one line of description by name."""
 
 _make = cache(lambda factory: factory())
+_load = cache(load)
 
 
 def make_robot(name: str) -> Robot:
@@ -32,7 +34,9 @@ def make_robot(name: str) -> Robot:
     if name in ROBOTS:
         robot: Robot = _make(ROBOTS[name][0])
         return robot
-    raise unknown("robot", name, ROBOTS)
+    if is_file(name):
+        return _load(name)
+    raise unknown("robot", name, (*ROBOTS, "a path that ends in .py or .xml"))
 
 
 def register(robot: Robot) -> Robot:

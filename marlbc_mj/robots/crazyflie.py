@@ -77,7 +77,7 @@ def crazyflie() -> Robot:
         speed_limit=1.0,
         acceleration_limit=1.0,
         gains=(9.0, 6.0),
-        length=0.16,
+        length=0.2,
         substep=0.0025,
         contact=True,
         prepare=_prepare,
