@@ -11,7 +11,6 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Blend, Supervisor, situation
 
-
 NO_POSE = np.zeros((0, 7))
 """Of robots that are where their p is and never turn."""
 

@@ -60,6 +60,9 @@ class Imperfections:
         return self.position_noise, self.velocity_noise, self.loss, float(self.loss_agent), self.loss_start
 
 
+NO_IMPERFECTIONS = Imperfections()
+
+
 @allocation_free
 def _mixed(word):  # type: ignore[no-untyped-def]
     """A 32-bit integer hash (constants of the hash-prospector project): every input bit moves every output bit."""

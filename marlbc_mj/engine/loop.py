@@ -273,7 +273,9 @@ def mission_step(  # type: ignore[no-untyped-def]
     steps, robot_state, history, sensed, seeds, status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
-    [m], safe distance [m], virtual (0/1); ``limits`` = speed [m/s], acceleration [m/s^2], force unit [N]; ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders make it.
+    [m], safe distance [m], virtual (0/1);
+    ``limits`` = speed [m/s], acceleration [m/s^2], force unit [N]; ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders
+    make it.
     """
     t = steps[b] * settings[0]
     agents = p.shape[1]

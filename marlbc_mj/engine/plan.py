@@ -17,7 +17,6 @@ from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
 
-
 _JOINT_SIZE = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
 """Numbers of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
 

@@ -106,7 +106,8 @@ class TeamState:
 
     def measured(self, b: int) -> np.ndarray:
         """(N, 2) positions of world ``b`` as they are measured [m]."""
-        return self.sensed[b, 0] if self.sensed.shape[1] > 0 else self.position[b]
+        measured: np.ndarray = self.sensed[b, 0] if self.sensed.shape[1] > 0 else self.position[b]
+        return measured
 
     def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
         """Put world ``b`` in the middle of a mission, as :meth:`World.place` says; controllers start anew."""

@@ -48,7 +48,7 @@ def _track(stage: Stage, bounds: tuple[float, float]) -> Camera:
     log = stage.log
     centroid = log.position.mean(axis=1, keepdims=True)
     reach = np.linalg.norm(log.position - centroid, axis=-1).max(axis=1, keepdims=True)
-    team = np.hstack([centroid[:, 0], np.clip(reach, *(stage.scale * r for r in bounds))])
+    team = np.hstack([centroid[:, 0], np.clip(reach, stage.scale * bounds[0], stage.scale * bounds[1])])
     smooth = _smoothed(team, max(1, round(TRACK_SMOOTHING / log.mission_step)))
     heading = _heading(centroid[:, 0])
     ahead = TRACK_AHEAD * stage.scale * bounds[0] / TRACK_RADIUS[0]

@@ -106,7 +106,10 @@ POSE = Topic(
 )
 TOPICS = (STATE, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE, REFERENCE, FORCE, PRIORITIES, METRICS)
-"""Topics without which a log cannot be read back; the weights are there for SORLC only. Robots with a free joint have ``POSE`` too."""
+"""Topics without which a log cannot be read back; the weights are there for SORLC only.
+
+Robots with a free joint have ``POSE`` too.
+"""
 
 
 def json_schema(topic: Topic) -> dict[str, Any]:

@@ -107,9 +107,11 @@ def make_stage(log: EpisodeLog) -> Stage:
     try:
         model = mujoco.MjModel.from_xml_string(log.mjcf)
         free = _free_joints(model, agents)
-        joints = [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents] if not free else [
-            [first, first + 1] for first in free
-        ]
+        joints = (
+            [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
+            if not free
+            else [[first, first + 1] for first in free]
+        )
         data = mujoco.MjData(model)
         for k, (x, y, _) in enumerate(log.obstacles):
             if model.nmocap:

@@ -136,10 +136,10 @@ def _step_test(robot: Robot) -> Iterator[Item]:
         return
     p, target = (np.concatenate([getattr(r, which)[0] for r in records]) for which in ("position", "reference"))
     force = np.concatenate([r.force[0] for r in records if r is not None])
-    error = float(np.abs(p[-1] - target[-1]).max()) / robot.length
+    off = float(np.abs(p[-1] - target[-1]).max()) / robot.length
     beyond = float((p - scenario.formations[0]).max()) / robot.length
-    good = error < SETTLED and beyond < OVERSHOOT
-    yield Item("step", good, f"{error:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal")
+    good = off < SETTLED and beyond < OVERSHOOT
+    yield Item("step", good, f"{off:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal")
     yield _saturation(robot, world, force)
     yield from _flight(robot, world)
 

@@ -1,8 +1,8 @@
 """A Crazyflie 2.x (cf2x_L250) at a held height, with the measured parameters of the optional package drone-models (MIT).
 
-Mass, inertia, arm, thrust limits and torque per thrust are its ``data/params.toml``; the attitude's response is its identified model
-of the vehicle with its firmware (``so_rpy``), the lag of the thrust that of ``so_rpy_rotor``. The package's own MJCF is not used: it
-has rounded values, no limits, and meshes that a log could not carry along.
+Mass, inertia, arm, thrust limits and torque per thrust are its ``data/params.toml``; the attitude's response is its identified
+model of the vehicle with its firmware (``so_rpy``), the lag of the thrust that of ``so_rpy_rotor``. The package's own MJCF is not
+used: it has another mass and inertia than those measured, no limits, no free joint, and meshes that a log could not carry along.
 """
 
 import tomllib

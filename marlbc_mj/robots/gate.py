@@ -24,7 +24,7 @@ SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
-"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead, as references take seconds to follow an order."""
+"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to follow an order."""
 
 CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
@@ -113,7 +113,10 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
 def gate_table(rows: Sequence[Row]) -> str:
     """Markdown, one line a robot and supervisor."""
     head = ("robot", "supervisor", "least clearance / safe", "violation", "contacts", "between agents", "tracking, RMS")
-    lines = ["| " + " | ".join((*head, "saturated", "switches", "height, tilt")) + " |", "|---|---|" + "---:|" * 5 + "---:|---|---|"]
+    lines = [
+        "| " + " | ".join((*head, "saturated", "switches", "height, tilt")) + " |",
+        "|---|---|" + "---:|" * 5 + "---:|---|---|",
+    ]
     for r in rows:
         flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
         cells = (

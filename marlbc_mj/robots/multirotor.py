@@ -1,7 +1,8 @@
 """A rotorcraft at a held height: planar force -> tilt and thrust -> rotors, with the attitude loop inside.
 
 The attitude follows the closed-loop response phi'' = -a phi - b phi' + a phi_wanted of each axis, as far as the rotors' limits
-allow. Rotors are allotted by the pseudo-inverse of what they do to thrust and moments, read from the MJCF, so any arrangement works.
+allow. Rotors are allotted by the pseudo-inverse of what they do to thrust and moments, read from the MJCF, so any arrangement
+works.
 """
 
 from typing import NamedTuple

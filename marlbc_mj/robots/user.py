@@ -1,8 +1,8 @@
 """Robots from a user's file: a Python file that makes one, or any MJCF whose way of driving can be told from its actuators.
 
-A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one. An
-MJCF is taken as it is: two slide joints or a free joint with motors along x and y are driven directly, a free joint with rotors
-that lift and turn flies. A path that starts with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
+A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one.
+An MJCF is taken as it is: two slide joints or a free joint with motors along x and y are driven directly, a free joint with
+rotors that lift and turn flies. A path that starts with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
 """
 
 import os
@@ -137,9 +137,9 @@ def from_mjcf(path: Path, name: str) -> Robot:
         raise ConfigurationError(f"{path}: body {body.name!r} needs a free joint, or slide joints along x and y")
     motors = _direct_motors(model, data, roots[0])
     if motors is not None:
-        limit = float(np.min(np.abs(model.actuator_ctrlrange[[m for m in motors]])))
-        names = tuple(model.actuator(m).name for m in motors)
-        return _direct(fields, (free[0] or FREE,) if free else slides, names, limit)
+        limit = float(np.min(np.abs(model.actuator_ctrlrange[list(motors)])))
+        along_x, along_y = (model.actuator(m).name for m in motors)
+        return _direct(fields, (free[0] or FREE,) if free else slides, (along_x, along_y), limit)
     if free:
         return _flying(fields, free[0] or FREE, path)
     raise ConfigurationError(_UNDRIVEN.format(path))

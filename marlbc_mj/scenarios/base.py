@@ -9,7 +9,7 @@ import numpy as np
 from marlbc_mj.behaviors import Behavior, Formation, ObstacleAvoidance
 from marlbc_mj.disturbances import Disturbance, PaperDrag
 from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.imperfections import Imperfections
+from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.orders import Orders
 
 Point = tuple[float, float]
@@ -86,7 +86,7 @@ class Scenario:
     unit_force: float = 1.0  # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
     speed_limit: float = np.inf  # of references [m/s]; real robots have one, the paper's point mass has not
     acceleration_limit: float = np.inf  # of references [m/s^2]
-    imperfections: Imperfections = Imperfections()  # noise and delay of sensors, loss of actuators
+    imperfections: Imperfections = NO_IMPERFECTIONS  # noise and delay of sensors, loss of actuators
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = Perturbation()
     schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
@@ -162,7 +162,16 @@ class Scenario:
                 )
 
     def _check_numbers(self) -> None:
-        positive = ("safe_distance", "formation_tolerance", "duration", "mission_step", "substep", "mass", "force_limit", "unit_force")
+        positive = (
+            "safe_distance",
+            "formation_tolerance",
+            "duration",
+            "mission_step",
+            "substep",
+            "mass",
+            "force_limit",
+            "unit_force",
+        )
         for name in positive:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):

@@ -1,8 +1,8 @@
 """The case study's first obstacle and gate, scaled to a robot: its size, speed, acceleration, force and contacts.
 
-Lengths are the paper's times the robot's length unit. The team travels at 0.4 of the robot's speed limit, and behaviors' gains are
-what its acceleration can follow: a reference that closes a gap with rate Lambda brakes with Lambda v, so Lambda = 0.8 a / v for FM
-and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
+Lengths are the paper's times the robot's length unit. The team travels at 0.4 of the robot's speed limit, and behaviors' gains
+are what its acceleration can follow: a reference that closes a gap with rate Lambda brakes with Lambda v, so Lambda = 0.8 a / v
+for FM and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
 """
 
 from typing import Any
@@ -32,12 +32,12 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
     top, brake = (body.speed_limit, body.acceleration_limit) if finite else (2.5 * unit, 4.0 * unit)
     speed, gain = 0.4 * top, 0.8 * brake / top
     avoid = SAFE * unit + speed**2 / brake + 0.3 * unit
-    slots = [tuple(tuple(unit * x for x in slot) for slot in which) for which in (SLOTS, COLUMN)]
+    slots, column = (tuple((unit * x, unit * y) for x, y in which) for which in (SLOTS, COLUMN))
     steps = round(LENGTH * unit / speed / 0.05)
     fields: dict[str, Any] = {
         "name": f"robot_gate-{body.name}",
-        "starts": tuple((x + unit * ORIGIN, y) for x, y in slots[0]),
-        "behaviors": standard_behaviors(*slots, avoidance_gain=2.5 * gain, formation_gain=gain, safe_distance=avoid),
+        "starts": tuple((x + unit * ORIGIN, y) for x, y in slots),
+        "behaviors": standard_behaviors(slots, column, avoidance_gain=2.5 * gain, formation_gain=gain, safe_distance=avoid),
         "path_origin": (unit * ORIGIN, 0.0),
         "path_velocity": (speed, 0.0),
         "obstacles": tuple(Obstacle(*(unit * x for x in o)) for o in (OBSTACLES[0], *OBSTACLES[2:])),
@@ -60,5 +60,3 @@ def _schedule(unit_time: float) -> tuple[Window, ...]:
         Window(unit_time * (POINT[0] - ORIGIN), unit_time * (POINT[1] - ORIGIN), 0, "OA>FM"),
         Window(unit_time * (COLUMN_IN - ORIGIN), unit_time * (COLUMN_OUT - ORIGIN), -1, "FR"),
     )
-
-
