@@ -14,14 +14,12 @@ import numba
 from numba.extending import register_jitable
 
 from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
 from marlbc_mj.engine.limits import keep, limit
-from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, as_drive, as_reading, call_step, doubles
+from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
 from marlbc_mj.imperfections import sense, weaken
 from marlbc_mj.laws import allocation_free, compiled, threaded
 from marlbc_mj.nullspace import add_behavior
-
-DIVERGED = 1e9
-"""A position, velocity or force beyond this (or NaN) stops the world before MuJoCo sees it."""
 
 SCRATCH = 7
 """Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""
@@ -109,50 +107,6 @@ def set_references(  # type: ignore[no-untyped-def]
             law = as_behavior(behavior_laws[j])
             rows = law(behavior_params[j, i], at[i], path, obstacles, at, i, velocity, jacobian)
             rank = add_behavior(velocity, jacobian, rows, basis, rank, v_r[i])
-
-
-@allocation_free
-def scale_rows(rows, factor):  # type: ignore[no-untyped-def]
-    """Multiply (N, 2) by a number, in place."""
-    for i in range(rows.shape[0]):
-        for axis in range(2):
-            rows[i, axis] *= factor
-
-
-@register_jitable
-def actuate(body, state, indices, qpos, qvel, force, h, ctrl):  # type: ignore[no-untyped-def]
-    """Turn planar forces (N, 2) into ctrl: as they are for direct robots, by the drive of ``body`` for others.
-
-    ``body`` = drive, reading, spans, params. Returns 0, or 1 + agent where a control is not finite or huge.
-    """
-    spans = body[2]
-    if spans.shape[1] == 0:
-        for i in range(force.shape[0]):
-            for axis in range(2):
-                ctrl[indices[2, i, axis]] = force[i, axis]
-        return 0
-    drive = as_drive(body[0])
-    drive(body[3], state, qpos, qvel, force, h, spans, ctrl)
-    for i in range(force.shape[0]):
-        for k in range(spans[2, i, 0], spans[2, i, 1]):
-            if not abs(ctrl[k]) < DIVERGED:
-                return 1 + i
-    return 0
-
-
-@register_jitable
-def measure(body, state, indices, qpos, qvel, actuator_force, p, v, force):  # type: ignore[no-untyped-def]
-    """Read p, v and the planar force that the actuators gave, (N, 2) each, after a step."""
-    spans = body[2]
-    if spans.shape[1] > 0:
-        reading = as_reading(body[1])
-        reading(body[3], state, qpos, qvel, actuator_force, spans, p, v, force)
-        return
-    for i in range(p.shape[0]):
-        for axis in range(2):
-            p[i, axis] = qpos[indices[0, i, axis]]
-            v[i, axis] = qvel[indices[1, i, axis]]
-            force[i, axis] = actuator_force[indices[2, i, axis]]
 
 
 @register_jitable

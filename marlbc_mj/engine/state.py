@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.engine import loop
+from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.errors import SimulationError
@@ -222,6 +223,6 @@ class TeamState:
         start = (self.steps[b] - 1) * self.plan.scenario.mission_step
         return SimulationError(
             f"world {b}, agent {agent + 1}, t = {start + substep * self.plan.scenario.substep:.3f} s: position, velocity or "
-            f"force is not finite or beyond {loop.DIVERGED:g} "
+            f"force is not finite or beyond {DIVERGED:g} "
             f"(p = {self.position[b, agent].tolist()}, v = {self.velocity[b, agent].tolist()})"
         )

@@ -24,7 +24,7 @@ SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
-"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to follow an order."""
+"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
 
 CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
