@@ -103,7 +103,7 @@ class FormationTask(composer.Task):
             scenario.substep,
             state.position[0],
             state.velocity[0],
-            state.sensed[0],
+            *state.measured(0),
             state.reference[0],
             state.reference_velocity[0],
             state.controller[0],

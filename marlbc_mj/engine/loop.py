@@ -111,18 +111,17 @@ def set_references(  # type: ignore[no-untyped-def]
 
 @register_jitable
 def team_forces(  # type: ignore[no-untyped-def]
-    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, sensed, p_r, v_r, state, unit, drag,
-    force,
+    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, seen_p, seen_v, p_r, v_r, state, unit,
+    drag, force,
 ):  # fmt: skip
     """Drag and controller force of every agent for one substep, written to ``drag`` and ``force`` (N, 2) [N].
 
-    The law sees ``sensed`` (2, N, 2), or p and v themselves where it is empty (0, N, 2); its force counts in ``unit`` [N].
+    The law sees ``seen_p`` and ``seen_v``, which are p and v where sensors are perfect; its force counts in ``unit`` [N].
     Returns 0, or 1 + agent where a position, velocity, force or drag left the physical range; then nothing may be stepped.
     """
     disturbance = as_disturbance(disturbance_law)
     controller = as_controller(controller_law)
     disturbance(disturbance_params, t, p, v, drag)
-    seen_p, seen_v = (sensed[0], sensed[1]) if sensed.shape[0] > 0 else (p, v)
     if unit == 1.0:
         controller(controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
     else:
@@ -157,10 +156,12 @@ def run_substeps(  # type: ignore[no-untyped-def]
         record: (substeps, N, 10): p, v, p_r, v_r as the law saw them and the force MuJoCo applied; (0, N, 10) records nothing.
     """
     agents = p.shape[0]
+    direct = body[2].shape[1] == 0
+    seen_p, seen_v = (sensed[0], sensed[1]) if sensed.shape[0] > 0 else (p, v)
     for k in range(substeps):
         failed = team_forces(
-            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, sensed, p_r, v_r, state,
-            unit, drag, force,
+            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, seen_p, seen_v, p_r,
+            v_r, state, unit, drag, force,
         )  # fmt: skip
         if failed:
             return failed + agents * k
@@ -184,7 +185,7 @@ def run_substeps(  # type: ignore[no-untyped-def]
         for i in range(agents):
             for axis in range(2):
                 if record.shape[0] > 0:
-                    record[k, i, 8 + axis] = force[i, axis]
+                    record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]] if direct else force[i, axis]
                 p_r[i, axis] += h * v_r[i, axis]
         if sensed.shape[0] > 0:
             sense(senses, seed, count + k + 1, history, p, v, sensed)

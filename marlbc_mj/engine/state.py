@@ -105,10 +105,11 @@ class TeamState:
         if self.sensed.shape[1] > 0:
             self._sense(b, int(self.steps[b]) * self.plan.scenario.substeps + substep + 1)
 
-    def measured(self, b: int) -> np.ndarray:
-        """(N, 2) positions of world ``b`` as they are measured [m]."""
-        measured: np.ndarray = self.sensed[b, 0] if self.sensed.shape[1] > 0 else self.position[b]
-        return measured
+    def measured(self, b: int) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2) positions [m] and velocities [m/s] of world ``b`` as they are measured."""
+        if self.sensed.shape[1] > 0:
+            return self.sensed[b, 0], self.sensed[b, 1]
+        return self.position[b], self.velocity[b]
 
     def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
         """Put world ``b`` in the middle of a mission, as :meth:`World.place` says; controllers start anew."""
@@ -154,7 +155,7 @@ class TeamState:
             orders,
             self.composed[b] if velocity is None else velocity,
             self.obstacles[b],
-            self.measured(b),
+            self.measured(b)[0],
             self.reference[b],
             self.reference_velocity[b],
             self.command[b],
