@@ -17,7 +17,7 @@ from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
 
 CRAZYFLIE = "Crazyflie 2.x at a held height, measured parameters and thrust limits (extra `robots`)"
-DRONE = "cf2x_L250"
+PACKAGE, DRONE = "drone_models", "cf2x_L250"
 _MJCF = MODELS / "robots" / "crazyflie.xml"
 
 
@@ -27,7 +27,7 @@ def _measured(model: str) -> dict[str, Any]:
     Raises:
         ConfigurationError: the package is not installed.
     """
-    found = find_spec("drone_models")
+    found = find_spec(PACKAGE)
     if found is None or found.origin is None:
         raise ConfigurationError(
             "robot 'crazyflie' needs the package drone-models; install the extra `robots`: pip install 'marlbc-mj[robots]'"

@@ -174,13 +174,18 @@ def _effects(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
 
 
 def _direct_motors(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[int, int] | None:
-    """Actuators that push the base along x and along y with force = control, and do nothing else."""
-    effect = _effects(model, data)
+    """Actuators that push the base along x and along y with force = control, and do nothing else, however it is turned."""
+    turned = mujoco.MjData(model)
+    mujoco.mj_integratePos(model, turned.qpos, np.full(model.nv, 0.4), 1.0)
+    mujoco.mj_forward(model, turned)
+    effects = _effects(model, data), _effects(model, turned)
     found = []
     for axis in range(2):
         pure = np.zeros(model.nv)
         pure[model.body_dofadr[body] + axis] = 1.0
-        same = [u for u in range(model.nu) if np.allclose(effect[u], pure) and model.actuator_gainprm[u, 0] == 1.0]
+        same = [
+            u for u in range(model.nu) if all(np.allclose(e[u], pure) for e in effects) and model.actuator_gainprm[u, 0] == 1.0
+        ]
         if not same:
             return None
         found.append(same[0])
