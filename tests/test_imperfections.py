@@ -33,7 +33,7 @@ def test_noise_is_standard_normal_and_independent():
 
 
 def test_a_delay_shows_what_was_and_nothing_else():
-    """The measured p, v at the end of a mission step are the true ones of 4 substeps before, to the bit; truth is what is judged."""
+    """The measured p, v at the end of a mission step are the true ones of 4 substeps before, to the bit."""
     scenario = paper(imperfections=Imperfections(delay=0.02))
     world = World(scenario, PD(), record=True)
     start = world.observe()
