@@ -162,7 +162,12 @@ def test_crazyflie_has_the_measured_numbers_and_keeps_its_thrust_limits():
     np.testing.assert_allclose(model.actuator_ctrlrange, np.tile([drone["thrust_min"], drone["thrust_max"]], (8, 1)), rtol=1e-5)
     least, most = data.actuator_force.min(), data.actuator_force.max()
     assert drone["thrust_min"] * (1 - 1e-5) <= least < most <= drone["thrust_max"] * (1 + 1e-5)
-    assert world.state.robot[0, 0, make_robot("crazyflie").diagnostics["saturated"]] > 0
+    robot = make_robot("crazyflie")
+    state, ctrl = np.array(robot.state), np.zeros(4)
+    deep = np.array([0.0, 0.0, -5.0, 1.0, 0.0, 0.0, 0.0])
+    for _ in range(200):
+        robot.drive(np.array(robot.params), state, deep, np.zeros(6), np.zeros(2), 0.0025, ctrl)
+    assert (ctrl == drone["thrust_max"]).all() and state[robot.diagnostics["saturated"]] > 100
 
 
 # One law, three paths ----------------------------------------------------------------------------------------------------------

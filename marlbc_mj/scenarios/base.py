@@ -15,6 +15,8 @@ from marlbc_mj.orders import Orders
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
 REFERENCE_MODES = ("virtual", "actual")
+YOUNG = {"young": True}
+"""Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
 
 
 class Obstacle(NamedTuple):
@@ -83,10 +85,11 @@ class Scenario:
     robot: str = "point_mass"
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
-    unit_force: float = 1.0  # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
-    speed_limit: float = np.inf  # of references [m/s]; real robots have one, the paper's point mass has not
-    acceleration_limit: float = np.inf  # of references [m/s^2]
-    imperfections: Imperfections = NO_IMPERFECTIONS  # noise and delay of sensors, loss of actuators
+    # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
+    unit_force: float = field(default=1.0, metadata=YOUNG)
+    speed_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s]; the paper's point mass has none
+    acceleration_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s^2]
+    imperfections: Imperfections = field(default=NO_IMPERFECTIONS, metadata=YOUNG)  # noise, delay, loss of actuators
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = Perturbation()
     schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
