@@ -7,6 +7,7 @@ rotors that lift and turn flies. A path that starts with ``menagerie:`` is looke
 
 import os
 import runpy
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -72,8 +73,7 @@ def _from_python(path: Path, name: str) -> Robot:
     if not isinstance(robot, Robot):
         raise ConfigurationError(f"robot file {path} defines neither ROBOT, a Robot, nor robot(), which returns one")
     check_mjcf(robot.mjcf)
-    object.__setattr__(robot, "name", name)
-    return robot
+    return replace(robot, name=name)
 
 
 def check_mjcf(path: Path) -> mujoco.MjModel:

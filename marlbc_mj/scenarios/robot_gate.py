@@ -5,6 +5,7 @@ are what its acceleration can follow: a reference that closes a gap with rate La
 for FM and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
 """
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
     slots, column = (tuple((unit * x, unit * y) for x, y in which) for which in (SLOTS, COLUMN))
     steps = round(LENGTH * unit / speed / 0.05)
     fields: dict[str, Any] = {
-        "name": f"robot_gate-{body.name}",
+        "name": f"robot_gate-{Path(body.name).stem}",
         "starts": tuple((x + unit * ORIGIN, y) for x, y in slots),
         "behaviors": standard_behaviors(slots, column, avoidance_gain=2.5 * gain, formation_gain=gain, safe_distance=avoid),
         "path_origin": (unit * ORIGIN, 0.0),
