@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -168,11 +168,19 @@ def run_gates(
 
 def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str) -> None:
     """Two stills and a short clip of an episode, seen close."""
-    log: Any = from_trajectory(trajectory, controller)
+    log = from_trajectory(trajectory, controller)
     duration = trajectory.scenario.duration
     for k, share in enumerate(STILL_AT, 1):
         Image.fromarray(render_still(log, share * duration, camera="close")).save(folder / f"{name}-{k}.png")
     start, end = (share * duration for share in CLIP)
     render_video(
-        log, folder / f"{name}.mp4", camera="close", start=start, end=end, speed=(end - start) / 10.0, width=960, height=540
+        log,
+        folder / f"{name}.mp4",
+        camera="close",
+        start=start,
+        end=end,
+        speed=float(max(1, round((end - start) / 10.0))),
+        width=960,
+        height=540,
+        samples=4,
     )
