@@ -1,7 +1,7 @@
 """One episode: supervisor and world in turn, and the trajectory they leave behind."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
 
@@ -10,6 +10,9 @@ import numpy as np
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Blend, Supervisor, situation
+
+NO_POSE = np.zeros((0, 7))
+"""Of robots that are where their p is and never turn."""
 
 
 class Frame(NamedTuple):
@@ -27,6 +30,7 @@ class Frame(NamedTuple):
     reward: float  # r1 + r2 of this mission step
     controller_state: np.ndarray  # (N, S) at the start of the mission step
     decision_ms: float  # what the supervisor took [ms]
+    pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,7 @@ class Trajectory:
     reward: np.ndarray  # (M,)
     controller_state: np.ndarray  # (M, N, S) at the start of each mission step
     decision_ms: np.ndarray  # (M,) [ms]
+    pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
 
 
 def run_episode(
@@ -81,13 +86,13 @@ def run_episode(
         began = perf_counter()
         decision, memory = supervisor.decide(situation(observation, obstacles, scenario.mission_step), memory)
         decision_ms = 1e3 * (perf_counter() - began)
-        controller_state = world.state.controller[0].copy()
+        controller_state, pose = world.state.controller[0].copy(), _pose(world)
         if isinstance(decision, Blend):
             step = world.step(decision.orders[None], decision.velocity[None])
         else:
             step = world.step(decision[None])
         assert step.record is not None, "run_episode needs World(record=True)"
-        record = np.stack([field[0] for field in step.record])  # (5, substeps, N, 2)
+        record = np.stack([rows[0] for rows in step.record])  # (5, substeps, N, 2)
         frames.append(
             Frame(
                 float(observation.time[0]),
@@ -98,6 +103,7 @@ def run_episode(
                 float(step.reward[0]),
                 controller_state,
                 decision_ms,
+                pose,
             )
         )
         if on_frame is not None:
@@ -123,4 +129,12 @@ def run_episode(
         reward=np.array([f.reward for f in frames]),
         controller_state=np.array([f.controller_state for f in frames]),
         decision_ms=np.array([f.decision_ms for f in frames]),
+        pose=np.array([f.pose for f in frames]),
     )
+
+
+def _pose(world: World) -> np.ndarray:
+    """(N, 7) of the bodies of world 0, (0, 7) where they have no free joint."""
+    if len(world.plan.robot.joints) > 1:
+        return NO_POSE
+    return np.stack([world.data[0].qpos[first : first + 7] for first in world.plan.indices[0, :, 0]])

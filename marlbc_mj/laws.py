@@ -1,9 +1,9 @@
 """What a law is: a small compiled function of arrays for one agent, with one fixed signature per kind.
 
-Behaviors (6)-(11), controllers (36)-(41) and disturbances (1) are all *laws*. A law is decorated with
-:func:`behavior`, :func:`controller` or :func:`disturbance`; it is then compiled on first use, callable from Python as an
-ordinary function, and callable by address from the compiled closed loop. A law that a user writes is therefore
-the equal of one shipped here. All arrays are contiguous float64; outputs are written in place, nothing is returned
+Behaviors (6)-(11), controllers (36)-(41), disturbances (1) and the two sides of a robot are all *laws*. A law is decorated with
+:func:`behavior`, :func:`controller`, :func:`disturbance`, :func:`drive` or :func:`reading`; it is then compiled on first use,
+callable from Python as an ordinary function, and callable by address from the compiled closed loop. A law that a user writes is
+therefore the equal of one shipped here. All arrays are contiguous float64; outputs are written in place, nothing is returned
 but a behavior's number of rows.
 
 =============  ==========================================================================================
@@ -12,6 +12,8 @@ kind           arguments
 behavior       ``(params, p, path, obstacles, team, agent, velocity_out, jacobian_out) -> rows``
 controller     ``(params, state, p, v, p_r, v_r, drag, h, force_out)``
 disturbance    ``(params, t, p, v, force_out)``
+drive          ``(params, state, qpos, qvel, force, h, ctrl_out)``
+reading        ``(params, state, qpos, qvel, actuator_force, p_out, v_out, force_out)``
 =============  ==========================================================================================
 
 Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or for coverage.
@@ -51,11 +53,27 @@ true f(chi), for laws that assume a known model, h [s], force_out (2,) [N]."""
 DISTURBANCE = types.void(_VECTOR, types.float64, _VECTOR, _VECTOR, _VECTOR)
 """params (P,), t [s], p (2,) [m], v (2,) [m/s], force_out (2,) [N]."""
 
+DRIVE = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
+"""params (P,), state (S,) changed in place, the robot's own part of qpos and of qvel, planar force (2,) [N] that is wanted,
+h [s], ctrl_out (actuators,): MuJoCo's controls, in the order of the robot's MJCF. Called before every substep."""
+
+READING = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR)
+"""params (P,), state (S,) as the drive left it, the robot's own part of qpos, of qvel and of actuator_force, p_out (2,) [m],
+v_out (2,) [m/s], force_out (2,) [N]: the planar force that the actuators really gave. Called after every substep."""
+
 TEAM_CONTROLLER = types.void(_MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, types.float64, _MATRIX)
 """A controller for every agent in turn: the arguments of :data:`CONTROLLER`, one row an agent."""
 
 TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
 """A disturbance for every agent in turn: the arguments of :data:`DISTURBANCE`, one row an agent."""
+
+_SPANS = types.int64[:, :, ::1]
+TEAM_DRIVE = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _MATRIX, types.float64, _SPANS, _VECTOR)
+"""A drive for every robot in turn: params (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (3, N, 2): first
+and last + 1 of each robot in qpos, in qvel and in ctrl; the whole ctrl."""
+
+TEAM_READING = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _SPANS, _MATRIX, _MATRIX, _MATRIX)
+"""A reading of every robot in turn: params, state, the whole qpos, qvel and actuator_force, spans; p, v, force (N, 2)."""
 
 
 def _jit(function: Law, **options: Any) -> Law:
@@ -113,11 +131,29 @@ def _disturbance_team(params, t, p, v, force_out):  # type: ignore[no-untyped-de
         law(params, t, p[i], v[i], force_out[i])  # type: ignore[name-defined]  # noqa: F821
 
 
-_TEAMS = {CONTROLLER: (TEAM_CONTROLLER, _controller_team), DISTURBANCE: (TEAM_DISTURBANCE, _disturbance_team)}
+def _drive_team(params, state, qpos, qvel, force, h, spans, ctrl_out):  # type: ignore[no-untyped-def]
+    for i in range(force.shape[0]):
+        q, v, u = spans[0, i], spans[1, i], spans[2, i]
+        law(params[i], state[i], qpos[q[0] : q[1]], qvel[v[0] : v[1]], force[i], h, ctrl_out[u[0] : u[1]])  # type: ignore[name-defined]  # noqa: F821
+
+
+def _reading_team(params, state, qpos, qvel, actuator_force, spans, p_out, v_out, force_out):  # type: ignore[no-untyped-def]
+    for i in range(p_out.shape[0]):
+        q, v, u = spans[0, i], spans[1, i], spans[2, i]
+        own = qpos[q[0] : q[1]], qvel[v[0] : v[1]], actuator_force[u[0] : u[1]]
+        law(params[i], state[i], own[0], own[1], own[2], p_out[i], v_out[i], force_out[i])  # type: ignore[name-defined]  # noqa: F821
+
+
+_TEAMS = {
+    CONTROLLER: (TEAM_CONTROLLER, _controller_team),
+    DISTURBANCE: (TEAM_DISTURBANCE, _disturbance_team),
+    DRIVE: (TEAM_DRIVE, _drive_team),
+    READING: (TEAM_READING, _reading_team),
+}
 
 
 def for_team(law: Law, signature: Any) -> Law:
-    """The law applied to every agent in turn, as a Python function; for :data:`CONTROLLER` and :data:`DISTURBANCE`.
+    """The law applied to every agent in turn, as a Python function; for every kind but :data:`BEHAVIOR`.
 
     The template above becomes a function of its own whose global ``law`` is this one, with the law's file and line as its place,
     by which numba's cache knows it when it is compiled.
@@ -156,6 +192,16 @@ def disturbance(function: Law) -> Law:
     return _declare(function, DISTURBANCE)
 
 
+def drive(function: Law) -> Law:
+    """Declare how a robot turns a planar force into controls; arguments as in :data:`DRIVE`."""
+    return _declare(function, DRIVE)
+
+
+def reading(function: Law) -> Law:
+    """Declare how a robot's planar motion and force are read; arguments as in :data:`READING`."""
+    return _declare(function, READING)
+
+
 def is_compiled(law: Law) -> bool:
     """Whether the compiled loop can call this law; a plain Python function runs through the Python loop."""
     return isinstance(law, Dispatcher)
@@ -167,7 +213,7 @@ def plain(law: Law) -> Law:
 
 
 def address(law: Law, signature: Any) -> int:
-    """Machine address of a compiled law for the compiled loop: of its team form for controllers and disturbances.
+    """Machine address of a compiled law for the compiled loop: of its team form for all but behaviors.
 
     Raises:
         ConfigurationError: the law is plain Python, was declared as another kind of law, or does not compile.

@@ -24,5 +24,5 @@ def selectable() -> dict[str, dict[str, str]]:
         "disturbances": {name: line for name, (_, line) in DISTURBANCES.items()},
         "training methods": {name: line for name, (_, line) in METHODS.items()},
         "training presets": {name: line for name, (_, line) in PRESETS.items()},
-        "robots": {name: robot.description for name, robot in ROBOTS.items()},
+        "robots": {name: line for name, (_, line) in ROBOTS.items()},
     }

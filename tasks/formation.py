@@ -14,9 +14,11 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
+from marlbc_mj.engine.body import actuate, measure
 from marlbc_mj.engine.loop import team_forces, team_forces_compiled
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.engine.state import TeamState
+from marlbc_mj.imperfections import weaken
 from marlbc_mj.scenarios import Scenario
 
 
@@ -43,6 +45,7 @@ class FormationTask(composer.Task):
         self._drag = np.zeros((scenario.agents, 2))
         self._force = np.zeros((scenario.agents, 2))
         self._forces, self._laws = _team_law(self.plan)
+        self._body = self.plan.python_body()
         self._substep = 0
         self._indices = self.plan.indices
         self.set_timesteps(control_timestep=scenario.mission_step, physics_timestep=scenario.substep)
@@ -80,7 +83,7 @@ class FormationTask(composer.Task):
         self._indices = find_indices(physics.model.ptr, self.scenario)
         seed = int(random_state.randint(2**31))
         starts = self.state.reset(0, np.random.default_rng(np.random.SeedSequence([seed, 0])))
-        physics.data.qpos[self._indices[0].ravel()] = starts.ravel()
+        self.state.put(0, physics.data, starts, np.zeros_like(starts))
 
     def before_step(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Orders become reference velocities for this mission step."""
@@ -88,33 +91,42 @@ class FormationTask(composer.Task):
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Force law and drag of every agent, into ctrl and qfrc_applied."""
-        state, scenario = self.state, self.scenario
+        """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
+        state, scenario, data = self.state, self.scenario, physics.data
+        now = state.time(0) + self._substep * scenario.substep
         failed = self._forces(
             self._laws[0],
             self.plan.controller_params,
             self._laws[1],
             state.disturbance_params[0],
-            state.time(0) + self._substep * scenario.substep,
+            now,
             scenario.substep,
             state.position[0],
             state.velocity[0],
+            *state.measured(0),
             state.reference[0],
             state.reference_velocity[0],
             state.controller[0],
+            self.plan.limits[2],
             self._drag,
             self._force,
         )
+        weaken(self.plan.senses, now, self._force)
+        failed = failed or actuate(
+            self._body, state.robot[0], self._indices, data.qpos, data.qvel, self._force, scenario.substep, data.ctrl
+        )
         if failed:
             raise state.diverged(0, failed + scenario.agents * self._substep)
-        physics.data.ctrl[self._indices[2]] = self._force
-        physics.data.qfrc_applied[self._indices[1]] = self._drag
+        data.qfrc_applied[self._indices[1]] = self._drag
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Measure, and advance the reference position."""
-        state = self.state
-        state.position[0] = physics.data.qpos[self._indices[0]]
-        state.velocity[0] = physics.data.qvel[self._indices[1]]
+        state, data = self.state, physics.data
+        measure(
+            self._body, state.robot[0], self._indices, data.qpos, data.qvel, data.actuator_force, state.position[0],
+            state.velocity[0], self._force,
+        )  # fmt: skip
+        state.after_substep(0, self._substep)
         state.reference[0] += self.scenario.substep * state.reference_velocity[0]
         self._substep += 1
 

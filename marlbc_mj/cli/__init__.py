@@ -12,6 +12,7 @@ from tyro.conf import subcommand
 from marlbc_mj.cli.benchmark import Bench, Run
 from marlbc_mj.cli.export import Export
 from marlbc_mj.cli.recordings import Log, Video, View
+from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import Ship
 from marlbc_mj.cli.studies import Ablation, Calibrate, ListAll, OracleSearch, Perf
 from marlbc_mj.cli.study import Study
@@ -30,6 +31,7 @@ Command = (
     | Annotated[View, subcommand("view")]
     | Annotated[Log, subcommand("log")]
     | Annotated[ListAll, subcommand("list")]
+    | Annotated[RobotCommand, subcommand("robot")]
     | Annotated[Perf, subcommand("perf")]
     | Annotated[Ablation, subcommand("ablation")]
     | Annotated[Calibrate, subcommand("calibrate")]

@@ -13,8 +13,12 @@ from marlbc_mj.scenarios import Obstacle, Scenario
 
 POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
 OBSTACLE_HEIGHT = 1.2  # [m]
+LEAST_SOLID = 0.05  # radius of a point obstacle that robots can hit, in the robot's length unit [m]
 MARGIN = 4.0  # that the top camera leaves around the mission [m]
 MEMORY = 256 * 1024  # arena of one MjData [bytes]; MuJoCo's default is 13.6 MB, too much for thousands of worlds
+MEMORY_OF_CONTACTS = 512 * 1024  # more of it for every agent that touches ground, obstacles and others [bytes]
+CONTACT_OPTIONS = ("cone", "impratio", "noslip_iterations", "iterations", "tolerance", "integrator", "solver")
+"""Options of a robot's MJCF that its contacts depend on: the arena takes them over."""
 
 
 def agent_prefix(agent: int) -> str:
@@ -39,22 +43,38 @@ def assemble(scenario: Scenario, limit: float) -> str:
     spec.modelname = scenario.name
     spec.option.timestep = scenario.substep
     spec.memory = MEMORY
+    _prepare_arena(spec, robot, scenario.agents)
     for agent in range(scenario.agents):
         _attach(spec, robot, agent, scenario.mass, limit)
     for k, obstacle in enumerate(scenario.obstacles):
-        _add_obstacle(spec, k, obstacle)
+        _add_obstacle(spec, k, obstacle, robot)
     _add_cameras(spec, scenario)
     spec.compile()
     return str(spec.to_xml())
 
 
+def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
+    """Take the options of contact from the robot's MJCF, and draw the ground at its scale."""
+    child = robot.spec()
+    for name in CONTACT_OPTIONS:
+        setattr(spec.option, name, getattr(child.option, name))
+    if robot.ground:
+        ground = spec.geom("ground")
+        ground.contype = ground.conaffinity = 1
+    if robot.mass is not None:
+        spec.memory = MEMORY + agents * MEMORY_OF_CONTACTS
+        spec.add_numeric(name="robot", data=[robot.length, robot.radius])  # the size of marks and cameras
+        spec.material("ground").texrepeat = np.array(spec.material("ground").texrepeat) / robot.length
+
+
 def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: float) -> None:
-    child = mujoco.MjSpec.from_file(str(robot.mjcf))
+    child = robot.spec()
     geoms = child.body(robot.body).geoms
     total = sum(geom.mass for geom in geoms)
     for geom in geoms:
-        geom.rgba = agent_color(agent)
-        geom.mass *= mass / total
+        geom.rgba = agent_color(agent) if robot.mass is None or not geom.material else geom.rgba
+        if robot.mass is None:
+            geom.mass *= mass / total
     for name in robot.motors:
         motor = child.actuator(name)
         bounded = np.isfinite(limit)
@@ -63,17 +83,24 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
     spec.attach(child, prefix=agent_prefix(agent), frame=spec.worldbody.add_frame())
 
 
-def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle) -> None:
-    """A cylinder without contact: the paper's obstacles are passed through, and counted."""
-    radius = max(obstacle.radius, POINT_RADIUS)
-    spec.worldbody.add_geom(
+def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, robot: Robot) -> None:
+    """A cylinder without contact: the paper's obstacles are passed through, and counted. For robots with contact it is solid,
+    as large as the scenario says, on a body that an episode's draw can move.
+    """
+    radius = max(obstacle.radius, POINT_RADIUS * robot.length)
+    height = max(OBSTACLE_HEIGHT * robot.length, 1.5 * robot.height)
+    place, parent = [obstacle.x, obstacle.y, 0.5 * height], spec.worldbody
+    if robot.contact:
+        parent = spec.worldbody.add_body(name=f"obstacle{k + 1}", pos=[obstacle.x, obstacle.y, 0.0], mocap=True)
+        place, radius = [0.0, 0.0, 0.5 * height], max(obstacle.radius, LEAST_SOLID * robot.length)
+    parent.add_geom(
         name=f"obstacle{k + 1}",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
-        size=[radius, 0.5 * OBSTACLE_HEIGHT, 0.0],
-        pos=[obstacle.x, obstacle.y, 0.5 * OBSTACLE_HEIGHT],
+        size=[radius, 0.5 * height, 0.0],
+        pos=place,
         material="obstacle",
-        contype=0,
-        conaffinity=0,
+        contype=int(robot.contact),
+        conaffinity=int(robot.contact),
         mass=0.0,
     )
 
@@ -81,7 +108,8 @@ def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle) -> None:
 def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
     """``top`` sees the whole mission in a 16:9 picture; ``track`` follows the team's centre of mass."""
     low, high = _mission_bounds(scenario)
-    width, depth = high - low + 2.0 * MARGIN
+    length = make_robot(scenario.robot).length
+    width, depth = high - low + 2.0 * MARGIN * length
     fovy = 30.0
     height = 0.5 * max(depth, width * 9.0 / 16.0) / np.tan(np.radians(0.5 * fovy))
     spec.stat.center = [*(0.5 * (low + high)), 0.0]
@@ -90,7 +118,7 @@ def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
     spec.worldbody.add_camera(
         name="track",
         mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
-        pos=[0.0, -34.0, 26.0],
+        pos=[0.0, -34.0 * length, 26.0 * length],
         xyaxes=[1.0, 0.0, 0.0, 0.0, 0.6, 0.8],
         fovy=40.0,
     )

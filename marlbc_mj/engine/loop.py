@@ -4,9 +4,9 @@ The pieces (:func:`begin_step`, :func:`team_forces`, :func:`run_substeps`, :func
 dm_control task call, so there is one definition of a mission step. Its order of operations:
 
 1. at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p (``actual``), and held;
-   a v_r that is given takes the place of the one that the orders make;
-2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), MuJoCo's
-   semi-implicit Euler step, then p_r += h v_r;
+   a v_r that is given takes the place of the one that the orders make; limits of speed and acceleration bound it;
+2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), the robot's
+   controls, MuJoCo's semi-implicit Euler step, then p_r += h v_r;
 3. at the end: clearances, formation identifier and reward from the measured positions.
 """
 
@@ -14,12 +14,12 @@ import numba
 from numba.extending import register_jitable
 
 from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
+from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
+from marlbc_mj.imperfections import sense, weaken
 from marlbc_mj.laws import allocation_free, compiled, threaded
 from marlbc_mj.nullspace import add_behavior
-
-DIVERGED = 1e9
-"""A position, velocity or force beyond this (or NaN) stops the world before MuJoCo sees it."""
 
 SCRATCH = 7
 """Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""
@@ -111,16 +111,24 @@ def set_references(  # type: ignore[no-untyped-def]
 
 @register_jitable
 def team_forces(  # type: ignore[no-untyped-def]
-    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, p_r, v_r, state, drag, force
+    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, seen_p, seen_v, p_r, v_r, state, unit,
+    drag, force,
 ):  # fmt: skip
     """Drag and controller force of every agent for one substep, written to ``drag`` and ``force`` (N, 2) [N].
 
+    The law sees ``seen_p`` and ``seen_v``, which are p and v where sensors are perfect; its force counts in ``unit`` [N].
     Returns 0, or 1 + agent where a position, velocity, force or drag left the physical range; then nothing may be stepped.
     """
     disturbance = as_disturbance(disturbance_law)
     controller = as_controller(controller_law)
     disturbance(disturbance_params, t, p, v, drag)
-    controller(controller_params, state, p, v, p_r, v_r, drag, h, force)
+    if unit == 1.0:
+        controller(controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
+    else:
+        scale_rows(drag, 1.0 / unit)
+        controller(controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
+        scale_rows(drag, unit)
+        scale_rows(force, unit)
     for i in range(p.shape[0]):
         size = 0.0
         for axis in range(2):
@@ -132,42 +140,55 @@ def team_forces(  # type: ignore[no-untyped-def]
 
 @register_jitable
 def run_substeps(  # type: ignore[no-untyped-def]
-    step_function, model, data, qpos, qvel, ctrl, applied, actuator_force, indices, controller_law, controller_params,
-    disturbance_law, disturbance_params, t, h, substeps, p, v, p_r, v_r, state, drag, force, record,
+    step_function, model, data, qpos, qvel, ctrl, applied, actuator_force, indices, body, senses, unit, controller_law,
+    controller_params, disturbance_law, disturbance_params, t, h, substeps, p, v, p_r, v_r, state, robot_state, history, sensed,
+    seed, count, drag, force, record,
 ):  # fmt: skip
     """All substeps of one mission step of one world, with v_r held. Returns 0, or 1 + agent + N * substep that diverged.
 
     Args:
         data, qpos, qvel, ctrl, applied, actuator_force: MjData and its arrays; ``applied`` is qfrc_applied, which takes the drag.
         indices: (3, N, 2), where in qpos, in qvel and in ctrl an agent's two axes are.
+        body: drive, reading, spans, params of the robots; senses: the numbers of :class:`Imperfections`; unit: of forces [N].
         p, v, p_r, v_r: (N, 2) [m, m/s], changed in place; state: (N, S), the controllers' own, changed in place.
+        robot_state: (N, S), the robots' own; history, sensed, seed: of :func:`sense`; count: substeps made since reset.
         drag, force: (N, 2) [N], scratch.
         record: (substeps, N, 10): p, v, p_r, v_r as the law saw them and the force MuJoCo applied; (0, N, 10) records nothing.
     """
     agents = p.shape[0]
+    direct = body[2].shape[1] == 0
+    seen_p, seen_v = (sensed[0], sensed[1]) if sensed.shape[0] > 0 else (p, v)
     for k in range(substeps):
         failed = team_forces(
-            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, p_r, v_r, state,
-            drag, force,
+            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, seen_p, seen_v, p_r,
+            v_r, state, unit, drag, force,
         )  # fmt: skip
+        if failed:
+            return failed + agents * k
+        if senses[2] > 0.0:
+            weaken(senses, t + k * h, force)
+        failed = actuate(body, robot_state, indices, qpos, qvel, force, h, ctrl)
         if failed:
             return failed + agents * k
         for i in range(agents):
             for axis in range(2):
-                ctrl[indices[2, i, axis]] = force[i, axis]
                 applied[indices[1, i, axis]] = drag[i, axis]
         call_step(step_function, model, data)
-        for i in range(agents):
-            for axis in range(2):
-                if record.shape[0] > 0:
+        if record.shape[0] > 0:
+            for i in range(agents):
+                for axis in range(2):
                     record[k, i, axis] = p[i, axis]
                     record[k, i, 2 + axis] = v[i, axis]
                     record[k, i, 4 + axis] = p_r[i, axis]
                     record[k, i, 6 + axis] = v_r[i, axis]
-                    record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]]
-                p[i, axis] = qpos[indices[0, i, axis]]
-                v[i, axis] = qvel[indices[1, i, axis]]
+        measure(body, robot_state, indices, qpos, qvel, actuator_force, p, v, force)
+        for i in range(agents):
+            for axis in range(2):
+                if record.shape[0] > 0:
+                    record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]] if direct else force[i, axis]
                 p_r[i, axis] += h * v_r[i, axis]
+        if sensed.shape[0] > 0:
+            sense(senses, seed, count + k + 1, history, p, v, sensed)
     return 0
 
 
@@ -200,27 +221,35 @@ def begin_step(  # type: ignore[no-untyped-def]
 def mission_step(  # type: ignore[no-untyped-def]
     b,
     # fixed for all worlds
-    step_function, model, indices, sizes, controller_law, controller_params, disturbance_law,
-    behavior_laws, behavior_params, table, command_of, path, formations, settings,
+    step_function, model, indices, sizes, drive, reading, spans, robot_params, senses, limits, controller_law, controller_params,
+    disturbance_law, behavior_laws, behavior_params, table, command_of, path, formations, settings,
     # one row a world
     data, disturbance_params, obstacles, orders, given, commands, p, v, p_r, v_r, state, clearance, formation, reward,
-    steps, status, record, scratch,
+    steps, robot_state, history, sensed, seeds, status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
-    [m], safe distance [m], virtual (0/1); ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders make it.
+    [m], safe distance [m], virtual (0/1);
+    ``limits`` = speed [m/s], acceleration [m/s^2], force unit [N]; ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders
+    make it.
     """
     t = steps[b] * settings[0]
-    r2 = begin_step(
-        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], given[b],
-        obstacles[b], p[b], p_r[b], v_r[b], commands[b], scratch[b],
-    )  # fmt: skip
     agents = p.shape[1]
     drag, force = scratch[b, SCRATCH : SCRATCH + agents], scratch[b, SCRATCH + agents :]
+    seen = sensed[b, 0] if sensed.shape[1] > 0 else p[b]
+    keep(limits, v_r[b], drag)
+    r2 = begin_step(
+        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], given[b],
+        obstacles[b], seen, p_r[b], v_r[b], commands[b], scratch[b],
+    )  # fmt: skip
+    limit(limits, settings[0], drag, v_r[b])
+    substeps = round(settings[0] / settings[1])
+    body = (drive, reading, spans, robot_params)  # numba shares no tuples out over threads
     status[b] = _run_substeps_compiled(
         step_function, model, data[b, 0], doubles(data[b, 1], sizes[0]), doubles(data[b, 2], sizes[1]),
-        doubles(data[b, 3], sizes[2]), doubles(data[b, 4], sizes[1]), doubles(data[b, 5], sizes[2]), indices,
-        controller_law, controller_params, disturbance_law, disturbance_params[b], t, settings[1],
-        round(settings[0] / settings[1]), p[b], v[b], p_r[b], v_r[b], state[b], drag, force, record[b],
+        doubles(data[b, 3], sizes[2]), doubles(data[b, 4], sizes[1]), doubles(data[b, 5], sizes[2]), indices, body, senses,
+        limits[2], controller_law, controller_params, disturbance_law, disturbance_params[b], t, settings[1], substeps, p[b],
+        v[b], p_r[b], v_r[b], state[b], robot_state[b], history[b], sensed[b], seeds[b], steps[b] * substeps, drag, force,
+        record[b],
     )  # fmt: skip
     formation[b], r1 = judge(p[b], obstacles[b], formations, settings[2], settings[3], clearance[b], scratch[b])
     reward[b] = r1 + r2

@@ -44,6 +44,16 @@ def as_disturbance(law):  # type: ignore[no-untyped-def]
     return law
 
 
+def as_drive(law):  # type: ignore[no-untyped-def]
+    """A robot's drive that can be called for a whole team, from its address."""
+    return law
+
+
+def as_reading(law):  # type: ignore[no-untyped-def]
+    """A robot's reading that can be called for a whole team, from its address."""
+    return law
+
+
 @intrinsic
 def _call_address(typing_context, step, model, data):  # type: ignore[no-untyped-def]
     def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
@@ -95,3 +105,5 @@ def _compile_as(function, kind):  # type: ignore[no-untyped-def]
 _compile_as(as_behavior, laws.BEHAVIOR)
 _compile_as(as_controller, laws.TEAM_CONTROLLER)
 _compile_as(as_disturbance, laws.TEAM_DISTURBANCE)
+_compile_as(as_drive, laws.TEAM_DRIVE)
+_compile_as(as_reading, laws.TEAM_READING)

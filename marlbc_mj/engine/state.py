@@ -1,12 +1,15 @@
 """The state of B teams between mission steps, apart from the physics: what World and the dm_control task both keep."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from marlbc_mj.engine import loop
+from marlbc_mj.engine.body import DIVERGED
+from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.errors import SimulationError
+from marlbc_mj.imperfections import sense
 
 
 class Observation(NamedTuple):
@@ -35,8 +38,9 @@ class TeamState:
     def __init__(self, plan: Plan, worlds: int) -> None:
         agents = plan.scenario.agents
         self.plan = plan
-        self.position = np.zeros((worlds, agents, 2))  # measured [m]
-        self.velocity = np.zeros((worlds, agents, 2))  # measured [m/s]
+        self._body = plan.python_body()
+        self.position = np.zeros((worlds, agents, 2))  # [m]
+        self.velocity = np.zeros((worlds, agents, 2))  # [m/s]
         self.reference = np.zeros((worlds, agents, 2))  # p_r [m]
         self.reference_velocity = np.zeros((worlds, agents, 2))  # v_r [m/s]
         self.controller = np.zeros((worlds, *plan.initial_state.shape))  # (B, N, S)
@@ -48,10 +52,15 @@ class TeamState:
         self.reward = np.zeros(worlds)
         self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
         self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
+        imperfections, substep = plan.scenario.imperfections, plan.scenario.substep
+        self.robot = np.zeros((worlds, agents, len(plan.robot.state)))  # the robots' laws' own
+        self.history = np.zeros((worlds, imperfections.depth(substep), 2, agents, 2))  # p and v, for delays
+        self.sensed = np.zeros((worlds, 2 if imperfections.sensing else 0, agents, 2))  # measured p and v, where they differ
+        self.noise_seed = np.zeros(worlds, dtype=np.int64)
         self.composed = np.zeros((worlds, 0, 2))  # no velocities given: the orders make v_r
 
     def reset(self, b: int, rng: np.random.Generator) -> np.ndarray:
-        """Put world ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m]."""
+        """Put world ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m], for :meth:`put`."""
         draw = self.plan.scenario.draw(rng)
         self.position[b] = self.reference[b] = draw.starts
         self.velocity[b] = self.reference_velocity[b] = 0.0
@@ -59,15 +68,55 @@ class TeamState:
         self.obstacles[b] = draw.obstacles
         self.disturbance_params[b] = self.plan.disturbance_params
         self.disturbance_params[b, 0] *= draw.drag_scale
+        self.robot[b] = self.plan.robot.state
+        self.noise_seed[b] = rng.integers(2**32)
         self.steps[b] = self.command[b] = self.reward[b] = 0
         self._judge(b)
         return draw.starts
+
+    def put(self, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Move the physics of world ``b``, ``data``, to positions (N, 2) [m] and velocities (N, 2) [m/s], and measure it.
+
+        The base of a robot that is read elsewhere (a look-ahead point) is shifted until the reading is the position. Its
+        velocity is what its joints allow. Obstacles that are solid go where this episode has them.
+        """
+        base, rates = self.plan.indices[0].ravel(), self.plan.indices[1].ravel()
+        data.qpos[base] = np.ravel(position)
+        data.qvel[rates] = np.ravel(velocity)
+        if len(self.plan.solid):
+            data.mocap_pos[self.plan.solid, :2] = self.obstacles[b, :, :2]
+        _, reading, spans, params = self._body
+        if reading is not None:
+            p, v, force = np.zeros((3, *self.position[b].shape))
+            reading(params, self.robot[b], data.qpos, data.qvel, data.actuator_force, spans, p, v, force)
+            data.qpos[base] += np.ravel(position - p)
+            self.velocity[b] = v
+        if self.sensed.shape[1] > 0:  # the past that delays look into is the present
+            self.history[b] = np.stack([self.position[b], self.velocity[b]])
+            self._sense(b, int(self.steps[b]) * self.plan.scenario.substeps)
+
+    def _sense(self, b: int, count: int) -> None:
+        sense(
+            self.plan.senses, self.noise_seed[b], count, self.history[b], self.position[b], self.velocity[b], self.sensed[b]
+        )  # fmt: skip
+
+    def after_substep(self, b: int, substep: int) -> None:
+        """Measure world ``b`` after its ``substep``-th substep of this mission step, counted from 0."""
+        if self.sensed.shape[1] > 0:
+            self._sense(b, int(self.steps[b]) * self.plan.scenario.substeps + substep + 1)
+
+    def measured(self, b: int) -> tuple[np.ndarray, np.ndarray]:
+        """(N, 2) positions [m] and velocities [m/s] of world ``b`` as they are measured."""
+        if self.sensed.shape[1] > 0:
+            return self.sensed[b, 0], self.sensed[b, 1]
+        return self.position[b], self.velocity[b]
 
     def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
         """Put world ``b`` in the middle of a mission, as :meth:`World.place` says; controllers start anew."""
         self.position[b] = self.reference[b] = position
         self.velocity[b] = self.reference_velocity[b] = velocity
         self.controller[b] = self.plan.initial_state
+        self.robot[b] = self.plan.robot.state
         self.steps[b], self.command[b], self.reward[b] = step, command, 0.0
         self._judge(b)
 
@@ -92,6 +141,8 @@ class TeamState:
         """
         plan = self.plan
         orders_of = plan.scenario.orders
+        previous = self.scratch[b, loop.SCRATCH : loop.SCRATCH + plan.scenario.agents]
+        keep(plan.limits, self.reference_velocity[b], previous)
         self.reward[b] = loop.begin_step(
             self.time(b),
             self.steps[b],
@@ -104,12 +155,13 @@ class TeamState:
             orders,
             self.composed[b] if velocity is None else velocity,
             self.obstacles[b],
-            self.position[b],
+            self.measured(b)[0],
             self.reference[b],
             self.reference_velocity[b],
             self.command[b],
             self.scratch[b],
         )
+        limit(plan.limits, plan.scenario.mission_step, previous, self.reference_velocity[b])
 
     def finish(self, b: int) -> None:
         """End a mission step of world ``b``: clearances, G and the reward r1 + r2 from the measured positions."""
@@ -131,10 +183,12 @@ class TeamState:
 
     def observe(self) -> Observation:
         """What a supervisor decides on, as copies."""
+        sensing = self.sensed.shape[1] > 0
+        position, velocity = (self.sensed[:, 0], self.sensed[:, 1]) if sensing else (self.position, self.velocity)
         return Observation(
             self.steps * self.plan.scenario.mission_step,
-            self.position.copy(),
-            self.velocity.copy(),
+            position.copy(),
+            velocity.copy(),
             self.clearance.copy(),
             self.formation.copy(),
             self.command.copy(),
@@ -142,7 +196,7 @@ class TeamState:
         )
 
     def rows(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-        """The arguments of ``mission_step`` with one row a world, from disturbance_params to steps, in its order."""
+        """The arguments of ``mission_step`` with one row a world, from disturbance_params to seeds, in its order."""
         return (
             self.disturbance_params,
             self.obstacles,
@@ -158,6 +212,10 @@ class TeamState:
             self.formation,
             self.reward,
             self.steps,
+            self.robot,
+            self.history,
+            self.sensed,
+            self.noise_seed,
         )
 
     def diverged(self, b: int, status: int) -> SimulationError:
@@ -166,6 +224,6 @@ class TeamState:
         start = (self.steps[b] - 1) * self.plan.scenario.mission_step
         return SimulationError(
             f"world {b}, agent {agent + 1}, t = {start + substep * self.plan.scenario.substep:.3f} s: position, velocity or "
-            f"force is not finite or beyond {loop.DIVERGED:g} "
+            f"force is not finite or beyond {DIVERGED:g} "
             f"(p = {self.position[b, agent].tolist()}, v = {self.velocity[b, agent].tolist()})"
         )

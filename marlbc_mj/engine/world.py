@@ -19,13 +19,13 @@ PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 
 
 class Record(NamedTuple):
-    """Every substep of one mission step: what the law saw, and the force that MuJoCo applied."""
+    """Every substep of one mission step: where the team was, and the planar force that its actuators gave."""
 
     position: np.ndarray  # (B, substeps, N, 2) [m]
     velocity: np.ndarray  # (B, substeps, N, 2) [m/s]
     reference: np.ndarray  # (B, substeps, N, 2) p_r [m]
     reference_velocity: np.ndarray  # (B, substeps, N, 2) v_r [m/s]
-    force: np.ndarray  # (B, substeps, N, 2) actuator_force [N]
+    force: np.ndarray  # (B, substeps, N, 2) actuator_force of a direct robot, or as its reading has it [N]
 
 
 class Step(NamedTuple):
@@ -85,7 +85,7 @@ class World:
         self._status = np.zeros(worlds, dtype=np.int64)
         self._record = np.zeros((worlds, scenario.substeps if record else 0, scenario.agents, 10))
         self._fixed = self.plan.fixed_arguments() if self.native else ()
-        self._python_laws = self.plan.python_laws()
+        self._python_laws, self._python_body = self.plan.python_laws(), self.plan.python_body()
         self.reset()
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
@@ -101,7 +101,7 @@ class World:
             rng = np.random.default_rng(np.random.SeedSequence([seed, int(b)]))
             starts = self.state.reset(int(b), rng)
             mujoco.mj_resetData(self.plan.model, self.data[b])
-            self.data[b].qpos[self.plan.indices[0].ravel()] = starts.ravel()
+            self.state.put(int(b), self.data[b], starts, np.zeros_like(starts))
         return self.observe()
 
     def copy_world(self, source: "World", source_world: int, world: int) -> None:
@@ -122,11 +122,9 @@ class World:
             command: (N,) indices into ``scenario.orders.commands`` that count as given last.
         """
         self.state.place(b, step, position, velocity, command)
-        data, indices = self.data[b], self.plan.indices
-        mujoco.mj_resetData(self.plan.model, data)
-        data.time = step * self.scenario.mission_step
-        data.qpos[indices[0].ravel()] = np.ravel(position)
-        data.qvel[indices[1].ravel()] = np.ravel(velocity)
+        mujoco.mj_resetData(self.plan.model, self.data[b])
+        self.data[b].time = step * self.scenario.mission_step
+        self.state.put(b, self.data[b], position, velocity)
 
     def physics(self, b: int) -> np.ndarray:
         """MuJoCo's integration state of world ``b``."""
@@ -259,6 +257,9 @@ class World:
             plan.model,
             *self._handles[b],
             plan.indices,
+            self._python_body,
+            plan.senses,
+            plan.limits[2],
             self._python_laws[0],
             plan.controller_params,
             self._python_laws[1],
@@ -271,6 +272,11 @@ class World:
             state.reference[b],
             state.reference_velocity[b],
             state.controller[b],
+            state.robot[b],
+            state.history[b],
+            state.sensed[b],
+            int(state.noise_seed[b]),
+            int(state.steps[b]) * self.scenario.substeps,
             drag,
             force,
             self._record[b],

@@ -14,6 +14,7 @@ TRACK_FOVY = 36.0  # [deg]
 TRACK_SMOOTHING = 8.0  # position and size of the team are followed as means over this time [s]
 TRACK_AHEAD = 5.0  # how far ahead of the team it looks [m]
 TRACK_DISTANCE = 3.45  # how far away it is, in team radii
+CLOSE_RADIUS = (4.0, 7.0)  # the same of the close view, which shows the robots rather than all of the team [m]
 TRACK_RADIUS = (10.5, 60.0)  # least and largest team radius it adapts to [m]
 TOP_MARGIN = 4.0  # around everything in the log [m]
 
@@ -21,7 +22,7 @@ Camera = Callable[[float], mujoco.MjvCamera]
 
 
 def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
-    """The camera ``track``, ``top`` or any one of the model, as a function of time [s].
+    """The camera ``track``, ``close``, ``top`` or any one of the model, as a function of time [s].
 
     Args:
         aspect: width of the picture over its height.
@@ -29,11 +30,11 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
     Raises:
         ConfigurationError: unknown camera.
     """
-    if name == "track":
-        return _track(stage)
+    if name in ("track", "close"):
+        return _track(stage, TRACK_RADIUS if name == "track" else CLOSE_RADIUS)
     names = [stage.model.camera(k).name for k in range(stage.model.ncam)]
     if name not in names:
-        raise unknown("camera", name, dict.fromkeys(["track", *names]))
+        raise unknown("camera", name, dict.fromkeys(["track", *names, "close"]))
     if name == "top":
         _fit_top(stage, aspect)
     fixed = mujoco.MjvCamera()
@@ -42,14 +43,15 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
     return lambda time: fixed
 
 
-def _track(stage: Stage) -> Camera:
+def _track(stage: Stage, bounds: tuple[float, float]) -> Camera:
     """From behind and above, turned so that team, trails and what lies ahead are in the picture."""
     log = stage.log
     centroid = log.position.mean(axis=1, keepdims=True)
     reach = np.linalg.norm(log.position - centroid, axis=-1).max(axis=1, keepdims=True)
-    team = np.hstack([centroid[:, 0], np.clip(reach, *TRACK_RADIUS)])
+    team = np.hstack([centroid[:, 0], np.clip(reach, stage.scale * bounds[0], stage.scale * bounds[1])])
     smooth = _smoothed(team, max(1, round(TRACK_SMOOTHING / log.mission_step)))
     heading = _heading(centroid[:, 0])
+    ahead = TRACK_AHEAD * stage.scale * bounds[0] / TRACK_RADIUS[0]
     stage.model.vis.global_.fovy = TRACK_FOVY
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -58,7 +60,7 @@ def _track(stage: Stage) -> Camera:
 
     def at(time: float) -> mujoco.MjvCamera:
         now = stage.sample(smooth, time)
-        camera.lookat[:2] = now[:2] + TRACK_AHEAD * heading
+        camera.lookat[:2] = now[:2] + ahead * heading
         camera.distance = TRACK_DISTANCE * now[2]
         return camera
 
@@ -86,7 +88,7 @@ def _fit_top(stage: Stage, aspect: float) -> None:
     zone = log.obstacles[:, 2:] + log.safe_distance
     points = [log.position.reshape(-1, 2), log.obstacles[:, :2] - zone, log.obstacles[:, :2] + zone]
     everything = np.concatenate(points)
-    low, high = everything.min(axis=0) - TOP_MARGIN, everything.max(axis=0) + TOP_MARGIN
+    low, high = everything.min(axis=0) - TOP_MARGIN * stage.scale, everything.max(axis=0) + TOP_MARGIN * stage.scale
     camera = model.camera("top").id
     model.cam_projection[camera] = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC
     model.cam_fovy[camera] = max(high[1] - low[1], (high[0] - low[0]) / aspect)

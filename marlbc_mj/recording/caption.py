@@ -39,6 +39,7 @@ class Caption:
     width: int
     height: int
     speed: float | None = None  # None: a still
+    badges: bool = False  # agents' numbers on badges of their own, not on the agents
     _bars: dict[object, Image.Image] = field(default_factory=dict)
 
     @property
@@ -67,7 +68,10 @@ class Caption:
         """
         frame = Image.new("RGB", (self.width, self.height), PAPER)
         image = Image.fromarray(np.ascontiguousarray(picture))
-        _number(image, labels, radii)
+        if self.badges:
+            _badge(image, labels, round(13 * self.scale))
+        else:
+            _number(image, labels, radii)
         commands = tuple(self.log.commands[k] for k in self.log.command[step])
         frame.paste(image, (0, self.header))
         frame.paste(self._kept("header"), (0, 0))
@@ -89,6 +93,22 @@ class Caption:
                 _draw_header(pen, self.log, self.speed)
             self._bars[key] = pen.image.resize((self.width, height), Image.Resampling.BOX)
         return self._bars[key]
+
+
+def _badge(image: Image.Image, labels: np.ndarray, radius: int) -> None:
+    """Every agent's number in a disc of its color: where it would hide the robot, it stands above it."""
+    side = 2 * radius * SHARP
+    for agent, (column, row) in enumerate(labels):
+        if not (0 <= column < image.width and 0 <= row < image.height):
+            continue
+        color = AGENT_COLORS[agent % len(AGENT_COLORS)]
+        badge, mask = Image.new("RGB", (side, side), color), Image.new("L", (side, side))
+        ImageDraw.Draw(mask).ellipse((0, 0, side - 1, side - 1), 255)
+        pen = ImageDraw.Draw(badge)
+        pen.ellipse((SHARP, SHARP, side - 1 - SHARP, side - 1 - SHARP), color, PAPER, 2 * SHARP)
+        pen.text((side // 2, side // 2), str(agent + 1), ink_on(color), _font(round(1.15 * radius * SHARP), True), "mm")
+        small = badge.resize((2 * radius, 2 * radius), Image.Resampling.BOX), mask.resize((2 * radius,) * 2, Image.Resampling.BOX)
+        image.paste(small[0], (round(column) - radius, round(row) - 2 * radius), small[1])
 
 
 def _number(image: Image.Image, labels: np.ndarray, radii: np.ndarray) -> None:

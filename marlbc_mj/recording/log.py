@@ -1,13 +1,13 @@
 """An episode at mission rate, as it is written to and read back from a log."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from marlbc_mj.controllers import Controller
 from marlbc_mj.engine.loop import judge
 from marlbc_mj.engine.plan import make_plan
-from marlbc_mj.episode import Trajectory
+from marlbc_mj.episode import NO_POSE, Trajectory
 
 
 @dataclass(frozen=True)
@@ -39,6 +39,7 @@ class EpisodeLog:
     command: np.ndarray  # (M, N) index into commands
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,) [ms]
+    pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:
@@ -69,6 +70,7 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         command=trajectory.command,
         reward=trajectory.reward,
         decision_ms=trajectory.decision_ms,
+        pose=trajectory.pose,
     )
 
 

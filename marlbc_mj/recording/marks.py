@@ -38,13 +38,14 @@ class Trail:
     time: np.ndarray  # (P,) when each corner is passed [s]
     corner: np.ndarray  # (P, 2) [m]
     pieces: list[Mark]  # P - 1 of them
+    scale: float = 1.0
 
     def until(self, time: float, here: np.ndarray) -> list[Mark]:
         """The path up to ``time`` [s], which ends at ``here`` (2,) [m]."""
         passed = int(np.searchsorted(self.time, time, side="right"))
         if passed == 0:
             return []
-        return [*self.pieces[: passed - 1], _trail_piece(self.agent, self.corner[passed - 1], here)]
+        return [*self.pieces[: passed - 1], _trail_piece(self.agent, self.corner[passed - 1], here, self.scale)]
 
 
 def add(scene: mujoco.MjvScene, mark: Mark) -> None:
@@ -55,19 +56,19 @@ def add(scene: mujoco.MjvScene, mark: Mark) -> None:
     scene.ngeom += 1
 
 
-def ribbon(a: np.ndarray, b: np.ndarray, width: float, height: float, color: Color) -> Mark:
+def ribbon(a: np.ndarray, b: np.ndarray, width: float, height: float, color: Color, scale: float = 1.0) -> Mark:
     """A flat strip between two points (2,) of the ground, ``height`` [m] above it."""
     along = b - a
     length = float(np.hypot(*along))
     cosine, sine = along / length if length > 1e-9 else (1.0, 0.0)
-    size = np.array([0.5 * length + 0.25 * width, 0.5 * width, SHEET])
+    size = np.array([0.5 * length + 0.25 * width, 0.5 * width, SHEET * scale])
     frame = np.array([cosine, -sine, 0.0, sine, cosine, 0.0, 0.0, 0.0, 1.0])
     return Mark(mujoco.mjtGeom.mjGEOM_BOX, size, np.array([*(0.5 * (a + b)), height]), frame, color)
 
 
-def disc(center: np.ndarray, radius: float, height: float, color: Color) -> Mark:
+def disc(center: np.ndarray, radius: float, height: float, color: Color, scale: float = 1.0) -> Mark:
     """A flat disc around ``center`` (2,), ``height`` [m] above the ground."""
-    size = np.array([radius, SHEET, 0.0])
+    size = np.array([radius, SHEET * scale, 0.0])
     return Mark(mujoco.mjtGeom.mjGEOM_CYLINDER, size, np.array([*center, height]), _UPRIGHT, color)
 
 
@@ -76,20 +77,24 @@ def ball(center: np.ndarray, radius: float, color: Color) -> Mark:
     return Mark(mujoco.mjtGeom.mjGEOM_SPHERE, np.full(3, radius), np.array([*center, radius]), _UPRIGHT, color)
 
 
-def dashed_circle(center: np.ndarray, radius: float, color: Color) -> list[Mark]:
-    """A circle of dashes around ``center`` (2,) on the ground, as many as ``DASH_LENGTH`` and ``DASH_ANGLE`` allow."""
-    dashes = int(np.clip(np.pi * radius / DASH_LENGTH, 8, np.pi / DASH_ANGLE))
+def dashed_circle(center: np.ndarray, radius: float, color: Color, scale: float = 1.0) -> list[Mark]:
+    """A circle of dashes around ``center`` (2,) on the ground, as many as ``DASH_LENGTH`` and ``DASH_ANGLE`` allow.
+
+    ``scale`` is what 1 m of the marks is in a mission of small robots [m], here and below.
+    """
+    dashes = int(np.clip(np.pi * radius / (DASH_LENGTH * scale), 8, np.pi / DASH_ANGLE))
     turn = np.linspace(0.0, 2.0 * np.pi, 2 * dashes, endpoint=False)
     points = center + radius * np.column_stack([np.cos(turn), np.sin(turn)])
-    return [ribbon(points[k], points[k + 1], CIRCLE_WIDTH, 0.03, color) for k in range(0, 2 * dashes, 2)]
+    size = CIRCLE_WIDTH * scale, 0.03 * scale, color, scale
+    return [ribbon(points[k], points[k + 1], *size) for k in range(0, 2 * dashes, 2)]
 
 
-def make_trail(agent: int, time: np.ndarray, path: np.ndarray) -> Trail:
+def make_trail(agent: int, time: np.ndarray, path: np.ndarray, scale: float = 1.0) -> Trail:
     """The trail of a path (M, 2) [m] that is passed at ``time`` (M,) [s]."""
-    corners = corner_indices(path, TRAIL_TOLERANCE)
+    corners = corner_indices(path, TRAIL_TOLERANCE * scale)
     points = path[corners]
-    pieces = [_trail_piece(agent, a, b) for a, b in pairwise(points)]
-    return Trail(agent, time[corners], points, pieces)
+    pieces = [_trail_piece(agent, a, b, scale) for a, b in pairwise(points)]
+    return Trail(agent, time[corners], points, pieces, scale)
 
 
 def corner_indices(path: np.ndarray, tolerance: float) -> np.ndarray:
@@ -116,6 +121,7 @@ def _distances(points: np.ndarray, along: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.norm(points - share[:, None] * along, axis=1))
 
 
-def _trail_piece(agent: int, a: np.ndarray, b: np.ndarray) -> Mark:
+def _trail_piece(agent: int, a: np.ndarray, b: np.ndarray, scale: float) -> Mark:
     """One straight piece of a trail; each agent's lies a little higher, so that crossing trails do not flicker."""
-    return ribbon(a, b, TRAIL_WIDTH, 0.04 + 0.002 * (agent % 8), agent_color(agent))
+    height = 0.04 + 0.002 * (agent % 8)
+    return ribbon(a, b, TRAIL_WIDTH * scale, height * scale, agent_color(agent), scale)

@@ -198,7 +198,8 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
     """Decoded messages of every required topic, the same number of each."""
-    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in schemas.REQUIRED}
+    posed = any(channel.topic == schemas.POSE.name for channel in _channels(reader))
+    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *[schemas.POSE] * posed)}
     for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
         found[channel.topic].append(json.loads(message.data))
     counts = {name: len(messages) for name, messages in found.items()}
@@ -210,8 +211,14 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
     return found
 
 
+def _channels(reader: McapReader) -> list[Channel]:
+    summary = reader.get_summary()
+    return list(summary.channels.values()) if summary is not None else []
+
+
 def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
     """The arrays of EpisodeLog from decoded messages."""
+    pose = schemas.POSE
 
     def agents(topic: str, *names: str) -> np.ndarray:
         # Infinite numbers are left out of the JSON, and only a clearance can be.
@@ -232,6 +239,7 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
         "command": agents("/priorities", "index")[..., 0],
         "reward": scalar("/metrics", "reward"),
         "decision_ms": scalar("/metrics", "decision_ms"),
+        "pose": agents(pose.name, *pose.columns) if pose.name in found else np.zeros((len(found["/state"]), 0, 7)),
     }
 
 

@@ -41,8 +41,9 @@ class Scene:
 
     def __init__(self, scenario: Scenario, obstacles: np.ndarray) -> None:
         self._static = SceneUpdate(entities=[_obstacle_entity(obstacles, scenario.safe_distance)]).SerializeToString()
-        radius = make_robot(scenario.robot).radius
-        self._team = SceneUpdate(entities=[_agent_entity(i, radius) for i in range(scenario.agents)])
+        robot = make_robot(scenario.robot)
+        radius = robot.radius
+        self._team = SceneUpdate(entities=[_agent_entity(i, radius, robot.length) for i in range(scenario.agents)])
         self._transforms = FrameTransforms()
         for i in range(scenario.agents):
             transform = self._transforms.transforms.add(parent_frame_id=WORLD_FRAME, child_frame_id=f"agent{i + 1}")
@@ -86,11 +87,12 @@ def _pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
     return Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0))
 
 
-def _agent_entity(agent: int, radius: float) -> SceneEntity:
-    """A sphere for the agent, a small one for its reference, a line between them."""
+def _agent_entity(agent: int, radius: float, length: float) -> SceneEntity:
+    """A sphere for the agent, a small one for its reference at the robot's length unit, a line between them."""
     color = _color(agent_color(agent))
     spheres = [
-        SpherePrimitive(pose=_pose(z=radius), size=Vector3(x=d, y=d, z=d), color=color) for d in (2 * radius, _REFERENCE_DIAMETER)
+        SpherePrimitive(pose=_pose(z=radius), size=Vector3(x=d, y=d, z=d), color=color)
+        for d in (2 * radius, _REFERENCE_DIAMETER * length)
     ]
     points = [Point3(z=radius), Point3(z=radius)]
     line = LinePrimitive(pose=_pose(), points=points, thickness=2.0, scale_invariant=True, color=color)

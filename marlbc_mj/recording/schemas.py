@@ -95,9 +95,21 @@ METRICS = Topic(
         "decision_ms": Field("number", "what the supervisor took [ms]"),
     },
 )
+POSE = Topic(
+    "/pose",
+    "marlbc.Pose",
+    "where the bodies of robots with a free joint are and how they are turned, at the start of a mission step",
+    {
+        **{axis: Field("number", f"position of the body, {axis} axis [m]") for axis in ("x", "y", "z")},
+        **{f"q{part}": Field("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
+    },
+)
 TOPICS = (STATE, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE, REFERENCE, FORCE, PRIORITIES, METRICS)
-"""Topics without which a log cannot be read back; the weights are there for SORLC only."""
+"""Topics without which a log cannot be read back; the weights are there for SORLC only.
+
+Robots with a free joint have ``POSE`` too.
+"""
 
 
 def json_schema(topic: Topic) -> dict[str, Any]:

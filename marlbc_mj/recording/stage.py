@@ -31,6 +31,8 @@ class Stage:
     radii: np.ndarray  # (N,) drawn radii of the agents [m]
     rings: list[Mark]
     trails: list[Trail]
+    scale: float = 1.0  # what 1 m of the paper's mission is here: marks and cameras shrink with small robots [m]
+    free: tuple[int, ...] = ()  # addresses in qpos of the agents' free joints, where the log has their poses
 
     def step(self, time: float) -> int:
         """Index of the mission step that ``time`` [s] lies in, the nearest one outside the log."""
@@ -50,6 +52,10 @@ class Stage:
     def pose(self, time: float) -> None:
         """Move the model's agents to where they are at ``time`` [s]."""
         self.data.qpos[self.joints] = self.sample(self.log.position, time)
+        poses = self.sample(self.log.pose, time) if self.free else ()
+        for first, pose in zip(self.free, poses, strict=True):
+            pose[3:] /= np.linalg.norm(pose[3:])
+            self.data.qpos[first : first + 7] = pose
         mujoco.mj_forward(self.model, self.data)
 
     def draw(self, scene: mujoco.MjvScene, time: float) -> None:
@@ -65,8 +71,9 @@ class Stage:
             add(scene, mark)
 
     def middles(self) -> np.ndarray:
-        """(N, 3) middle of every agent as drawn [m]."""
-        return np.column_stack([self.data.qpos[self.joints], self.radii])
+        """(N, 3) where every agent's number goes [m]: on the middle of a ball, above a robot that has a pose."""
+        heights = self.data.qpos[[first + 2 for first in self.free]] + 1.9 * self.radii if self.free else self.radii
+        return np.column_stack([self.data.qpos[self.joints], heights])
 
     def _trails(self, time: float) -> list[Mark]:
         here = self.sample(self.log.position, time)
@@ -75,14 +82,16 @@ class Stage:
     def _agents(self, time: float) -> list[Mark]:
         """Halos in the color of the command, and the references as ghosts."""
         position, reference = (self.sample(v, time) for v in (self.log.position, self.log.reference))
-        marks = []
+        marks, unit = [], self.scale
         for i, command in enumerate(self.commands(time)):
             radius = float(self.radii[i])
-            marks.append(disc(position[i], HALO * radius, 0.06, rgba("#FFFFFF")))
-            marks.append(disc(position[i], (HALO - RIM) * radius, 0.09, rgba(command_color(command))))
-            if np.hypot(*(reference[i] - position[i])) > radius:
-                marks.append(ribbon(position[i], reference[i], 0.1, 0.12, agent_color(i)))
-            marks.append(ball(reference[i], GHOST * radius, (*agent_color(i)[:3], 0.45)))
+            marks.append(disc(position[i], HALO * radius, 0.06 * unit, rgba("#FFFFFF"), unit))
+            marks.append(disc(position[i], (HALO - RIM) * radius, 0.09 * unit, rgba(command_color(command)), unit))
+            far = bool(np.hypot(*(reference[i] - position[i])) > radius)
+            if far:
+                marks.append(ribbon(position[i], reference[i], 0.1 * unit, 0.12 * unit, agent_color(i), unit))
+            if far or not self.free:  # a robot that is on its reference is not to be hidden by it
+                marks.append(ball(reference[i], GHOST * radius, (*agent_color(i)[:3], 0.45)))
         return marks
 
 
@@ -97,26 +106,56 @@ def make_stage(log: EpisodeLog) -> Stage:
     agents = range(log.position.shape[1])
     try:
         model = mujoco.MjModel.from_xml_string(log.mjcf)
-        joints = [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
+        free = _free_joints(model, agents)
+        joints = (
+            [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
+            if not free
+            else [[first, first + 1] for first in free]
+        )
+        data = mujoco.MjData(model)
         for k, (x, y, _) in enumerate(log.obstacles):
-            model.geom(f"obstacle{k + 1}").pos[:2] = x, y
+            if model.nmocap:
+                data.mocap_pos[model.body(f"obstacle{k + 1}").mocapid[0], :2] = x, y
+            else:
+                model.geom(f"obstacle{k + 1}").pos[:2] = x, y
     except (KeyError, ValueError) as error:
         raise ConfigurationError(f"the log's model cannot be shown: {str(error).strip()}") from error
+    unit, radius = _size(model)
     return Stage(
         log=log,
         model=model,
-        data=mujoco.MjData(model),
+        data=data,
         joints=np.array(joints),
-        radii=np.array([_enlarge(model, agent_prefix(i)) for i in agents]),
-        rings=[mark for obstacle in log.obstacles for mark in _zone(obstacle, log.safe_distance)],
-        trails=[make_trail(i, log.time, log.position[:, i]) for i in agents],
+        radii=np.array([radius or _enlarge(model, agent_prefix(i)) for i in agents]),
+        rings=[mark for obstacle in log.obstacles for mark in _zone(obstacle, log.safe_distance, unit)],
+        trails=[make_trail(i, log.time, log.position[:, i], unit) for i in agents],
+        scale=unit,
+        free=tuple(free) if log.pose.shape[1] else (),
     )
 
 
-def _zone(obstacle: np.ndarray, safe_distance: float) -> list[Mark]:
+def _free_joints(model: mujoco.MjModel, agents: range) -> list[int]:
+    """Addresses in qpos of the agents' free joints, none where they have slides."""
+    found = []
+    for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        if model.body(model.jnt_bodyid[j]).name.startswith(tuple(agent_prefix(i) for i in agents)):
+            found.append(int(model.jnt_qposadr[j]))
+    return found
+
+
+def _size(model: mujoco.MjModel) -> tuple[float, float]:
+    """Length unit of the mission and drawn radius of a robot [m], as the assembly left them; 1 and 0 for point masses."""
+    if model.nnumeric == 0:
+        return 1.0, 0.0
+    unit, radius = model.numeric("robot").data
+    return float(unit), float(radius)
+
+
+def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]:
     """Where the clearance to an obstacle (3,) is below the safe distance [m]: a tinted disc in a dashed circle."""
     center, radius = obstacle[:2], float(obstacle[2]) + safe_distance
-    return [disc(center, radius, 0.01, rgba(SAFE_DISTANCE_COLOR, 0.1)), *dashed_circle(center, radius, rgba(SAFE_DISTANCE_COLOR))]
+    circle = dashed_circle(center, radius, rgba(SAFE_DISTANCE_COLOR), unit)
+    return [disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
 
 
 def _enlarge(model: mujoco.MjModel, prefix: str) -> float:

@@ -107,7 +107,7 @@ def _frames(
     """(height, width, 3) uint8 for every time [s]."""
     _check_size(width, height)
     stage = make_stage(log)
-    caption = Caption(log, width, height, speed)
+    caption = Caption(log, width, height, speed, badges=bool(stage.free))
     size = width, caption.picture_height
     view = make_camera(camera, stage, size[0] / size[1])
     with Offscreen(stage, view, *size, samples=samples) as offscreen:

@@ -29,6 +29,7 @@ from marlbc_mj.files import check_target
 from marlbc_mj.provenance import config_hash, git_revision, plain_data, versions
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
+from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
 METADATA = "marlbc"
@@ -89,6 +90,7 @@ class LogWriter:
         self._scene = Scene(scenario, obstacles)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = controller.initial_state(0).shape == (sorlc.STATE_SIZE,)
+        self._posed = len(make_robot(scenario.robot).joints) == 1
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]
         self._flushed = monotonic()  # when [s]
@@ -169,7 +171,7 @@ class LogWriter:
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
-        for topic in schemas.TOPICS:
+        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed):
             if topic is not schemas.WEIGHTS or self._weighted:
                 text = json.dumps(schemas.json_schema(topic)).encode()
                 schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
@@ -187,6 +189,8 @@ class LogWriter:
         yield "/reference", schemas.encode(schemas.REFERENCE, reference)
         yield "/force", schemas.encode(schemas.FORCE, frame.force)
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
+        if self._posed:
+            yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)
         if self._weighted:
             yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
         verdicts = {"formation": int(frame.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}

@@ -6,8 +6,9 @@ from typing import Any
 from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.case_study import cruise, paper
+from marlbc_mj.scenarios.robot_gate import robot_gate
 
-SCENARIOS: dict[str, Callable[..., Scenario]] = {"paper": paper, "cruise": cruise}
+SCENARIOS: dict[str, Callable[..., Scenario]] = {"paper": paper, "cruise": cruise, "robot_gate": robot_gate}
 """Factory by name."""
 
 
@@ -32,5 +33,6 @@ __all__ = [
     "cruise",
     "make_scenario",
     "paper",
+    "robot_gate",
     "standard_behaviors",
 ]

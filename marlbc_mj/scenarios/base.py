@@ -9,11 +9,14 @@ import numpy as np
 from marlbc_mj.behaviors import Behavior, Formation, ObstacleAvoidance
 from marlbc_mj.disturbances import Disturbance, PaperDrag
 from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.orders import Orders
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
 REFERENCE_MODES = ("virtual", "actual")
+YOUNG = {"young": True}
+"""Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
 
 
 class Obstacle(NamedTuple):
@@ -82,6 +85,11 @@ class Scenario:
     robot: str = "point_mass"
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
+    # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
+    unit_force: float = field(default=1.0, metadata=YOUNG)
+    speed_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s]; the paper's point mass has none
+    acceleration_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s^2]
+    imperfections: Imperfections = field(default=NO_IMPERFECTIONS, metadata=YOUNG)  # noise, delay, loss of actuators
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = Perturbation()
     schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
@@ -93,6 +101,7 @@ class Scenario:
         self._check_numbers()
         self._check_team()
         self._check_clocks()
+        self.imperfections.check(self.agents, self.substep)
         self.check_windows(self.schedule)
 
     @property
@@ -156,11 +165,23 @@ class Scenario:
                 )
 
     def _check_numbers(self) -> None:
-        positive = ("safe_distance", "formation_tolerance", "duration", "mission_step", "substep", "mass", "force_limit")
+        positive = (
+            "safe_distance",
+            "formation_tolerance",
+            "duration",
+            "mission_step",
+            "substep",
+            "mass",
+            "force_limit",
+            "unit_force",
+        )
         for name in positive:
             value = getattr(self, name)
             if not (np.isfinite(value) and value > 0):
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive and finite, got {value}")
+        for name in ("speed_limit", "acceleration_limit"):
+            if not getattr(self, name) > 0:
+                raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive, got {getattr(self, name)}")
         if self.reference not in REFERENCE_MODES:
             raise unknown("reference mode", self.reference, REFERENCE_MODES)
         arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}

@@ -163,8 +163,9 @@ class MPCMS:
         least, scale = scenario.safe_distance + self.margin, scenario.formation_tolerance
         weights = np.array([self.w_formation, self.w_reconstruction, self.slack, least, scale])
         costs, trails = judge(
-            memory.plan, start, situation.step, orders, situation.obstacles, weights, threads=self.threads, trails=trails
-        )
+            memory.plan, start, situation.step, orders, situation.obstacles, weights, moving=situation.velocity,
+            threads=self.threads, trails=trails,
+        )  # fmt: skip
         return costs, trails[:, 0].copy()
 
     def _changes(self, joint: Joint) -> list[Joint]:

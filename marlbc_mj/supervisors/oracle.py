@@ -10,7 +10,7 @@ next incumbent is put together from the best segment of each. What counts is its
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -23,8 +23,9 @@ from marlbc_mj.controllers import Controller, make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.files import write_json
-from marlbc_mj.provenance import config_hash, versions
+from marlbc_mj.provenance import config_hash, plain_data, versions
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
+from marlbc_mj.scenarios.base import YOUNG
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.scripted import Scripted
 
@@ -62,7 +63,10 @@ def shipped() -> Path:
 
 def cache_key(scenario: Scenario, controller: Controller) -> str:
     """Hash of all that decides a schedule's return; names, descriptions and the scripted schedule do not."""
-    bare = replace(scenario, name="", description="", schedule=())
+    bare = plain_data(replace(scenario, name="", description="", schedule=()))
+    for field in fields(scenario):
+        if field.metadata == YOUNG and getattr(scenario, field.name) == field.default:
+            del bare[field.name]
     return config_hash({"scenario": bare, "controller": controller})
 
 

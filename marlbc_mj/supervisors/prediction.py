@@ -8,6 +8,7 @@ import numba
 import numpy as np
 
 from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.loop import path_at, set_references
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.world import World
@@ -20,12 +21,14 @@ SCRATCH = 9
 
 @allocation_free
 def roll_out(  # type: ignore[no-untyped-def]
-    start, first, mission_step, orders, behavior_laws, behavior_params, table, path, obstacles, scratch, v_r, trail
-):
+    start, moving, first, mission_step, orders, behavior_laws, behavior_params, table, path, limits, obstacles, scratch, v_r,
+    before_v, trail,
+):  # fmt: skip
     """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
 
     Args:
-        start: (N, 2) [m] at mission step ``first``.
+        start: (N, 2) [m] at mission step ``first``; moving: (N, 2) its velocity [m/s], from which limited references go on.
+        limits: speed [m/s] and acceleration [m/s^2] of references; before_v: (N, 2), scratch.
         orders: (H, N) int64, indices into ``table``.
         path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3).
         scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
@@ -33,11 +36,16 @@ def roll_out(  # type: ignore[no-untyped-def]
     """
     now = scratch[:2]
     before = start
+    for i in range(start.shape[0]):
+        for axis in range(2):
+            v_r[i, axis] = moving[i, axis]
     for k in range(orders.shape[0]):
         path_at((first + k) * mission_step, path, now)
+        keep(limits, v_r, before_v)
         set_references(
             behavior_laws, behavior_params, table, orders[k], before, now, obstacles, scratch[2:7], v_r
         )  # fmt: skip
+        limit(limits, mission_step, before_v, v_r)
         for i in range(start.shape[0]):
             for axis in range(2):
                 trail[k, i, axis] = before[i, axis] + mission_step * v_r[i, axis]
@@ -66,14 +74,14 @@ def trail_cost(trail, first, mission_step, path, formations, obstacles, weights,
 
 @allocation_free
 def judge_candidate(  # type: ignore[no-untyped-def]
-    c, kinematic, start, first, mission_step, orders, behavior_laws, behavior_params, table, path, formations, obstacles,
-    weights, scratch, v_r, trails, costs,
+    c, kinematic, start, moving, first, mission_step, orders, behavior_laws, behavior_params, table, path, limits, formations,
+    obstacles, weights, scratch, v_r, before_v, trails, costs,
 ):  # fmt: skip
     """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
     if kinematic:
         roll_out(
-            start, first, mission_step, orders[c], behavior_laws, behavior_params, table, path, obstacles, scratch[c], v_r[c],
-            trails[c],
+            start, moving, first, mission_step, orders[c], behavior_laws, behavior_params, table, path, limits, obstacles,
+            scratch[c], v_r[c], before_v[c], trails[c],
         )  # fmt: skip
     costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, weights, scratch[c])
 
@@ -94,10 +102,11 @@ def judge_parallel(candidates, *args):  # type: ignore[no-untyped-def]
 
 def judge(
     plan: Plan, start: np.ndarray, first: int, orders: np.ndarray, obstacles: np.ndarray, weights: np.ndarray, *,
-    threads: int = 1, trails: np.ndarray | None = None,
+    moving: np.ndarray | None = None, threads: int = 1, trails: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) from positions ``start`` (N, 2) at step ``first``.
 
+    ``moving`` (N, 2) [m/s], zero by default, is the velocity that references of limited acceleration go on from.
     ``weights`` as in :func:`trail_cost`; ``trails`` given are judged as they are, else the kinematic reference is rolled out.
     """
     candidates, scenario = len(orders), plan.scenario
@@ -106,9 +115,10 @@ def judge(
         trails = np.empty((*orders.shape, 2))
     costs = np.empty(candidates)
     arguments = (
-        kinematic, np.ascontiguousarray(start), first, scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params,
-        scenario.orders.table, plan.path, scenario.formations, obstacles, weights, np.zeros((candidates, SCRATCH, 2)),
-        np.zeros((candidates, scenario.agents, 2)), trails, costs,
+        kinematic, np.ascontiguousarray(start), np.ascontiguousarray(np.zeros_like(start) if moving is None else moving), first,
+        scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params, scenario.orders.table, plan.path, plan.limits,
+        scenario.formations, obstacles, weights, np.zeros((candidates, SCRATCH, 2)),
+        *np.zeros((2, candidates, scenario.agents, 2)), trails, costs,
     )  # fmt: skip
     if threads == 1 or candidates == 1:
         judge_serial(candidates, *arguments)
@@ -120,10 +130,9 @@ def judge(
 
 def follow(twin: World, situation: Situation) -> None:
     """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
-    state, model = twin.state, twin.plan
+    state = twin.state
     state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
-    twin.data[0].qpos[model.indices[0]] = situation.position
-    twin.data[0].qvel[model.indices[1]] = situation.velocity
+    state.put(0, twin.data[0], situation.position, situation.velocity)
 
 
 def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:

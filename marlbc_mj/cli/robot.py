@@ -1,0 +1,74 @@
+"""``marlbc robot check`` and ``gate``: a robot tried out, and every robot on its mission."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+
+from marlbc_mj.terminal import progress_bars
+
+
+@dataclass(frozen=True)
+class RobotCheck:
+    """Go through the checklist of a robot; exit status 1 if something fails."""
+
+    file: Positional[str]
+    """A robot's MJCF (.xml) or Python file (.py), menagerie:FOLDER/FILE.xml, or a name from `marlbc list`."""
+
+    def run(self) -> None:
+        """Print one line a check."""
+        from marlbc_mj.robots.checklist import checklist
+
+        failed = 0
+        for item in checklist(self.file):
+            print(f"{'ok  ' if item.passed else 'FAIL'}  {item.name:<10}  {item.said}")
+            failed += not item.passed
+        if failed:
+            sys.exit(1)
+
+
+@dataclass(frozen=True)
+class RobotGate:
+    """Fly the gate mission, scaled to each robot, under scripted, FSAMS with hysteresis and MPCMS: a table, stills and clips."""
+
+    robots: tuple[str, ...] = ()
+    """Robots, by name or path; all of them but the point mass by default."""
+    supervisors: tuple[str, ...] = ("scripted", "fsams-hysteresis", "mpcms")
+    """Supervisors; the first one's episodes are shown."""
+    controller: str = "pd"
+    """Controller with the robot's gains: pd or sorlc-scaled."""
+    out: Path = Path("out/robots")
+    """Folder of gate.md, gate.json, PNG and MP4."""
+    clips: bool = True
+    """Draw stills and clips."""
+    overwrite: bool = False
+    """Replace what is in the output folder."""
+
+    def run(self) -> None:
+        """Fly, write, and print the table."""
+        from marlbc_mj.robots.gate import SHOWN, gate_table, run_gates
+
+        with progress_bars() as progress:
+            rows = run_gates(
+                self.robots or SHOWN,
+                self.supervisors,
+                self.out,
+                controller=self.controller,
+                clips=self.clips,
+                overwrite=self.overwrite,
+                progress=progress,
+            )
+        print(gate_table(rows))
+
+
+@dataclass(frozen=True)
+class RobotCommand:
+    """Check a robot of your own, or fly robots through their gate."""
+
+    action: OmitSubcommandPrefixes[Annotated[RobotCheck, subcommand("check")] | Annotated[RobotGate, subcommand("gate")]]
+
+    def run(self) -> None:
+        """Hand over to the action."""
+        self.action.run()

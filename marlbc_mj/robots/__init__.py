@@ -1,0 +1,54 @@
+"""Robots: one MJCF file and one Python file each, by name, or by the path of a user's."""
+
+from collections.abc import Callable
+from functools import cache
+
+from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.robots.base import MODELS, Robot
+from marlbc_mj.robots.crazyflie import CRAZYFLIE, crazyflie
+from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
+from marlbc_mj.robots.disc import DISC, disc
+from marlbc_mj.robots.omni import OMNI, omni
+from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
+from marlbc_mj.robots.user import is_file, load
+
+ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
+    "point_mass": (point_mass, POINT_MASS),
+    "disc": (disc, DISC),
+    "omni": (omni, OMNI),
+    "diff_drive": (diff_drive, DIFF_DRIVE),
+    "crazyflie": (crazyflie, CRAZYFLIE),
+}
+"""Factory and one line of description by name."""
+
+_make = cache(lambda factory: factory())
+_load = cache(load)
+
+
+def make_robot(name: str) -> Robot:
+    """A robot by name, or from the path of a user's ``.py`` or ``.xml``.
+
+    Raises:
+        ConfigurationError: unknown name, a file that cannot be used, or an optional package that is missing.
+    """
+    if name in ROBOTS:
+        robot: Robot = _make(ROBOTS[name][0])
+        return robot
+    if is_file(name):
+        return _load(name)
+    raise unknown("robot", name, (*ROBOTS, "a path that ends in .py or .xml"))
+
+
+def register(robot: Robot) -> Robot:
+    """Give a robot of one's own a name that scenarios can use, for this process.
+
+    Raises:
+        ConfigurationError: the name is taken.
+    """
+    if robot.name in ROBOTS and _make(ROBOTS[robot.name][0]) != robot:
+        raise ConfigurationError(f"a robot named {robot.name!r} exists; names that are taken: {', '.join(ROBOTS)}")
+    ROBOTS[robot.name] = (lambda: robot, robot.description)
+    return robot
+
+
+__all__ = ["MODELS", "ROBOTS", "Robot", "make_robot", "register"]

@@ -1,0 +1,123 @@
+"""What a robot is: its MJCF file, where its planar motion is, its two laws, and the scale of its missions."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.errors import ConfigurationError
+
+MODELS = Path(str(files("marlbc_mj") / "models"))
+"""Folder of the MJCF files; in the repository a link to ``models/``."""
+
+
+def _as_it_is(spec: mujoco.MjSpec) -> None:
+    """A file that needs no change."""
+
+
+@dataclass(frozen=True)
+class Robot:
+    """How a body's planar position and velocity are found, and how a planar force drives it. Names are those inside the MJCF.
+
+    A robot without laws is *direct*: its two ``motors`` push along x and y with the scenario's force limit, and p, v are its
+    joints' own. Every other robot has a ``drive`` that turns the force into controls before each substep and a ``reading`` of p,
+    v and the force that its actuators really gave, after it.
+
+    ``mass`` and what follows it are the scale of a robot's missions, see :meth:`scale`. A robot with no mass of its own takes the
+    scenario's, as the paper's point mass does.
+
+    Raises:
+        ConfigurationError: a number that cannot be, or one law without the other.
+    """
+
+    name: str
+    mjcf: Path
+    description: str
+    joints: tuple[str, ...]  # two slide joints along x and y, or one free joint: unknown dynamics push here
+    body: str  # carries the mass; its geoms take the agent's color
+    radius: float  # of the smallest circle that it fits in, seen from above [m]
+    motors: tuple[str, ...] = ()  # direct robots: the actuators of x and y
+    drive: laws.Law | None = None  # as laws.DRIVE
+    reading: laws.Law | None = None  # as laws.READING
+    params: tuple[float, ...] = ()  # numbers for both laws
+    state: tuple[float, ...] = ()  # what the laws remember, at the start
+    diagnostics: dict[str, int] = field(default_factory=dict)  # named entries of the state, "saturated" for example
+    mass: float | None = None  # what a planar force accelerates, wheels and rotors included [kg]
+    force_limit: float = np.inf  # per axis [N]
+    speed_limit: float = np.inf  # of references [m/s]
+    acceleration_limit: float = np.inf  # of references [m/s^2]
+    gains: tuple[float, float] = (100.0, 100.0)  # that track a step without overshoot, per unit mass [1/s^2, 1/s]
+    length: float = 1.0  # what 1 m of the paper's mission is for this robot [m]
+    substep: float = np.inf  # largest that its contacts and inner loops take [s]
+    height: float = 0.0  # that it flies at [m]
+    contact: bool = False  # obstacles and other agents are solid
+    ground: bool = False  # stands on the arena's ground by its own geoms' contact; else its MJCF has a floor, or it flies
+    prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
+
+    def __post_init__(self) -> None:
+        positive = ("radius", "mass", "force_limit", "speed_limit", "acceleration_limit", "length", "substep")
+        for name in positive:
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ConfigurationError(f"robot {self.name!r}: {name} must be positive, got {value}")
+        if (self.drive is None) != (self.reading is None):
+            raise ConfigurationError(f"robot {self.name!r} has one of drive and reading; it needs both, or neither and motors")
+        if self.drive is None and len(self.motors) != 2:
+            raise ConfigurationError(f"robot {self.name!r} needs two motors, or a drive and a reading; got {self.motors}")
+        if len(self.joints) not in (1, 2):
+            raise ConfigurationError(f"robot {self.name!r}: joints must name two slides or one free joint, got {self.joints}")
+
+    @property
+    def direct(self) -> bool:
+        """Whether the planar force goes to the motors as it is."""
+        return self.drive is None
+
+    def spec(self) -> mujoco.MjSpec:
+        """The MJCF, ready to be attached.
+
+        Raises:
+            ConfigurationError: the file cannot be read or is no MJCF.
+        """
+        try:
+            spec = mujoco.MjSpec.from_file(str(self.mjcf))
+        except (ValueError, FileNotFoundError) as error:
+            raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {_one_line(error)}") from error
+        self.prepare(spec)
+        return spec
+
+    def scale(self) -> dict[str, Any]:
+        """The fields of a :class:`~marlbc_mj.scenarios.Scenario` that this robot sets: mass, limits, force unit, substep."""
+        if self.mass is None:
+            return {"robot": self.name}
+        return {
+            "robot": self.name,
+            "mass": self.mass,
+            "unit_force": self.mass,
+            "force_limit": self.force_limit,
+            "speed_limit": self.speed_limit,
+            "acceleration_limit": self.acceleration_limit,
+            "substep": self.substep,
+        }
+
+    def check(self, scenario: Any) -> None:
+        """Raise ConfigurationError where a scenario asks of this robot what it is not."""
+        if self.mass is not None and not np.isclose(scenario.mass, self.mass, rtol=1e-9, atol=0.0):
+            raise ConfigurationError(
+                f"scenario {scenario.name!r}: mass {scenario.mass:g} kg, but robot {self.name!r} has {self.mass:g} kg; "
+                f"take the robot's scale: **make_robot({self.name!r}).scale()"
+            )
+        for name in ("force_limit", "substep"):
+            value, most = getattr(scenario, name), getattr(self, name)
+            if value > most * (1 + 1e-9):
+                raise ConfigurationError(
+                    f"scenario {scenario.name!r}: {name} must be at most {most:g} for robot {self.name!r}, got {value:g}"
+                )
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())

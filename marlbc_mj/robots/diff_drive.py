@@ -1,0 +1,77 @@
+"""Two driven wheels and a caster: a point ahead of the axle follows second-order laws as if it were a point mass.
+
+The point p = c + l (cos t, sin t) has p'' = R(t) (u' - l w^2, l w' + u w) for the axle's speed u and turn rate w, so any wanted
+p'' gives u' and w', and these the torques of the wheels (feedback linearization; d'Andrea-Novel, Campion, Bastin 1995). With the
+centre of mass d ahead of the axle, m u' = F + m d w^2 and I w' = M - m d u w.
+"""
+
+import mujoco
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.robots.base import MODELS, Robot
+from marlbc_mj.robots.wheels import heading, inertia
+
+DIFF_DRIVE = "6.6 kg base on two driven wheels and a caster, led by a point 0.15 m ahead of its axle"
+WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, how far ahead the point is [m]
+_MJCF = MODELS / "robots" / "diff_drive.xml"
+
+
+@laws.drive
+def diff_drive_drive(params, state, qpos, qvel, force, h, ctrl_out):  # type: ignore[no-untyped-def]
+    """Torques of the left and right wheel for p'' = F / m. ``params`` = r, half track b, l, m, I (both with spinning wheels),
+    m d, torque limit. ``state`` = heading, u, w, saturated substeps.
+    """
+    r, b, ahead, mass, turn, offset = params[0], params[1], params[2], params[3], params[4], params[5]
+    t = heading(qpos[3:7])
+    u, w = np.cos(t) * qvel[0] + np.sin(t) * qvel[1], qvel[5]
+    along, across = np.cos(t) * force[0] + np.sin(t) * force[1], np.cos(t) * force[1] - np.sin(t) * force[0]
+    push = mass * (along / mass + ahead * w * w) - offset * w * w
+    moment = turn * (across / mass - u * w) / ahead + offset * u * w
+    state[0], state[1], state[2] = t, u, w
+    for k in range(2):
+        wish = 0.5 * r * (push + (2 * k - 1) * moment / b)
+        ctrl_out[k] = laws.clip(wish, params[6])
+        state[3] += 0.5 if ctrl_out[k] != wish else 0.0
+
+
+@laws.reading
+def diff_drive_reading(params, state, qpos, qvel, actuator_force, p_out, v_out, force_out):  # type: ignore[no-untyped-def]
+    """p, v of the point ahead; force = m p'' for the torques given, at the motion that the drive saw."""
+    r, b, ahead, mass, turn, offset = params[0], params[1], params[2], params[3], params[4], params[5]
+    t, w = heading(qpos[3:7]), qvel[5]
+    p_out[0], p_out[1] = qpos[0] + ahead * np.cos(t), qpos[1] + ahead * np.sin(t)
+    v_out[0], v_out[1] = qvel[0] - ahead * w * np.sin(t), qvel[1] + ahead * w * np.cos(t)
+    t, u, w = state[0], state[1], state[2]
+    push, moment = (actuator_force[0] + actuator_force[1]) / r, (actuator_force[1] - actuator_force[0]) * b / r
+    along = push + offset * w * w - mass * ahead * w * w
+    across = mass * (ahead * (moment - offset * u * w) / turn + u * w)
+    force_out[0] = np.cos(t) * along - np.sin(t) * across
+    force_out[1] = np.sin(t) * along + np.cos(t) * across
+
+
+def diff_drive() -> Robot:
+    """Inertias are read from the MJCF; spinning wheels add 2 I / r^2 to the mass and 2 I (b / r)^2 to the turning inertia."""
+    own = inertia(mujoco.MjSpec.from_file(str(_MJCF)))
+    mass, turn = own.mass + 2.0 * own.wheel / WHEEL**2, own.turn + 2.0 * own.wheel * (TRACK / WHEEL) ** 2
+    return Robot(
+        name="diff_drive",
+        mjcf=_MJCF,
+        joints=("root",),
+        body="body",
+        radius=0.23,  # about the middle of the shell
+        description=DIFF_DRIVE,
+        drive=diff_drive_drive,
+        reading=diff_drive_reading,
+        params=(WHEEL, TRACK, AHEAD, mass, turn, own.mass * own.ahead, 0.8),
+        state=(0.0, 0.0, 0.0, 0.0),
+        diagnostics={"heading": 0, "saturated": 3},
+        mass=mass,
+        force_limit=10.0,
+        speed_limit=1.2,
+        acceleration_limit=1.0,
+        gains=(36.0, 12.0),
+        length=0.6,
+        substep=0.0025,
+        contact=True,
+    )

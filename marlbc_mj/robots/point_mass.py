@@ -1,0 +1,19 @@
+"""The paper's plant (1): a mass on two slide joints, one motor per axis; of any mass, force and size."""
+
+from marlbc_mj.robots.base import MODELS, Robot
+
+
+def point_mass() -> Robot:
+    """Direct: forces are its motors', p and v its joints'."""
+    return Robot(
+        name="point_mass",
+        mjcf=MODELS / "point_mass.xml",
+        joints=("x", "y"),
+        motors=("x", "y"),
+        body="body",
+        radius=0.5,
+        description=POINT_MASS,
+    )
+
+
+POINT_MASS = "unit mass on two slide joints, one motor per axis: the paper's plant (1)"

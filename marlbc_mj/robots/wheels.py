@@ -1,0 +1,35 @@
+"""What wheeled robots share: their heading, and the inertias that a planar force and a turn meet."""
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from marlbc_mj.laws import allocation_free
+
+
+@allocation_free
+def heading(quaternion):  # type: ignore[no-untyped-def]
+    """Yaw [rad] of a unit quaternion w, x, y, z."""
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Inertia(NamedTuple):
+    """Of a whole robot about its frame, wheels at rest relative to it."""
+
+    mass: float  # [kg]
+    turn: float  # about z [kg m^2]
+    ahead: float  # its centre of mass in front of the frame [m]
+    wheel: float  # one wheel about its axle [kg m^2]
+
+
+def inertia(spec: mujoco.MjSpec) -> Inertia:
+    """Read from the inertia matrix of a compiled robot whose joints are one free joint and then equal wheels."""
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    mass = float(matrix[0, 0])
+    return Inertia(mass, float(matrix[5, 5]), float(matrix[1, 5]) / mass, float(matrix[6, 6]))

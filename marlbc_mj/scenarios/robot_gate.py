@@ -1,0 +1,63 @@
+"""The case study's first obstacle and gate, scaled to a robot: its size, speed, acceleration, force and contacts.
+
+Lengths are the paper's times the robot's length unit. The team travels at 0.4 of the robot's speed limit, and behaviors' gains
+are what its acceleration can follow: a reference that closes a gap with rate Lambda brakes with Lambda v, so Lambda = 0.8 a / v
+for FM and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.disturbances import LinearDrag
+from marlbc_mj.robots import make_robot
+from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS
+
+LENGTH, ORIGIN = 108.0, -2.5  # of the path, where it starts, in length units
+POINT, COLUMN_IN, COLUMN_OUT = (14.8, 20.5), 36.0, 82.0  # of the path, in length units: schedule of the script
+SAFE = 2.0  # d_OA in length units, as the paper's
+AIR_DRAG = 0.0147  # of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/m]
+
+
+def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
+    """Four robots round a point obstacle and through the gate; ``changes`` replace any field.
+
+    Raises:
+        ConfigurationError: unknown robot, or one without limits of speed and acceleration to scale by.
+    """
+    body = make_robot(robot)
+    unit = body.length
+    finite = np.isfinite((body.speed_limit, body.acceleration_limit)).all()
+    top, brake = (body.speed_limit, body.acceleration_limit) if finite else (2.5 * unit, 4.0 * unit)
+    speed, gain = 0.4 * top, 0.8 * brake / top
+    avoid = SAFE * unit + speed**2 / brake + 0.3 * unit
+    slots, column = (tuple((unit * x, unit * y) for x, y in which) for which in (SLOTS, COLUMN))
+    steps = round(LENGTH * unit / speed / 0.05)
+    fields: dict[str, Any] = {
+        "name": f"robot_gate-{Path(body.name).stem}",
+        "starts": tuple((x + unit * ORIGIN, y) for x, y in slots),
+        "behaviors": standard_behaviors(slots, column, avoidance_gain=2.5 * gain, formation_gain=gain, safe_distance=avoid),
+        "path_origin": (unit * ORIGIN, 0.0),
+        "path_velocity": (speed, 0.0),
+        "obstacles": tuple(Obstacle(*(unit * x for x in o)) for o in (OBSTACLES[0], *OBSTACLES[2:])),
+        "safe_distance": SAFE * unit,
+        "formation_tolerance": 0.5 * unit,
+        "duration": 0.05 * steps,
+        "disturbance": LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
+        "schedule": _schedule(unit / speed),
+        "description": "a point obstacle and a gate for four real robots, scaled to --robot",
+        "speed_limit": top,
+        "acceleration_limit": brake,
+        **body.scale(),
+    }
+    return Scenario(**{**fields, **changes})
+
+
+def _schedule(unit_time: float) -> tuple[Window, ...]:
+    """Agent 1 round the point, then everybody through the gate in a column; ``unit_time`` [s] is one length unit of the path."""
+    return (
+        Window(unit_time * (POINT[0] - ORIGIN), unit_time * (POINT[1] - ORIGIN), 0, "OA>FM"),
+        Window(unit_time * (COLUMN_IN - ORIGIN), unit_time * (COLUMN_OUT - ORIGIN), -1, "FR"),
+    )

@@ -1,0 +1,48 @@
+"""For tests of robots: worlds whose forces are known beforehand, and what came of them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj import laws
+from marlbc_mj.disturbances import LinearDrag
+from marlbc_mj.engine.world import Record, World
+from marlbc_mj.robots import make_robot
+from marlbc_mj.robots.checklist import step_scenario
+
+
+@laws.controller
+def pushed(params, state, p, v, p_r, v_r, drag, h, force_out):
+    """A constant force per unit mass up to a time: ``params`` = x, y [m/s^2], until [s]; state: the clock."""
+    on = state[0] < params[2] - 1e-9
+    force_out[0] = params[0] if on else 0.0
+    force_out[1] = params[1] if on else 0.0
+    state[0] += h
+
+
+@dataclass(frozen=True)
+class Push:
+    """The same push for everybody, then nothing."""
+
+    acceleration: tuple[float, float]  # [m/s^2]
+    until: float  # [s]
+    limited: bool = True
+    linear_gains = None
+    law = staticmethod(pushed)
+
+    def params(self, agent, limit):
+        return *self.acceleration, self.until
+
+    def initial_state(self, agent):
+        return np.zeros(1)
+
+
+def push(name: str, acceleration: tuple[float, float], until: float, duration: float, drag: float = 0.0, **changes: Any):
+    """Robots of one kind pushed and let go: the world, and p, v, force of the first one, (T, 2) each."""
+    robot = make_robot(name)
+    fields = {"duration": duration, "disturbance": LinearDrag(coefficient=drag), "speed_limit": np.inf, **changes}
+    world = World(step_scenario(robot, **fields), Push(acceleration, until), record=True)
+    orders = np.full((1, 2), world.scenario.orders.index("FM"))
+    records: list[Record] = [world.step(orders).record for _ in range(world.scenario.mission_steps)]
+    return world, *(np.concatenate([getattr(r, k)[0, :, 0] for r in records]) for k in ("position", "velocity", "force"))
