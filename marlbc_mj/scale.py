@@ -33,6 +33,7 @@ SUPERVISORS = ("fsams", "fms", "layered")
 OBSTACLES = 1  # per agent
 AGENT_STEPS = 2560  # agents x mission steps in one burst
 MEMORY_AGENTS = 2048  # agents in all worlds together whose memory is measured
+LEAST_WORLDS = 64  # so that what a plan leaves behind is small beside them
 
 
 def mission(agents: int) -> Scenario:
@@ -98,28 +99,28 @@ def measure_scale(rounds: int = 7, progress: Callable[[str], None] | None = None
 
 
 _MEMORY = """
-import gc, sys
+import sys
+import numpy as np
 from marlbc_mj.engine.world import World
 from marlbc_mj.scale import mission, resident
 agents, worlds = int(sys.argv[1]), int(sys.argv[2])
 scenario = mission(agents)
 def use(count):
     world = World(scenario, worlds=count)
-    import numpy as np
     world.advance(np.full((count, agents), scenario.orders.index("OA>AA>FM")))
     return world
-first = use(1)
-gc.collect()
+warm = use(1), use(1)
 before = resident()
-kept = use(worlds)
-gc.collect()
-print((resident() - before) / worlds)
+one = use(1)
+middle = resident()
+many = use(1 + worlds)
+print((resident() - middle - (middle - before)) / worlds)
 """
 
 
 def _memory(agents: int) -> float:
-    """Resident memory [bytes] of one more world of so many agents, measured in a process of its own."""
-    worlds = max(4, MEMORY_AGENTS // agents)
+    """Resident memory [bytes] of one more world of so many agents, its plan not counted, in a process of its own."""
+    worlds = max(LEAST_WORLDS, MEMORY_AGENTS // agents)
     run = subprocess.run([sys.executable, "-c", _MEMORY, str(agents), str(worlds)], capture_output=True, text=True, check=True)
     return float(run.stdout)
 
