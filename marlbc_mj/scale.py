@@ -177,11 +177,11 @@ def _figure(figures: dict[str, Any]) -> Any:
     times.annotate("1.5 times the cost at 4 agents", (sizes[-1], 1.5 * cost[0]), (0, 3), textcoords="offset points", ha="right")
     times.set(ylim=(0, 1.75 * cost[0]), ylabel="mission step [µs per agent]")
     memory.plot(sizes, [figures["kib_per_world"][str(n)] for n in sizes], "o-", color="#D55E00", markersize=3.5)
-    memory.set(yscale="log", ylabel="memory of a world [KiB]")
+    memory.set(ylim=0, xlim=0, ylabel="memory of a world [KiB]", xlabel="agents")  # linear axes: a straight line is linear growth
+    times.set_xscale("log", base=2)
+    times.set_xticks(sizes, [str(n) for n in sizes])
+    times.set_xlabel("agents")
     for axes in (times, memory):
-        axes.set_xscale("log", base=2)
-        axes.set_xticks(sizes, [str(n) for n in sizes])
-        axes.set_xlabel("agents")
         axes.grid(color="#E4E4E4", linewidth=0.4)
         axes.set_axisbelow(True)
     return figure
