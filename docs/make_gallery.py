@@ -38,13 +38,14 @@ def shots(names: list[str]) -> Iterator[Shot]:
     for name in names or ["case_study", *SHOWN]:
         if name == "case_study":
             controller = make_controller("sorlc")
-            trajectory = run_episode(World(paper(), controller, record=True), make_supervisor("scripted"))
-            yield Shot(name, from_trajectory(trajectory, controller), "track", 57.0, (14.0, 38.0), 4.0)
+            world, names_shown = World(paper(), controller, record=True), ("scripted", "sorlc")
+            trajectory = run_episode(world, make_supervisor("scripted"), names=names_shown)
+            yield Shot(name, from_trajectory(trajectory, controller), "track", 57.0, (41.0, 67.0), 4.0)
         else:
             _, trajectory = fly_gate(name, "scripted")
             duration = trajectory.scenario.duration
             log = from_trajectory(trajectory, CONTROLLERS["pd"](make_robot(name)))
-            clip = 0.28 * duration, 0.52 * duration
+            clip = 0.35 * duration, 0.60 * duration
             yield Shot(name, log, "close", 0.56 * duration, clip, max(1.0, round((clip[1] - clip[0]) / 6.0)))
 
 
@@ -55,9 +56,19 @@ def draw(shot: Shot) -> None:
     Image.fromarray(picture).save(still, quality=QUALITY[0], optimize=True)
     with tempfile.TemporaryDirectory() as folder:
         large = Path(folder) / "clip.mp4"
-        size = {"width": CLIP[0], "height": CLIP[1]}
-        start, end = shot.clip
-        render_video(shot.log, large, speed=shot.speed, fps=20, start=start, end=end, camera=shot.camera, samples=4, **size)
+        (start, end), (width, height) = shot.clip, CLIP
+        render_video(
+            shot.log,
+            large,
+            camera=shot.camera,
+            speed=shot.speed,
+            fps=20,
+            start=start,
+            end=end,
+            width=width,
+            height=height,
+            samples=4,
+        )
         squeeze = ["-crf", str(QUALITY[1]), "-preset", "veryslow", "-movflags", "+faststart"]
         ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", "-i", str(large)]
         subprocess.run([*ffmpeg, *squeeze, str(clip)], check=True)
