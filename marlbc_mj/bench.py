@@ -41,6 +41,7 @@ class BenchConfig:
     overwrite: bool = False
     seeds: int | None = None  # this many draws around the scenario, from ``seed`` on, instead of one
     workers: int = 1  # processes that share the methods of ``seeds``
+    against: str | None = None  # with ``seeds``: the method that others are compared with; None: the first
 
     def __post_init__(self) -> None:
         for kind, names, known in (
@@ -120,7 +121,7 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
     scenario, seeds = perturbed(scenario), seed_range(config.seeds or 0, config.seed)
     with staged_folder(out, overwrite=config.overwrite) as folder:
         write_json(folder / "config.json", _config(scenario, config))
-        results = run_methods(scenario, config.methods, seeds, progress, workers=config.workers)
+        results = run_methods(scenario, config.methods, seeds, progress, reference=config.against, workers=config.workers)
         write_seed_report(results, folder, config=_config(scenario, config), figures=config.figures, progress=progress)
     return results
 

@@ -43,6 +43,21 @@ def constant_wind(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
     force_out[1] = params[0] * params[2]
 
 
+@laws.disturbance
+def wind_gusts(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
+    """f = scale (w + sum_k a_k sin(w_k t + phase_k)), alike for all agents; ``params`` = scale, w_x, w_y [N], then for each of
+    the harmonics of x and then of y: a_k [N], w_k [rad/s], phase_k.
+    """
+    for axis in range(2):
+        force_out[axis] = params[1 + axis]
+    harmonics = (params.shape[0] - 3) // 6
+    for k in range(2 * harmonics):
+        axis = k // harmonics
+        force_out[axis] += params[3 + 3 * k] * np.sin(params[4 + 3 * k] * t + params[5 + 3 * k])
+    for axis in range(2):
+        force_out[axis] *= params[0]
+
+
 @runtime_checkable
 class Disturbance(Protocol):
     """What the engine asks of a disturbance. ``params()[0]`` is its scale, which a perturbation draw multiplies."""
@@ -52,6 +67,9 @@ class Disturbance(Protocol):
     def params(self) -> Sequence[float]:
         """Numbers handed to the law as ``params``."""
         ...
+
+
+HARMONICS = 12  # of wind gusts, on each axis
 
 
 @dataclass(frozen=True)
@@ -106,11 +124,46 @@ class ConstantWind(_Scaled):
         return (self.scale, *self.force)
 
 
+@dataclass(frozen=True)
+class WindGusts(_Scaled):
+    """Wind that comes and goes: a steady force and ``HARMONICS`` sines whose frequencies and phases ``seed`` draws.
+
+    The same seed blows the same at the same mission time, whatever the agents do. Harmonic k has an amplitude that falls with its
+    frequency as 1 / sqrt(1 + (w_k T)^2), as in a Dryden spectrum, and together they have the root mean square ``strength``.
+    """
+
+    steady: tuple[float, float] = (2.0, 0.0)  # [N]
+    strength: float = 10.0  # RMS of the gusts on each axis [N]
+    time: float = 4.0  # T, how long a gust lasts [s]
+    seed: int = 0
+    law = staticmethod(wind_gusts)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.strength) and self.strength >= 0 and np.isfinite(self.time) and self.time > 0):
+            raise ConfigurationError(
+                f"WindGusts needs a non-negative strength and a positive time, got {self.strength} and {self.time}"
+            )
+        if self.seed < 0:
+            raise ConfigurationError(f"WindGusts seed must not be negative, got {self.seed}")
+        super().__post_init__()
+
+    def params(self) -> tuple[float, ...]:
+        rng = np.random.default_rng(self.seed)
+        place = (np.arange(HARMONICS) + rng.uniform(0.0, 1.0, (2, HARMONICS))) / HARMONICS  # one frequency in each band
+        ratio = np.exp(np.log(0.2) + np.log(50.0) * place)  # w_k T, from 0.2 to 10
+        amplitude = 1.0 / np.sqrt(1.0 + ratio**2)
+        amplitude *= self.strength * np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
+        phase = rng.uniform(0.0, 2.0 * np.pi, (2, HARMONICS))
+        rows = np.stack([amplitude, ratio / self.time, phase], axis=-1)
+        return (self.scale, *self.steady, *rows.ravel().tolist())
+
+
 DISTURBANCES: dict[str, tuple[Callable[..., Disturbance], str]] = {
     "paper": (PaperDrag, "the case study's drag (43), periodic in the position"),
     "linear": (LinearDrag, "f = -c v"),
     "quadratic": (QuadraticDrag, "f = -c |v| v"),
     "wind": (ConstantWind, "a constant force"),
+    "gusts": (WindGusts, "wind that comes and goes, drawn by its seed"),
 }
 """Class and one line of description by name."""
 

@@ -7,7 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.behaviors import clearances, clearances_among
 from marlbc_mj.engine.world import World
+from marlbc_mj.motion import NUMBERS, moved
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Blend, Supervisor, situation
 
@@ -41,7 +43,7 @@ class Trajectory:
     supervisor: str
     controller: str
     seed: int
-    obstacles: np.ndarray  # (K, 3) this episode's x, y, radius [m]
+    obstacles: np.ndarray  # (K, 3) this episode's x, y, radius [m]; of one that moves, its place without motion
     time: np.ndarray  # (T,) start of each substep [s]
     position: np.ndarray  # (T + 1, N, 2) [m]
     velocity: np.ndarray  # (T + 1, N, 2) [m/s]
@@ -53,7 +55,16 @@ class Trajectory:
     reward: np.ndarray  # (M,)
     controller_state: np.ndarray  # (M, N, S) at the start of each mission step
     decision_ms: np.ndarray  # (M,) [ms]
+    motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as motion.move has them; (0, 6): at rest
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
+
+    def clearances(self) -> np.ndarray:
+        """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
+        after = self.position[1:]
+        if len(self.motions) == 0:
+            return clearances(after, self.obstacles)
+        ends = (1 + np.arange(len(after))) * self.scenario.substep
+        return clearances_among(after, moved(ends, self.obstacles, self.motions))
 
 
 def run_episode(
@@ -77,14 +88,15 @@ def run_episode(
     scenario = world.scenario
     memory = supervisor.start(scenario)
     observation = world.reset(seed)
-    obstacles = world.state.obstacles[0].copy()
+    state = world.state
+    obstacles = state.anchors[0].copy() if scenario.moving else state.obstacles[0].copy()
     frames: list[Frame] = []
     substeps: list[np.ndarray] = []
     formation = []
     done = False
     while not done:
         began = perf_counter()
-        decision, memory = supervisor.decide(situation(observation, obstacles, scenario.mission_step), memory)
+        decision, memory = supervisor.decide(situation(observation, state.obstacles[0].copy(), scenario.mission_step), memory)
         decision_ms = 1e3 * (perf_counter() - began)
         controller_state, pose = world.state.controller[0].copy(), _pose(world)
         if isinstance(decision, Blend):
@@ -129,6 +141,7 @@ def run_episode(
         reward=np.array([f.reward for f in frames]),
         controller_state=np.array([f.controller_state for f in frames]),
         decision_ms=np.array([f.decision_ms for f in frames]),
+        motions=state.motions[0].copy(),
         pose=np.array([f.pose for f in frames]),
     )
 

@@ -43,8 +43,9 @@ _VECTOR = types.float64[::1]
 _MATRIX = types.float64[:, ::1]
 
 BEHAVIOR = types.int64(_VECTOR, _VECTOR, _MATRIX, _MATRIX, _MATRIX, types.int64, _VECTOR, _MATRIX)
-"""params (P,), p (2,) [m], path (2, 2): desired centroid [m] and its velocity [m/s], obstacles (K, 3): x, y, radius [m],
-team (N, 2): everyone's position [m], agent, velocity_out (2,) [m/s], jacobian_out (2, 2) -> rows used of the Jacobian."""
+"""params (P,), p (2,) [m], path (2, 2): desired centroid [m] and its velocity [m/s], obstacles (K, 3): x, y, radius [m], or
+(K, 5) where they move: their velocity [m/s] too, team (N, 2): everyone's position [m], agent, velocity_out (2,) [m/s],
+jacobian_out (2, 2) -> rows used of the Jacobian."""
 
 CONTROLLER = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
 """params (P,), state (S,) changed in place, p (2,) [m], v (2,) [m/s], p_r (2,) [m], v_r (2,) [m/s], drag (2,) [N]: the

@@ -6,6 +6,7 @@ from marlbc_mj.disturbances import DISTURBANCES
 from marlbc_mj.robots import ROBOTS
 from marlbc_mj.scenarios import SCENARIOS
 from marlbc_mj.scenarios.base import REFERENCE_MODES
+from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.supervisors import SUPERVISORS
 from marlbc_mj.training.config import METHODS, PRESETS
 
@@ -17,6 +18,7 @@ def selectable() -> dict[str, dict[str, str]]:
     """Descriptions by kind and name."""
     return {
         "scenarios": {name: make().description for name, make in SCENARIOS.items()},
+        "formations": {name: line for name, (_, line) in FORMATIONS.items()},
         "supervisors": {name: line for name, (_, line) in SUPERVISORS.items()},
         "controllers": {name: line for name, (_, line) in CONTROLLERS.items()},
         "SORLC bases": dict(zip(BASES, _BASES, strict=True)),

@@ -4,7 +4,7 @@ from typing import TypedDict
 
 import numpy as np
 
-from marlbc_mj.behaviors import clearances
+from marlbc_mj.cells import spacing
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.scenarios import Scenario
 
@@ -34,6 +34,7 @@ TeamMetrics = TypedDict(
         "decision_ms_median": float,  # all agents, one mission step [ms]
         "decision_ms_p99": float,
         "agent_distance_min": float,  # no behavior of the paper guards it [m]
+        "end_error": float,  # greatest distance from an agent's FM slot around the desired centroid, at the end [m]
         "formation_error": float,  # mean distance from the FM slot, relative to the centroid [m]
     },
 )
@@ -52,12 +53,12 @@ def measure(trajectory: Trajectory) -> Metrics:
     Errors and force are those at the start of each substep, weighted by its length; clearance is taken at its end.
     """
     return {
-        "agents": [_agent(trajectory, i) for i in range(trajectory.scenario.agents)],
+        "agents": [_agent(trajectory, i, clearance) for i, clearance in enumerate(trajectory.clearances().T)],
         "team": _team(trajectory),
     }
 
 
-def _agent(trajectory: Trajectory, agent: int) -> AgentMetrics:
+def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMetrics:
     scenario = trajectory.scenario
     h, dt = scenario.substep, scenario.mission_step
     force = trajectory.force[:, agent]
@@ -66,7 +67,6 @@ def _agent(trajectory: Trajectory, agent: int) -> AgentMetrics:
     square_p, square_v = (position_error**2).sum(-1), (velocity_error**2).sum(-1)
     size = np.linalg.norm(force, axis=-1)
     cost = square_p + square_v + size**2
-    clearance = clearances(trajectory.position[1:, agent], trajectory.obstacles)
     return {
         "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
         "clearance_min": float(clearance.min()),
@@ -90,7 +90,8 @@ def _team(trajectory: Trajectory) -> TeamMetrics:
         "return": float(trajectory.reward.sum()),
         "decision_ms_median": float(np.median(trajectory.decision_ms)),
         "decision_ms_p99": float(np.percentile(trajectory.decision_ms, 99)),
-        "agent_distance_min": _closest_pair(positions),
+        "agent_distance_min": float(spacing(positions).min()),
+        "end_error": _end_error(trajectory),
         "formation_error": float(_slot_distance(positions, trajectory.scenario).mean()),
     }
 
@@ -110,10 +111,12 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
     return np.where(after < len(above), after * trajectory.scenario.substep, np.nan)
 
 
-def _closest_pair(positions: np.ndarray) -> float:
-    """Smallest distance between two agents over (T, N, 2) [m]."""
-    first, second = np.triu_indices(positions.shape[1], 1)
-    return float(np.linalg.norm(positions[:, first] - positions[:, second], axis=-1).min())
+def _end_error(trajectory: Trajectory) -> float:
+    """Whether a mission was accomplished: how far from its place the worst agent ended [m]."""
+    scenario = trajectory.scenario
+    end = len(trajectory.time) * scenario.substep
+    centroid = np.array(scenario.path_origin) + end * np.array(scenario.path_velocity)
+    return float(np.linalg.norm(trajectory.position[-1] - centroid - scenario.formations[0], axis=-1).max())
 
 
 def _slot_distance(positions: np.ndarray, scenario: Scenario) -> np.ndarray:

@@ -1,7 +1,7 @@
 """Colors of agents and behaviors: the same in the model, the figures, the video and the page (color-blind safe)."""
 
 AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7A5195", "#4D4D4D")
-BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000"}
+BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000", "AA": "#7A3E9D"}
 SAFE_DISTANCE_COLOR = "#B4505E"
 _OTHER_BEHAVIORS = ("#6A3D9A", "#33A02C", "#8C564B", "#17BECF")
 

@@ -103,8 +103,8 @@ def seed_range(count: int, first: int = 0) -> tuple[int, ...]:
 
 
 def perturbed(scenario: Scenario) -> Scenario:
-    """The scenario, with the case study's perturbation if it has none of its own."""
-    if scenario.perturbation != Perturbation():
+    """The scenario, with the case study's perturbation if it has none of its own and draws no layout."""
+    if scenario.perturbation != Perturbation() or scenario.layout is not None:
         return scenario
     return replace(scenario, perturbation=CASE_STUDY_PERTURBATION)
 
@@ -207,9 +207,12 @@ def run_method(
 
 def run_seed(world: World, law: Controller, supervisor: str, controller: str, seed: int) -> SeedRun:
     """One episode in a world made with ``record=True``; its trajectory is measured and let go."""
-    world.reset(seed)
+    try:
+        world.reset(seed)
+    except ConfigurationError as error:  # no layout was found for this seed
+        return SeedRun(seed, None, failure=str(error))
     state = world.state
-    instance = Instance(state.position[0].copy(), state.obstacles[0].copy(), float(state.disturbance_params[0, 0]))
+    instance = Instance(state.position[0].copy(), state.obstacles[0, :, :3].copy(), float(state.disturbance_params[0, 0]))
     try:
         trajectory = run_episode(world, make_supervisor(supervisor, controller), seed=seed, names=(supervisor, controller))
         check_free(trajectory, law)

@@ -49,7 +49,7 @@ class PrintedState:
         agents = scenario.agents
         self.size = 5 * agents + 1
         self.scale = np.array([50.0, 50.0, 10.0, 10.0] * agents + [len(scenario.orders.commands)] * agents + [2.0])
-        self.layout = {"version": 1, "size": self.size}
+        self.layout: dict[str, float] = {"version": 1, "size": self.size}
         self.low = np.array([-np.inf] * 4 * agents + [0.0] * (agents + 1))
         self.high = np.array([np.inf] * 4 * agents + [len(scenario.orders.commands) - 1.0] * agents + [2.0])
 

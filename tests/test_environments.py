@@ -292,14 +292,14 @@ def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives()
     assert (((ahead > -0.03) & (ahead < 3.03)).any(axis=0)).all()
 
 
-def test_a_turning_start_is_to_begin_with_the_other_formation():
+def test_a_turning_start_is_to_begin_with_one_formation_or_the_other():
     batch = FormationBatch(paper(), worlds=60, interval=10, starts=Starts(exploring=1.0, length=1.0, turning=0.5))
     batch.reset(0)
     for _ in range(2):
         turning = batch.turn >= 0
         assert 15 < turning.sum() < 45
         commands = np.array(batch.scenario.orders.commands)[batch.scenario.orders.command_of[batch.order_of[batch.turn[turning]]]]
-        assert (commands == np.where(batch.world.state.formation == 2, "FR", "FM")[turning]).all()
+        assert set(commands) == {"FM", "FR"} and 0.2 < (commands == "FM").mean() < 0.8
         for _ in range(2):
             outcome = batch.step(batch.last)
         assert outcome.truncated.sum() > 50

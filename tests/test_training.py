@@ -392,6 +392,42 @@ def test_held_orders_last_and_are_shared():
     assert (explore(best, cold, rng) == 9).all()
 
 
+def quiet(**changes):
+    """No exploration but what is asked for."""
+    return replace(TrainConfig(), worlds=400, together=0.0, agreement=0.0, least_exploration=0.0, capacity=40_000, **changes)
+
+
+def test_a_team_begins_as_it_is_told_and_endangers_nobody():
+    explore, rng, best = Exploration(quiet(hold=3), N, A), np.random.default_rng(0), np.full((400, N), 9)
+    told = np.where(np.arange(400) % 2, -1, 2)
+    cold, allowed = np.zeros(best.shape), np.ones((400, N, A), dtype=bool)
+    allowed[::4, 1, 2] = False
+    explore.begin(told, rng)
+    rows = np.array([explore(best, cold, rng, allowed=allowed) for _ in range(5)])
+    assert (rows[:, 1::2] == 9).all() and (rows[:, ::4, 1] == 9).all()
+    others = rows[:, ::2][:, :, [0, 2]]
+    assert (others[0] == 2).all() and (others[4] == 9).all()
+    lengths = (others == 2).sum(axis=0)
+    assert set(np.unique(lengths)) == {1, 2, 3} and (lengths == lengths[:, :1]).all()
+
+
+def test_a_torn_team_agrees_on_a_members_order():
+    config = replace(quiet(), agreement=0.3)
+    explore, rng, cold = Exploration(config, N, A), np.random.default_rng(0), np.zeros((400, N))
+    last = np.tile([1, 1, 1], (400, 1))
+    best = np.tile([1, 3, 1], (400, 1))
+    chosen = np.concatenate([explore(best, cold, rng, last=last) for _ in range(30)])
+    agreed = (chosen == chosen[:, :1]).all(axis=1)
+    assert agreed.mean() == pytest.approx(0.3, abs=0.02) and (chosen[~agreed] == best[0]).all()
+    assert (chosen[agreed, 0] == 3).mean() == pytest.approx(1 / 3, abs=0.03)
+    allowed = np.ones((400, N, A), dtype=bool)
+    allowed[:, 0, 3] = False
+    chosen = np.concatenate([explore(best, cold, rng, last=last, allowed=allowed) for _ in range(30)])
+    assert (chosen[:, 0] == 1).all() and (chosen[:, 1:] == 3).all(axis=1).any()
+    for unmoved in (best, np.full_like(best, 3)):  # nobody wants to change; all want the same
+        assert (explore(unmoved, cold, rng, last=best if unmoved is best else last) == unmoved).all()
+
+
 @pytest.mark.parametrize("kind", ["autoencoder", "plain"])
 def test_hash_codes(kind):
     rng = np.random.default_rng(0)

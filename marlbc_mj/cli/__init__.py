@@ -11,6 +11,7 @@ from tyro.conf import subcommand
 
 from marlbc_mj.cli.benchmark import Bench, Run
 from marlbc_mj.cli.export import Export
+from marlbc_mj.cli.missions import Evaluate, Scale
 from marlbc_mj.cli.recordings import Log, Video, View
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import Ship
@@ -23,6 +24,7 @@ from marlbc_mj.terminal import prepare_gl
 Command = (
     Annotated[Bench, subcommand("bench")]
     | Annotated[Run, subcommand("run")]
+    | Annotated[Evaluate, subcommand("evaluate")]
     | Annotated[Train, subcommand("train")]
     | Annotated[Ship, subcommand("ship")]
     | Annotated[Export, subcommand("export")]
@@ -33,6 +35,7 @@ Command = (
     | Annotated[ListAll, subcommand("list")]
     | Annotated[RobotCommand, subcommand("robot")]
     | Annotated[Perf, subcommand("perf")]
+    | Annotated[Scale, subcommand("scale")]
     | Annotated[Ablation, subcommand("ablation")]
     | Annotated[Calibrate, subcommand("calibrate")]
     | Annotated[OracleSearch, subcommand("oracle")]

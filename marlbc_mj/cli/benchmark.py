@@ -25,20 +25,22 @@ class ScenarioOptions:
     two_sided: bool = False
     """Obstacle avoidance as the printed equality task, which also attracts (erratum 6)."""
     disturbance: str | None = None
-    """Unknown dynamics: paper, linear, quadratic or wind."""
+    """Unknown dynamics: paper, linear, quadratic, wind or gusts."""
     drag_scale: float | None = None
     """Multiplies the disturbance."""
     force_limit: float | None = None
     """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
     duration: float | None = None
     """Mission time [s]."""
+    split: str | None = None
+    """Whose layouts a scenario that draws them takes: train (default) or test, the held-out ones."""
 
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
         from marlbc_mj.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
 
-        keys = ("substep", "reference", "force_limit", "duration")
+        keys = ("substep", "reference", "force_limit", "duration", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
         if self.two_sided:
             changes["two_sided"] = True
@@ -56,7 +58,7 @@ class Bench:
     """
 
     scenario: Positional[str] = "paper"
-    """Scenario, see `marlbc list`."""
+    """Scenario, see `marlbc list`, or a .toml file."""
     supervisors: tuple[str, ...] | None = None
     """Supervisors to run, each with every one of --controllers (scripted, if only those are named)."""
     controllers: tuple[str, ...] | None = None
@@ -120,7 +122,7 @@ class Run:
     """Run one episode of one method and log it."""
 
     scenario: Positional[str] = "paper"
-    """Scenario, see `marlbc list`."""
+    """Scenario, see `marlbc list`, or a .toml file."""
     supervisor: str = "scripted"
     """Mission supervisor."""
     controller: str = "sorlc"

@@ -7,21 +7,24 @@ dm_control task call, so there is one definition of a mission step. Its order of
    a v_r that is given takes the place of the one that the orders make; limits of speed and acceleration bound it;
 2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), the robot's
    controls, MuJoCo's semi-implicit Euler step, then p_r += h v_r;
-3. at the end: clearances, formation identifier and reward from the measured positions.
+3. at the end: obstacles that move are put where they are then; clearances, formation identifier and reward from the measured
+   positions. So behaviors and supervisors see obstacles where they are at the start of a mission step.
 """
 
 import numba
 from numba.extending import register_jitable
 
-from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE, nearest_obstacle
+from marlbc_mj.cells import fill, nearest, room
 from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
 from marlbc_mj.imperfections import sense, weaken
 from marlbc_mj.laws import allocation_free, compiled, threaded
+from marlbc_mj.motion import move
 from marlbc_mj.nullspace import add_behavior
 
-SCRATCH = 7
+SCRATCH = 9
 """Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
@@ -43,11 +46,28 @@ def judge(p, obstacles, formations, tolerance, safe_distance, clearance, scratch
 
     ``formations`` (2, N, 2): slots of G = 2, then of G = 1. ``clearance`` (N,) is written in place. Returns (G, r1).
     """
+    fill_clearance(p, obstacles, scratch[0, :0], clearance, scratch[0])
+    return verdict(p, clearance, formations, tolerance, safe_distance)
+
+
+@allocation_free
+def fill_clearance(p, obstacles, grid, clearance, normal):  # type: ignore[no-untyped-def]
+    """Clearance (N,) [m] of every agent at ``p`` (N, 2), by a grid if ``grid`` has room for one; ``normal`` (2,) is scratch."""
+    count = obstacles.shape[0]
+    near = grid.shape[0] > 0 and count > 0
+    if near:
+        fill(obstacles, grid[: room(count)])
+    for i in range(p.shape[0]):
+        k = nearest(p[i], obstacles, grid[: room(count)], -1) if near else -1
+        clearance[i] = nearest_obstacle(p[i], obstacles[k : k + 1] if k >= 0 else obstacles, normal)
+
+
+@allocation_free
+def verdict(p, clearance, formations, tolerance, safe_distance):  # type: ignore[no-untyped-def]
+    """Formation identifier G and r1 (14) of a team at positions ``p`` (N, 2) with ``clearance`` (N,) [m]."""
     agents = p.shape[0]
-    normal = scratch[0]
     violated = False
     for i in range(agents):
-        clearance[i] = nearest_obstacle(p[i], obstacles, normal)
         violated |= clearance[i] <= safe_distance
     mean_x, mean_y = 0.0, 0.0
     for i in range(agents):
@@ -89,14 +109,20 @@ def count_switches(orders, command_of, commands, step):  # type: ignore[no-untyp
 
 @allocation_free
 def set_references(  # type: ignore[no-untyped-def]
-    behavior_laws, behavior_params, table, orders, at, path, obstacles, scratch, v_r
+    behavior_laws, behavior_params, sees, table, orders, at, path, obstacles, grid, scratch, v_r
 ):
     """Reference velocity of every agent at positions ``at`` (N, 2): its behaviors composed in its order (12).
 
-    A behavior is evaluated only if those above it leave a direction free. ``scratch``: (1 + 2n, n).
+    A behavior is evaluated only if those above it leave a direction free. ``sees`` (M,) says what each looks at; ``grid`` has
+    room for one of the obstacles and one of the team, or is empty, which hands everything to every law. ``scratch``: (3 + 2n, n).
     """
-    n = at.shape[1]
-    velocity, jacobian, basis = scratch[0], scratch[1 : 1 + n], scratch[1 + n :]
+    n, count = at.shape[1], obstacles.shape[0]
+    velocity, jacobian, basis, pair = scratch[0], scratch[1 : 1 + n], scratch[1 + n : 1 + 2 * n], scratch[1 + 2 * n : 3 + 2 * n]
+    things, others = grid[: room(count)], grid[room(count) :]
+    near = grid.shape[0] > 0
+    if near:
+        fill(obstacles, things)
+        fill(at, others)
     for i in range(at.shape[0]):
         for axis in range(n):
             v_r[i, axis] = 0.0
@@ -104,8 +130,20 @@ def set_references(  # type: ignore[no-untyped-def]
         for j in table[orders[i]]:
             if rank == n:
                 break
+            seen, team, own = obstacles, at, i
+            if near and sees[j] == NEAREST_OBSTACLE:
+                k = nearest(at[i], obstacles, things, -1)
+                if k >= 0:
+                    seen = obstacles[k : k + 1]
+            elif near and sees[j] == NEAREST_NEIGHBOR:
+                k = nearest(at[i], at, others, i)
+                if k >= 0:
+                    own = 1 if i > k else 0
+                    for axis in range(n):
+                        pair[own, axis], pair[1 - own, axis] = at[i, axis], at[k, axis]
+                    team = pair
             law = as_behavior(behavior_laws[j])
-            rows = law(behavior_params[j, i], at[i], path, obstacles, at, i, velocity, jacobian)
+            rows = law(behavior_params[j, i], at[i], path, seen, team, own, velocity, jacobian)
             rank = add_behavior(velocity, jacobian, rows, basis, rank, v_r[i])
 
 
@@ -198,8 +236,8 @@ _run_substeps_compiled = allocation_free(run_substeps)
 
 @allocation_free
 def begin_step(  # type: ignore[no-untyped-def]
-    t, step, virtual, behavior_laws, behavior_params, table, command_of, path, orders, given, obstacles, p, p_r, v_r,
-    commands, scratch,
+    t, step, virtual, behavior_laws, behavior_params, sees, table, command_of, path, orders, given, obstacles, p, p_r, v_r,
+    commands, scratch, grid,
 ):  # fmt: skip
     """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15).
 
@@ -213,7 +251,7 @@ def begin_step(  # type: ignore[no-untyped-def]
         now = scratch[:2]
         path_at(t, path, now)
         at = p_r if virtual else p
-        set_references(behavior_laws, behavior_params, table, orders, at, now, obstacles, scratch[2:7], v_r)
+        set_references(behavior_laws, behavior_params, sees, table, orders, at, now, obstacles, grid, scratch[2:SCRATCH], v_r)
     return count_switches(orders, command_of, commands, step)
 
 
@@ -222,15 +260,15 @@ def mission_step(  # type: ignore[no-untyped-def]
     b,
     # fixed for all worlds
     step_function, model, indices, sizes, drive, reading, spans, robot_params, senses, limits, controller_law, controller_params,
-    disturbance_law, behavior_laws, behavior_params, table, command_of, path, formations, settings,
+    disturbance_law, behavior_laws, behavior_params, sees, table, command_of, path, formations, settings,
     # one row a world
     data, disturbance_params, obstacles, orders, given, commands, p, v, p_r, v_r, state, clearance, formation, reward,
-    steps, robot_state, history, sensed, seeds, status, record, scratch,
+    steps, robot_state, history, sensed, seeds, anchors, motions, grid, status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
     [m], safe distance [m], virtual (0/1);
     ``limits`` = speed [m/s], acceleration [m/s^2], force unit [N]; ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders
-    make it.
+    make it; ``motions`` (B, K, 6), or (B, 0, 6) where ``obstacles`` stay.
     """
     t = steps[b] * settings[0]
     agents = p.shape[1]
@@ -238,8 +276,8 @@ def mission_step(  # type: ignore[no-untyped-def]
     seen = sensed[b, 0] if sensed.shape[1] > 0 else p[b]
     keep(limits, v_r[b], drag)
     r2 = begin_step(
-        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, table, command_of, path, orders[b], given[b],
-        obstacles[b], seen, p_r[b], v_r[b], commands[b], scratch[b],
+        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, sees, table, command_of, path, orders[b], given[b],
+        obstacles[b], seen, p_r[b], v_r[b], commands[b], scratch[b], grid[b],
     )  # fmt: skip
     limit(limits, settings[0], drag, v_r[b])
     substeps = round(settings[0] / settings[1])
@@ -251,7 +289,10 @@ def mission_step(  # type: ignore[no-untyped-def]
         v[b], p_r[b], v_r[b], state[b], robot_state[b], history[b], sensed[b], seeds[b], steps[b] * substeps, drag, force,
         record[b],
     )  # fmt: skip
-    formation[b], r1 = judge(p[b], obstacles[b], formations, settings[2], settings[3], clearance[b], scratch[b])
+    if motions.shape[1] > 0:
+        move((steps[b] + 1) * settings[0], anchors[b], motions[b], obstacles[b])
+    fill_clearance(p[b], obstacles[b], grid[b], clearance[b], scratch[b, 0])
+    formation[b], r1 = verdict(p[b], clearance[b], formations, settings[2], settings[3])
     reward[b] = r1 + r2
     steps[b] += 1
     return 1 if status[b] else 0

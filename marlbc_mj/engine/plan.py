@@ -9,7 +9,8 @@ import numba
 import numpy as np
 
 from marlbc_mj import laws
-from marlbc_mj.behaviors import Behavior
+from marlbc_mj.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
+from marlbc_mj.cells import WORTH, room
 from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.native import step_address
@@ -33,6 +34,7 @@ class Plan:
     sizes: np.ndarray  # (3,) int64: nq, nv, nu
     behavior_laws: np.ndarray  # (M,) addresses; the laws themselves where numba is off
     behavior_params: np.ndarray  # (M, N, P)
+    sees: np.ndarray  # (M,) what each behavior's law looks at, see marlbc_mj.behaviors
     controller_params: np.ndarray  # (N, P)
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     disturbance_params: np.ndarray  # (P,)
@@ -44,6 +46,11 @@ class Plan:
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
     limits: np.ndarray  # (3,) speed [m/s] and acceleration [m/s^2] of references, force unit [N]
     senses: np.ndarray  # (5,) Imperfections.params()
+
+    @property
+    def grid_room(self) -> int:
+        """Length of a world's array for grids of obstacles and team; 0 for a team so small that trying all pairs costs less."""
+        return grid_room(self.scenario)
 
     @property
     def native(self) -> bool:
@@ -93,6 +100,7 @@ class Plan:
             disturbance,
             self.behavior_laws,
             self.behavior_params,
+            self.sees,
             orders.table,
             orders.command_of,
             self.path,
@@ -110,6 +118,11 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
     _check_substep(scenario, controller)
     robot = make_robot(scenario.robot)
     robot.check(scenario)
+    if robot.contact and scenario.moving:
+        raise ConfigurationError(
+            f"robot {scenario.robot!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
+            "through only; choose a robot without contact"
+        )
     limit = scenario.force_limit if controller.limited else np.inf
     xml = assemble(scenario, limit)
     model = mujoco.MjModel.from_xml_string(xml)
@@ -124,6 +137,7 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         sizes=np.array([model.nq, model.nv, model.nu], dtype=np.int64),
         behavior_laws=behavior_laws,
         behavior_params=behavior_params,
+        sees=sees_array(scenario.behaviors),
         controller_params=_padded([[controller.params(i, limit / scenario.unit_force) for i in agents]])[0],
         initial_state=np.array([controller.initial_state(i) for i in agents], dtype=np.float64),
         disturbance_params=np.array(scenario.disturbance.params(), dtype=np.float64),
@@ -198,6 +212,18 @@ def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndar
     if numba.config.DISABLE_JIT:
         return np.array([b.law for b in behaviors], dtype=object), params
     return np.array([laws.address(b.law, laws.BEHAVIOR) for b in behaviors], dtype=np.uint64), params
+
+
+def grid_room(scenario: Scenario) -> int:
+    """Length of an array for grids of a scenario's obstacles and team; 0 where trying all pairs costs less."""
+    agents, obstacles = scenario.agents, len(scenario.obstacles)
+    neighbors = agents if NEAREST_NEIGHBOR in sees_array(scenario.behaviors) else 0
+    return int(room(obstacles) + room(agents)) if agents * max(obstacles, neighbors) > WORTH else 0
+
+
+def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
+    """(M,) what each behavior's law looks at; everything, where it does not say."""
+    return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)
 
 
 def _padded(rows: Sequence[Sequence[Sequence[float]]]) -> np.ndarray:

@@ -8,8 +8,12 @@ from marlbc_mj.engine import loop
 from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.plan import Plan
-from marlbc_mj.errors import SimulationError
+from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.imperfections import sense
+from marlbc_mj.motion import MOVING, NUMBERS, move
+
+SCRAP = ("scratch", "grid", "composed")
+"""Arrays that carry nothing from one mission step to the next."""
 
 
 class Observation(NamedTuple):
@@ -44,7 +48,11 @@ class TeamState:
         self.reference = np.zeros((worlds, agents, 2))  # p_r [m]
         self.reference_velocity = np.zeros((worlds, agents, 2))  # v_r [m/s]
         self.controller = np.zeros((worlds, *plan.initial_state.shape))  # (B, N, S)
-        self.obstacles = np.zeros((worlds, len(plan.scenario.obstacles), 3))  # x, y, radius [m]
+        count, moving = len(plan.scenario.obstacles), plan.scenario.moving
+        # x, y, radius [m] now, and where obstacles move their velocity [m/s]; where from and how they do
+        self.obstacles = np.zeros((worlds, count, MOVING if moving else 3))
+        self.anchors = np.zeros((worlds, count if moving else 0, 3))
+        self.motions = np.zeros((worlds, count if moving else 0, NUMBERS))
         self.disturbance_params = np.zeros((worlds, len(plan.disturbance_params)))
         self.clearance = np.zeros((worlds, agents))  # [m]
         self.formation = np.zeros(worlds, dtype=np.int64)  # G
@@ -52,6 +60,7 @@ class TeamState:
         self.reward = np.zeros(worlds)
         self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
         self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
+        self.grid = np.zeros((worlds, plan.grid_room))
         imperfections, substep = plan.scenario.imperfections, plan.scenario.substep
         self.robot = np.zeros((worlds, agents, len(plan.robot.state)))  # the robots' laws' own
         self.history = np.zeros((worlds, imperfections.depth(substep), 2, agents, 2))  # p and v, for delays
@@ -65,7 +74,10 @@ class TeamState:
         self.position[b] = self.reference[b] = draw.starts
         self.velocity[b] = self.reference_velocity[b] = 0.0
         self.controller[b] = self.plan.initial_state
-        self.obstacles[b] = draw.obstacles
+        self._check_solid(draw.obstacles)
+        self.obstacles[b, :, :3] = draw.obstacles
+        if self.motions.shape[1]:
+            self.anchors[b], self.motions[b] = draw.obstacles, draw.motions
         self.disturbance_params[b] = self.plan.disturbance_params
         self.disturbance_params[b, 0] *= draw.drag_scale
         self.robot[b] = self.plan.robot.state
@@ -73,6 +85,15 @@ class TeamState:
         self.steps[b] = self.command[b] = self.reward[b] = 0
         self._judge(b)
         return draw.starts
+
+    def _check_solid(self, obstacles: np.ndarray) -> None:
+        """Raise ConfigurationError for obstacles (K, 3) that robots would collide with in a size that the model does not have."""
+        scenario = self.plan.scenario
+        if len(self.plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
+            raise ConfigurationError(
+                f"robot {scenario.robot!r} collides with obstacles, whose radii no seed can change; "
+                "give the family one radius: [r, r]"
+            )
 
     def put(self, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:
         """Move the physics of world ``b``, ``data``, to positions (N, 2) [m] and velocities (N, 2) [m/s], and measure it.
@@ -121,8 +142,8 @@ class TeamState:
         self._judge(b)
 
     def arrays(self, *, copy: bool = False) -> dict[str, np.ndarray]:
-        """All arrays by name: the very ones, or copies."""
-        own = {name: array for name, array in vars(self).items() if isinstance(array, np.ndarray)}
+        """All arrays that a mission step depends on, by name: the very ones, or copies."""
+        own = {name: array for name, array in vars(self).items() if isinstance(array, np.ndarray) and name not in SCRAP}
         return {name: array.copy() for name, array in own.items()} if copy else own
 
     def copy_row(self, source: "TeamState", source_world: int, world: int) -> None:
@@ -149,6 +170,7 @@ class TeamState:
             plan.scenario.reference == "virtual",
             plan.behavior_laws,
             plan.behavior_params,
+            plan.sees,
             orders_of.table,
             orders_of.command_of,
             plan.path,
@@ -160,25 +182,23 @@ class TeamState:
             self.reference_velocity[b],
             self.command[b],
             self.scratch[b],
+            self.grid[b],
         )
         limit(plan.limits, plan.scenario.mission_step, previous, self.reference_velocity[b])
 
     def finish(self, b: int) -> None:
         """End a mission step of world ``b``: clearances, G and the reward r1 + r2 from the measured positions."""
-        self.reward[b] += self._judge(b)
         self.steps[b] += 1
+        self.reward[b] += self._judge(b)
 
     def _judge(self, b: int) -> float:
-        scenario = self.plan.scenario
-        self.formation[b], reward = loop.judge(
-            self.position[b],
-            self.obstacles[b],
-            scenario.formations,
-            scenario.formation_tolerance,
-            scenario.safe_distance,
-            self.clearance[b],
-            self.scratch[b],
-        )
+        """Obstacles, clearances and G at the present time of world ``b``; returns r1."""
+        scenario, position, clearance = self.plan.scenario, self.position[b], self.clearance[b]
+        if self.motions.shape[1]:
+            move(self.time(b), self.anchors[b], self.motions[b], self.obstacles[b])
+        loop.fill_clearance(position, self.obstacles[b], self.grid[b], clearance, self.scratch[b, 0])
+        rule = (scenario.formations, scenario.formation_tolerance, scenario.safe_distance)
+        self.formation[b], reward = loop.verdict(position, clearance, *rule)
         return float(reward)
 
     def observe(self) -> Observation:
@@ -196,7 +216,7 @@ class TeamState:
         )
 
     def rows(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
-        """The arguments of ``mission_step`` with one row a world, from disturbance_params to seeds, in its order."""
+        """The arguments of ``mission_step`` with one row a world, from disturbance_params to grid, in its order."""
         return (
             self.disturbance_params,
             self.obstacles,
@@ -216,6 +236,9 @@ class TeamState:
             self.history,
             self.sensed,
             self.noise_seed,
+            self.anchors,
+            self.motions,
+            self.grid,
         )
 
     def diverged(self, b: int, status: int) -> SimulationError:

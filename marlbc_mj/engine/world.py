@@ -139,7 +139,8 @@ class World:
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Go back to a :meth:`snapshot` of a World with the same plan and number of worlds."""
         for name, array in self.state.arrays().items():
-            array[:] = snapshot[name]
+            if array.size:
+                array[:] = snapshot[name]
         for b in range(self.worlds):
             mujoco.mj_setState(self.plan.model, self.data[b], snapshot["physics"][b], PHYSICS)
 

@@ -85,9 +85,7 @@ def _smoothed(values: np.ndarray, window: int) -> np.ndarray:
 def _fit_top(stage: Stage, aspect: float) -> None:
     """Turn the model's top camera into a map: no perspective, and everything in the log just fits."""
     log, model = stage.log, stage.model
-    zone = log.obstacles[:, 2:] + log.safe_distance
-    points = [log.position.reshape(-1, 2), log.obstacles[:, :2] - zone, log.obstacles[:, :2] + zone]
-    everything = np.concatenate(points)
+    everything = np.concatenate([log.position.reshape(-1, 2), *log.zone()])
     low, high = everything.min(axis=0) - TOP_MARGIN * stage.scale, everything.max(axis=0) + TOP_MARGIN * stage.scale
     camera = model.camera("top").id
     model.cam_projection[camera] = mujoco.mjtProjection.mjPROJ_ORTHOGRAPHIC

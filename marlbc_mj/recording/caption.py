@@ -17,7 +17,7 @@ HEADER, FOOTER = 48, 80  # heights of the bars
 SHARP = 3  # bars are drawn this many times larger and reduced, which smooths their edges
 PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
-MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "reconstruction"}
+MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "reconstruction", "AA": "agent avoidance"}
 
 
 @lru_cache(maxsize=64)

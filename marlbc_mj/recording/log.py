@@ -8,6 +8,7 @@ from marlbc_mj.controllers import Controller
 from marlbc_mj.engine.loop import judge
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import NO_POSE, Trajectory
+from marlbc_mj.motion import nearest_places, obstacles_at
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,8 @@ class EpisodeLog:
     safe_distance: float  # [m]
     force_limit: float  # [N]; infinite for an unlimited law
     commands: tuple[str, ...]  # names that ``command`` indexes, "FM" or "OA>FM" for example
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
+    motions: np.ndarray  # (K, 6) as marlbc_mj.motion has them, or (0, 6): all at rest
     mjcf: str  # the assembled model
     time: np.ndarray  # (M,) start of each mission step [s]
     position: np.ndarray  # (M, N, 2) [m]
@@ -40,6 +42,18 @@ class EpisodeLog:
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,) [ms]
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
+
+    def obstacles_at(self, time: float) -> np.ndarray:
+        """(K, 3) x, y, radius [m] at ``time`` [s]."""
+        return obstacles_at(time, self.obstacles, self.motions)
+
+    def zone(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corners (K, 2) [m] of boxes around all obstacles' safe distances; of those that move, where and when
+        they are nearest to an agent.
+        """
+        places = nearest_places(self.time, self.position, self.obstacles, self.motions)
+        reach = places[:, 2:] + self.safe_distance
+        return places[:, :2] - reach, places[:, :2] + reach
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:
@@ -58,6 +72,7 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         force_limit=scenario.force_limit if controller.limited else np.inf,
         commands=scenario.orders.commands,
         obstacles=trajectory.obstacles,
+        motions=trajectory.motions,
         mjcf=make_plan(scenario, controller).xml,
         time=np.arange(len(position)) * scenario.mission_step,
         position=position,
@@ -82,5 +97,6 @@ def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np
     rule = (scenario.formations, scenario.formation_tolerance, scenario.safe_distance)
     scratch = np.empty((1, 2))
     for k in range(len(position)):
-        formation[k], _ = judge(position[k], trajectory.obstacles, *rule, clearance[k], scratch)
+        obstacles = obstacles_at(k * scenario.mission_step, trajectory.obstacles, trajectory.motions)
+        formation[k], _ = judge(position[k], obstacles, *rule, clearance[k], scratch)
     return clearance, formation

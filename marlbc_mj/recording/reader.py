@@ -25,6 +25,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.files import staged_file
+from marlbc_mj.motion import NUMBERS
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.writer import METADATA, MODEL
@@ -58,6 +59,7 @@ def read_log(path: str | Path) -> EpisodeLog:
             force_limit=float(metadata["force_limit"]),
             commands=tuple(json.loads(metadata["commands"])),
             obstacles=np.array(json.loads(metadata["obstacles"]), dtype=np.float64).reshape(-1, 3),
+            motions=np.array(json.loads(metadata.get("motions", "[]")), dtype=np.float64).reshape(-1, NUMBERS),
             mjcf=model,
             **columns,
         )

@@ -16,6 +16,7 @@ from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
 from marlbc_mj.engine.assembly import OBSTACLE_HEIGHT, POINT_RADIUS
+from marlbc_mj.motion import NUMBERS, obstacles_at
 from marlbc_mj.palette import BEHAVIOR_COLORS, agent_color, rgba
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
@@ -36,11 +37,14 @@ class Scene:
 
     Args:
         scenario: the team.
-        obstacles: (K, 3) this episode's x, y, radius [m].
+        obstacles: (K, 3) this episode's x, y, radius [m]; of one that moves, its place without motion.
+        motions: (K, 6) as :mod:`marlbc_mj.motion` has them; none: all at rest.
     """
 
-    def __init__(self, scenario: Scenario, obstacles: np.ndarray) -> None:
-        self._static = SceneUpdate(entities=[_obstacle_entity(obstacles, scenario.safe_distance)]).SerializeToString()
+    def __init__(self, scenario: Scenario, obstacles: np.ndarray, motions: np.ndarray | None = None) -> None:
+        self._obstacles, self._motions = obstacles, np.zeros((0, NUMBERS)) if motions is None else motions
+        self._safe_distance = scenario.safe_distance
+        self._static = self._obstacles_at(0.0)
         robot = make_robot(scenario.robot)
         radius = robot.radius
         self._team = SceneUpdate(entities=[_agent_entity(i, radius, robot.length) for i in range(scenario.agents)])
@@ -76,7 +80,13 @@ class Scene:
                 for target in targets:
                     target.x = x
                     target.y = y
-        return self._static + self._team.SerializeToString(), self._transforms.SerializeToString()
+        static = self._obstacles_at(1e-9 * stamp) if len(self._motions) else self._static
+        return static + self._team.SerializeToString(), self._transforms.SerializeToString()
+
+    def _obstacles_at(self, time: float) -> bytes:
+        """The message of all obstacles at ``time`` [s]."""
+        now = obstacles_at(time, self._obstacles, self._motions)
+        return bytes(SceneUpdate(entities=[_obstacle_entity(now, self._safe_distance)]).SerializeToString())
 
 
 def _color(color: tuple[float, float, float, float]) -> Color:

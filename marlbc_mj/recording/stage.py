@@ -8,13 +8,14 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from marlbc_mj.engine.assembly import agent_prefix
+from marlbc_mj.engine.assembly import LEAST_SOLID, POINT_RADIUS, agent_prefix
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, disc, make_trail, ribbon
 
-BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m
+BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
+BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
 RIM = 0.14  # width of the white rim around it, in drawn radii
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
@@ -28,6 +29,7 @@ class Stage:
     model: mujoco.MjModel
     data: mujoco.MjData
     joints: np.ndarray  # (N, 2) addresses of the agents' axes in qpos
+    discs: np.ndarray  # (K,) geoms of the obstacles
     radii: np.ndarray  # (N,) drawn radii of the agents [m]
     rings: list[Mark]
     trails: list[Trail]
@@ -50,7 +52,9 @@ class Stage:
         return [self.log.commands[k] for k in self.log.command[self.step(time)]]
 
     def pose(self, time: float) -> None:
-        """Move the model's agents to where they are at ``time`` [s]."""
+        """Move the model's agents and obstacles to where they are at ``time`` [s]."""
+        if len(self.log.motions):
+            _place_obstacles(self.model, self.data, self.discs.tolist(), self.log.obstacles_at(time), self.scale)
         self.data.qpos[self.joints] = self.sample(self.log.position, time)
         poses = self.sample(self.log.pose, time) if self.free else ()
         for first, pose in zip(self.free, poses, strict=True):
@@ -64,7 +68,8 @@ class Stage:
         Raises:
             ConfigurationError: the scene has no room for them.
         """
-        marks = [*self.rings, *self._trails(time), *self._agents(time)]
+        rings = _rings(self.log, time, self.scale) if len(self.log.motions) else self.rings
+        marks = [*rings, *self._trails(time), *self._agents(time)]
         if scene.ngeom + len(marks) > scene.maxgeom:
             raise ConfigurationError(f"a scene of {scene.maxgeom} shapes cannot hold {len(marks)} marks")
         for mark in marks:
@@ -106,6 +111,7 @@ def make_stage(log: EpisodeLog) -> Stage:
     agents = range(log.position.shape[1])
     try:
         model = mujoco.MjModel.from_xml_string(log.mjcf)
+        unit, radius = _size(model)
         free = _free_joints(model, agents)
         joints = (
             [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
@@ -113,21 +119,18 @@ def make_stage(log: EpisodeLog) -> Stage:
             else [[first, first + 1] for first in free]
         )
         data = mujoco.MjData(model)
-        for k, (x, y, _) in enumerate(log.obstacles):
-            if model.nmocap:
-                data.mocap_pos[model.body(f"obstacle{k + 1}").mocapid[0], :2] = x, y
-            else:
-                model.geom(f"obstacle{k + 1}").pos[:2] = x, y
+        discs = [model.geom(f"obstacle{k + 1}").id for k in range(len(log.obstacles))]
+        _place_obstacles(model, data, discs, log.obstacles, unit)
     except (KeyError, ValueError) as error:
         raise ConfigurationError(f"the log's model cannot be shown: {str(error).strip()}") from error
-    unit, radius = _size(model)
     return Stage(
         log=log,
         model=model,
         data=data,
         joints=np.array(joints),
-        radii=np.array([radius or _enlarge(model, agent_prefix(i)) for i in agents]),
-        rings=[mark for obstacle in log.obstacles for mark in _zone(obstacle, log.safe_distance, unit)],
+        discs=np.array(discs, dtype=np.int64),
+        radii=np.array([radius or _enlarge(model, agent_prefix(i), min(BALL, BALL_SHARE * log.safe_distance)) for i in agents]),
+        rings=_rings(log, 0.0, unit),
         trails=[make_trail(i, log.time, log.position[:, i], unit) for i in agents],
         scale=unit,
         free=tuple(free) if log.pose.shape[1] else (),
@@ -151,6 +154,22 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
     return float(unit), float(radius)
 
 
+def _place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, discs: list[int], obstacles: np.ndarray, unit: float) -> None:
+    """Obstacles (K, 3) where an episode has them, and as large."""
+    least = unit * (LEAST_SOLID if model.nmocap else POINT_RADIUS)
+    for geom, (x, y, radius) in zip(discs, obstacles, strict=True):
+        model.geom_size[geom, 0] = max(radius, least)
+        if model.nmocap:
+            data.mocap_pos[model.body(model.geom_bodyid[geom]).mocapid[0], :2] = x, y
+        else:
+            model.geom_pos[geom, :2] = x, y
+
+
+def _rings(log: EpisodeLog, time: float, unit: float) -> list[Mark]:
+    """Safe distances around all obstacles at ``time`` [s]."""
+    return [mark for obstacle in log.obstacles_at(time) for mark in _zone(obstacle, log.safe_distance, unit)]
+
+
 def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]:
     """Where the clearance to an obstacle (3,) is below the safe distance [m]: a tinted disc in a dashed circle."""
     center, radius = obstacle[:2], float(obstacle[2]) + safe_distance
@@ -158,16 +177,16 @@ def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]
     return [disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
 
 
-def _enlarge(model: mujoco.MjModel, prefix: str) -> float:
-    """Draw an agent's spheres no smaller than ``BALL``, resting on the ground; returns the largest drawn radius [m]."""
-    largest = BALL
+def _enlarge(model: mujoco.MjModel, prefix: str, least: float) -> float:
+    """Draw an agent's spheres no smaller than ``least`` [m], resting on the ground; returns the largest drawn radius [m]."""
+    largest = least
     for geom in range(model.ngeom):
         if not model.body(model.geom_bodyid[geom]).name.startswith(prefix):
             continue
         size = model.geom_size[geom]
-        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE and size[0] < BALL:
-            model.geom_pos[geom, 2] += BALL - size[0]
+        if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE and size[0] < least:
+            model.geom_pos[geom, 2] += least - size[0]
             model.geom_sameframe[geom] = 0  # or MuJoCo would skip the new position
-            size[:] = BALL
+            size[:] = least
         largest = max(largest, float(size[0]))
     return largest

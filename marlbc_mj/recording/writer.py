@@ -30,7 +30,7 @@ from marlbc_mj.provenance import config_hash, git_revision, plain_data, versions
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
 from marlbc_mj.robots import make_robot
-from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios import Draw, Scenario
 
 METADATA = "marlbc"
 """Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
@@ -77,17 +77,17 @@ class LogWriter:
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
-        obstacles = _drawn_obstacles(scenario, seed)
+        draw = _draw(scenario, seed)
         metadata = {
             "supervisor": supervisor,
             "controller": controller_name,
             "seed": str(seed),
             "config_sha256": config_hash(config),
             "revision": git_revision(),
-            **_describe(scenario, controller, obstacles),
+            **_describe(scenario, controller, draw),
         }
         attachments = _attachments(scenario, controller, config)
-        self._scene = Scene(scenario, obstacles)
+        self._scene = Scene(scenario, draw.obstacles, draw.motions)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = controller.initial_state(0).shape == (sorlc.STATE_SIZE,)
         self._posed = len(make_robot(scenario.robot).joints) == 1
@@ -228,7 +228,7 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
         raise ConfigurationError(f"cannot write {path}: {error.strerror}") from error
 
 
-def _describe(scenario: Scenario, controller: Controller, obstacles: np.ndarray) -> dict[str, str]:
+def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[str, str]:
     """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
@@ -236,7 +236,9 @@ def _describe(scenario: Scenario, controller: Controller, obstacles: np.ndarray)
         "safe_distance": repr(float(scenario.safe_distance)),
         "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",
         "commands": json.dumps(scenario.orders.commands),
-        "obstacles": json.dumps(obstacles.tolist()),
+        "obstacles": json.dumps(draw.obstacles.tolist()),
+        "motions": json.dumps(draw.motions.tolist()),
+        **({} if draw.layout is None else {"layout": str(draw.layout), "split": scenario.split}),
     }
 
 
@@ -250,9 +252,9 @@ def _attachments(scenario: Scenario, controller: Controller, config: dict[str, A
     ]
 
 
-def _drawn_obstacles(scenario: Scenario, seed: int) -> np.ndarray:
-    """(K, 3) obstacles of the episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
-    return scenario.draw(np.random.default_rng(np.random.SeedSequence([seed, 0]))).obstacles
+def _draw(scenario: Scenario, seed: int) -> Draw:
+    """The episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
+    return scenario.draw(np.random.default_rng(np.random.SeedSequence([seed, 0])))
 
 
 def _weight_table(state: np.ndarray) -> np.ndarray:

@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from marlbc_mj.behaviors import clearances
 from marlbc_mj.episode import Trajectory
+from marlbc_mj.motion import moved, nearest_places
 from marlbc_mj.orders import SEPARATOR
 from marlbc_mj.palette import command_color
 from marlbc_mj.report import plotting as pl
@@ -51,7 +51,7 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
 def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float, float, float]:
     """x and y limits [m] that hold every path and every obstacle's safe-distance ring, for a panel of ``width`` [in]."""
     points = np.concatenate([e.position.reshape(-1, 2) for e in episodes])
-    rings = np.concatenate([e.obstacles for e in episodes])
+    rings = np.concatenate([_discs(e) for e in episodes])
     reach = rings[:, 2:] + episodes[0].scenario.safe_distance
     low = np.concatenate([points, rings[:, :2] - reach]).min(axis=0)
     high = np.concatenate([points, rings[:, :2] + reach]).max(axis=0)
@@ -60,8 +60,17 @@ def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float,
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])
 
 
+def _discs(episode: Trajectory) -> np.ndarray:
+    """(K, 3) obstacles to draw: of those that move, where and when each is nearest to an agent."""
+    every = episode.scenario.substeps
+    return nearest_places(episode.time[::every], episode.position[:-1:every], episode.obstacles, episode.motions)
+
+
 def _draw_arena(axes: Axes, episode: Trajectory) -> None:
-    for x, y, radius in episode.obstacles:
+    if len(episode.motions):
+        tracks = moved(episode.time[:: episode.scenario.substeps], episode.obstacles, episode.motions)
+        axes.add_collection(LineCollection(list(tracks[..., :2].swapaxes(0, 1)), colors=pl.GREY, linewidths=0.5, zorder=0.5))
+    for x, y, radius in _discs(episode):
         ring = radius + episode.scenario.safe_distance
         axes.add_patch(Circle((x, y), ring, fill=False, edgecolor=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2))))
         axes.add_patch(Circle((x, y), max(radius, _POINT), facecolor="#D4D4D4", edgecolor=pl.GREY, linewidth=0.5))
@@ -90,7 +99,7 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
 def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -> None:
     """A dark casing around the stretches with a clearance of at most the safe distance."""
     path = episode.position[1:, agent]
-    violated = clearances(path, episode.obstacles) <= episode.scenario.safe_distance
+    violated = episode.clearances()[:, agent] <= episode.scenario.safe_distance
     every = max(1, episode.scenario.substeps // 2)
     bands = [path[start : end + every : every] for start, end, value in pl.runs(violated.astype(int)) if value]
     axes.add_collection(LineCollection(bands, colors=_VIOLATION, linewidths=width, zorder=1.5))
@@ -104,6 +113,8 @@ def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
             handle.set_label(f"{handle.get_label()} on top")
     distance = episodes[0].scenario.safe_distance
     handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2)), label=f"safe distance {distance:g} m"))
-    if any((clearances(e.position[1:], e.obstacles) <= distance).any() for e in episodes):
+    if any(len(e.motions) for e in episodes):
+        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="way of an obstacle, drawn where it came nearest"))
+    if any((e.clearances() <= distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
     pl.legend_above(figure, handles)

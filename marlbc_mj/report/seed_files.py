@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from marlbc_mj.outcomes import outcome
 from marlbc_mj.report.formats import one_line
 from marlbc_mj.report.results import AGENT_KEYS, SCHEMA, TEAM_KEYS, plain
 from marlbc_mj.report.seed_statistics import (
@@ -15,8 +16,9 @@ from marlbc_mj.report.seed_statistics import (
     by_supervisor,
     group,
 )
+from marlbc_mj.scenarios import Scenario
 from marlbc_mj.seeds import SeedResults, SeedRun
-from marlbc_mj.statistics import Estimate
+from marlbc_mj.statistics import Estimate, rate
 
 
 def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:
@@ -29,7 +31,8 @@ def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions:
         "seeds": list(results.seeds),
         "perturbation": vars(results.scenario.perturbation),
         "reference": results.reference,
-        "methods": {statistics.runs.key: _summary_entry(statistics) for statistics in methods},
+        "split": results.scenario.split,
+        "methods": {s.runs.key: {**_summary_entry(s), **_outcome_entry(s, results.scenario)} for s in methods},
         "groups": {key: {g.name: _group_entry(g) for g in group(results, by)} for key, by in groups.items()},
     }
     return dict(plain(content))
@@ -48,6 +51,13 @@ def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
         return {"failure": failed[0].failure, **entry}
     agents = [_all_with_ci(agent) for agent in statistics.agents]
     return {"agents": agents, "team": _all_with_ci(statistics.team), "scores": scores, **entry}
+
+
+def _outcome_entry(statistics: MethodStatistics, scenario: Scenario) -> dict[str, Any]:
+    """Rates of every part of an outcome, with Wilson's intervals."""
+    outcomes = [outcome(run.metrics, scenario) for run in statistics.runs.runs]
+    parts = ("success", "reached", "struck", "collided")
+    return {k: v for part in parts for k, v in _with_ci(f"{part}_rate", rate([getattr(o, part) for o in outcomes])).items()}
 
 
 def _group_entry(statistics: GroupStatistics) -> dict[str, Any]:

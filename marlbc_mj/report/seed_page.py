@@ -98,6 +98,10 @@ Medians and interquartile means ignore a few odd draws; intervals say how far an
 has moved, and a median over the runs that finished flatters a method that often fails.</p>"""
 
 
+_PAPER = "<p>The paper prints single runs without perturbation; without --seeds the same command shows them.</p>"
+_NO_PAPER = "<p>The paper has no mission like this one.</p>"
+
+
 def _write_page(
     path: Path, results: SeedResults, methods: Sequence[MethodStatistics], tables: Sequence[Table], config: Mapping[str, Any]
 ) -> Path:
@@ -122,7 +126,7 @@ def _write_page(
         facts=facts,
         command=str(config["command"]),
         overview="".join(map(to_html, tables)),
-        paper="<p>The paper prints single runs without perturbation; without --seeds the same command shows them.</p>",
+        paper=_PAPER if scenario.layout is None else _NO_PAPER,
         comparisons=figure or "<p>Not drawn.</p>",
         methods="".join(map(_method_section, methods)),
         reading=_READING,

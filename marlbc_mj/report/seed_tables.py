@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
+from marlbc_mj.outcomes import outcome
 from marlbc_mj.report.formats import DASH, FAILED, interval, one_line, percent, spans
 from marlbc_mj.report.seed_statistics import (
     SCORES,
@@ -13,19 +14,24 @@ from marlbc_mj.report.seed_statistics import (
     group,
 )
 from marlbc_mj.report.table import Column, Table
+from marlbc_mj.robots import make_robot
 from marlbc_mj.seeds import MethodRuns, SeedResults
+from marlbc_mj.statistics import rate
 
 ENOUGH = 10
 """Draws from which a bootstrap interval is taken at its word."""
 
 
 def make_tables(results: SeedResults, methods: Sequence[MethodStatistics]) -> list[Table]:
-    """All tables; the ones of groups (two or more that can be compared) and of failures only where there are some."""
+    """All tables, outcomes first where a scenario draws layouts; the ones of groups (two or more that can be compared) and of
+    failures only where there are some.
+    """
     groups = [rows if len(rows) > 1 else [] for rows in (group(results, by_supervisor), group(results, by_controller))]
     failing = [statistics.runs for statistics in methods if statistics.runs.failed]
+    first = [_return_table(results, methods), _safety_table(methods)]
+    first.insert(len(first) if results.scenario.layout is None else 0, outcome_table(results))
     tables = [
-        _return_table(results, methods),
-        _safety_table(methods),
+        *first,
         _score_table("costs", "What each method costs", ("effort", "cost", "formation_error", "saturation_duty"), methods),
         _switch_table(methods, results.scenario.agents),
         *([_group_table(groups)] if any(groups) else []),
@@ -59,14 +65,43 @@ def _return_table(results: SeedResults, methods: Sequence[MethodStatistics]) -> 
         )
         for s in methods
     ]
+    layouts = "" if results.scenario.layout is None else f"a layout each of the {results.scenario.split} split; "
     notes = (
-        f"{len(results.seeds)} draws, the same for every method: starts within {spread.start_spread:g} m and obstacles within "
-        f"{spread.obstacle_spread:g} m per axis, drag × {spread.drag_scale[0]:g} to {spread.drag_scale[1]:g}, uniformly.",
+        f"{len(results.seeds)} draws, the same for every method: {layouts}starts within {spread.start_spread:g} m and obstacles "
+        f"within {spread.obstacle_spread:g} m per axis, drag × {spread.drag_scale[0]:g} to {spread.drag_scale[1]:g}, uniformly.",
         "In brackets: 95 % percentile-bootstrap interval over draws. IQM: interquartile mean.",
         f"Better: probability of a higher return than {results.reference} on the same draw, ties counted half; "
         "a run that failed loses. 50 % is no difference.",
     )
     return Table("seeds-return", "Return of each method over draws of the scenario", columns, tuple(rows), notes)
+
+
+def outcome_table(results: SeedResults) -> Table:
+    """Success of each method, and what kept the others from it."""
+    columns = (
+        Column("", "method"),
+        Column("success", "rate [%]"),
+        Column("reached the end", "rate [%]"),
+        Column("violation", "rate [%]"),
+        Column("struck an obstacle", "rate [%]"),
+        Column("agents collided", "rate [%]"),
+    )
+    rows = []
+    for method in results.methods:
+        if len(method.failed) == len(method.runs):
+            rows.append((method.key, FAILED, *[DASH] * 4))
+            continue
+        outcomes = [outcome(run.metrics, results.scenario) for run in method.runs]
+        shares = ([getattr(one, name) for one in outcomes] for name in ("success", "reached", "violated", "struck", "collided"))
+        rows.append((method.key, *(interval(percent(rate(share)), 0) for share in shares)))
+    scenario, radius = results.scenario, make_robot(results.scenario.robot).radius
+    notes = (
+        f"Success: at the end every agent within {scenario.formation_tolerance:g} m of its slot around the desired centroid, on "
+        "the way no violation and no collision. In brackets: Wilson's 95 % interval.",
+        f"Violation: a clearance of at most {scenario.safe_distance:g} m. Struck: of at most {radius:g} m, the agent's radius. "
+        f"Collided: two agents within {2 * radius:g} m. A run that failed counts against its method in every column.",
+    )
+    return Table("seeds-outcome", "Outcome of the mission over draws of the scenario", columns, tuple(rows), notes)
 
 
 def _never_ran(statistics: MethodStatistics) -> bool:

@@ -6,31 +6,46 @@ from typing import Any
 from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.case_study import cruise, paper
+from marlbc_mj.scenarios.families import FAMILIES, held_out
+from marlbc_mj.scenarios.files import SUFFIX, load_scenario
+from marlbc_mj.scenarios.layout import Layout, Motion
 from marlbc_mj.scenarios.robot_gate import robot_gate
 
-SCENARIOS: dict[str, Callable[..., Scenario]] = {"paper": paper, "cruise": cruise, "robot_gate": robot_gate}
+SCENARIOS: dict[str, Callable[..., Scenario]] = {
+    "paper": paper,
+    "cruise": cruise,
+    "robot_gate": robot_gate,
+    **{name: family().build for name, family in FAMILIES.items()},
+}
 """Factory by name."""
 
 
 def make_scenario(name: str, **changes: Any) -> Scenario:
-    """A scenario by name, with any of its fields changed.
+    """A scenario by name or from a ``.toml`` file, with any of its fields changed.
 
     Raises:
-        ConfigurationError: unknown name, or a change that cannot be run.
+        ConfigurationError: unknown name, a file that cannot be loaded, or a change that cannot be run.
     """
+    if name.endswith(SUFFIX):
+        return load_scenario(name, **changes)
     if name not in SCENARIOS:
-        raise unknown("scenario", name, SCENARIOS)
+        raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
     return SCENARIOS[name](**changes)
 
 
 __all__ = [
+    "FAMILIES",
     "SCENARIOS",
     "Draw",
+    "Layout",
+    "Motion",
     "Obstacle",
     "Perturbation",
     "Scenario",
     "Window",
     "cruise",
+    "held_out",
+    "load_scenario",
     "make_scenario",
     "paper",
     "robot_gate",

@@ -2,18 +2,22 @@
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from math import factorial
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import Behavior, Formation, ObstacleAvoidance
+from marlbc_mj.behaviors import AgentAvoidance, Behavior, Formation, ObstacleAvoidance
 from marlbc_mj.disturbances import Disturbance, PaperDrag
 from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
+from marlbc_mj.motion import NUMBERS, obstacles_at
 from marlbc_mj.orders import Orders
+from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
+MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
 YOUNG = {"young": True}
 """Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
@@ -54,8 +58,10 @@ class Draw(NamedTuple):
     """One seed's instance of a scenario."""
 
     starts: np.ndarray  # (N, 2) [m]
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
     drag_scale: float
+    motions: np.ndarray = np.zeros((0, NUMBERS))  # (K, 6), or (0, 6) where all obstacles are at rest
+    layout: int | None = None  # number of the layout; None where a scenario has none to draw
 
 
 @dataclass(frozen=True)
@@ -94,10 +100,14 @@ class Scenario:
     perturbation: Perturbation = Perturbation()
     schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
     description: str = ""
+    motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one an obstacle, or none: all at rest
+    layout: Layout | None = field(default=None, metadata=YOUNG)  # draws obstacles and motions anew for every seed
+    split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # whose layouts are drawn
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
         object.__setattr__(self, "schedule", tuple(Window(*w) for w in self.schedule))
+        object.__setattr__(self, "motions", tuple(Motion(*m) for m in self.motions))
         self._check_numbers()
         self._check_team()
         self._check_clocks()
@@ -131,28 +141,42 @@ class Scenario:
         offsets = [by_name[name].offsets for name in self.formation_names]  # type: ignore[attr-defined]
         return np.array(offsets, dtype=np.float64)
 
+    @property
+    def moving(self) -> bool:
+        """Whether obstacles move."""
+        return len(self.motions) > 0
+
     def obstacle_array(self) -> np.ndarray:
-        """(K, 3) x, y, radius [m]."""
+        """(K, 3) x, y, radius [m]; of one that moves, its place without motion."""
         return np.array(self.obstacles, dtype=np.float64).reshape(-1, 3)
 
     def draw(self, rng: np.random.Generator) -> Draw:
         """One instance: starts, obstacles and drag scale drawn around this scenario's values.
 
-        A draw that puts an obstacle on a start is drawn again.
+        A scenario with a layout draws that first. A draw that puts an obstacle on a start is drawn again.
 
         Raises:
-            ConfigurationError: a hundred draws in a row did.
+            ConfigurationError: a hundred draws in a row did, or no layout was found.
         """
         spread = self.perturbation
         for _ in range(100):
             starts = np.array(self.starts, dtype=np.float64)
-            obstacles = self.obstacle_array()
+            obstacles, motions, number = self._lay_out(rng)
             starts += rng.uniform(-spread.start_spread, spread.start_spread, starts.shape)
             obstacles[:, :2] += rng.uniform(-spread.obstacle_spread, spread.obstacle_spread, (len(obstacles), 2))
-            gaps = np.linalg.norm(starts[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
+            first = obstacles_at(0.0, obstacles, motions)
+            gaps = np.linalg.norm(starts[:, None] - first[None, :, :2], axis=-1) - first[:, 2]
             if (gaps > 0).all():
-                return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)))
+                return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)), motions, number)
         raise ConfigurationError(f"scenario {self.name!r}: {spread} puts an obstacle on a start in every one of 100 draws")
+
+    def _lay_out(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int | None]:
+        """Obstacles (K, 3), motions (K, 6) or (0, 6), and the number of the layout if there is one."""
+        if self.layout is None:
+            return self.obstacle_array(), motion_array(self.motions), None
+        number = layout_number(rng, self.split)
+        obstacles, motions = self.layout.sample(np.random.default_rng(number))
+        return obstacles.copy(), motions, number
 
     def check_windows(self, windows: tuple[Window, ...]) -> None:
         """Raise ConfigurationError for a window with an unknown agent or times that are not finite."""
@@ -184,6 +208,8 @@ class Scenario:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive, got {getattr(self, name)}")
         if self.reference not in REFERENCE_MODES:
             raise unknown("reference mode", self.reference, REFERENCE_MODES)
+        if self.split not in SPLITS:
+            raise unknown("split", self.split, SPLITS)
         arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}
         for name, values in arrays.items():
             if not np.isfinite(np.array(values, dtype=float)).all():
@@ -193,6 +219,10 @@ class Scenario:
         if self.agents < 2:
             raise ConfigurationError(f"scenario {self.name!r} has {self.agents} agent(s); a team needs at least 2")
         names = [b.name for b in self.behaviors]
+        if len(names) > MOST_BEHAVIORS:
+            raise ConfigurationError(
+                f"{len(names)} behaviors make {factorial(len(names))} orders; at most {MOST_BEHAVIORS} are ordered"
+            )
         if len(set(names)) != len(names):
             raise ConfigurationError(f"scenario {self.name!r}: two behaviors share a name: {', '.join(names)}")
         slotted = [b.name for b in self.behaviors if hasattr(b, "offsets")]
@@ -203,23 +233,24 @@ class Scenario:
             offsets = getattr(behavior, "offsets", None)
             if offsets is not None:
                 self._check_slots(behavior.name, offsets)
+        check_motions(self.motions, len(self.obstacles))
+        first = obstacles_at(0.0, self.obstacle_array(), motion_array(self.motions))
+        starts = np.array(self.starts, dtype=np.float64)
         for k, obstacle in enumerate(self.obstacles):
             if obstacle.radius < 0:
                 raise ConfigurationError(f"obstacle {k} has a negative radius: {obstacle}")
-            for i, start in enumerate(self.starts):
-                if np.hypot(start[0] - obstacle.x, start[1] - obstacle.y) <= obstacle.radius:
-                    raise ConfigurationError(f"obstacle {k} {tuple(obstacle)} covers the start of agent {i + 1} {start}")
+            covered = np.flatnonzero(np.hypot(*(starts - first[k, :2]).T) <= obstacle.radius)
+            if len(covered):
+                i = int(covered[0])
+                raise ConfigurationError(f"obstacle {k} {tuple(obstacle)} covers the start of agent {i + 1} {self.starts[i]}")
 
     def _check_slots(self, name: str, offsets: tuple[Point, ...]) -> None:
         if len(offsets) != self.agents:
             raise ConfigurationError(f"{name} has {len(offsets)} slots for {self.agents} agents")
         slots = np.array(offsets)
-        for i in range(self.agents):
-            for j in range(i):
-                if np.linalg.norm(slots[i] - slots[j]) < 1e-9:
-                    raise ConfigurationError(
-                        f"{name} slots of agents {j + 1} and {i + 1} overlap at {tuple(map(float, slots[i]))}"
-                    )
+        near = np.linalg.norm(slots[:, None] - slots[None], axis=-1) < 1e-9
+        for i, j in np.argwhere(np.tril(near, -1)):
+            raise ConfigurationError(f"{name} slots of agents {j + 1} and {i + 1} overlap at {tuple(map(float, slots[i]))}")
 
     def _check_clocks(self) -> None:
         if self.mission_step / self.substep > MOST_SUBSTEPS:
@@ -242,10 +273,12 @@ def standard_behaviors(
     formation_gain: float = 8.0,
     safe_distance: float = 2.0,
     two_sided: bool = False,
+    agent_distance: float | None = None,
 ) -> tuple[Behavior, ...]:
-    """OA, FM and FR in this order, with the gains of Table 2."""
+    """OA, FM and FR in this order, with the gains of Table 2; then AA with OA's gain, if ``agent_distance`` is given."""
     return (
         ObstacleAvoidance(avoidance_gain, safe_distance, two_sided),
         Formation("FM", formation, formation_gain),
         Formation("FR", reconstruction, formation_gain),
+        *(() if agent_distance is None else (AgentAvoidance(avoidance_gain, agent_distance),)),
     )

@@ -38,6 +38,8 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
 """Factory and one line of description by name."""
 LEARNED = ("marlms",)
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
+UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, "mpcms-mujoco"))
+"""Supervisors that nothing was trained for, without the slow ones."""
 SLOW = ("mpcms-mujoco",)
 """Supervisors that take minutes an episode: a benchmark runs them where they are named, not by default."""
 
@@ -60,6 +62,7 @@ __all__ = [
     "MPCMS",
     "SLOW",
     "SUPERVISORS",
+    "UNLEARNED",
     "Blend",
     "Decision",
     "FuzzyBlend",

@@ -12,6 +12,7 @@ import numpy as np
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 
 _FM, _FR, _OA = 0, 1, 2
 
@@ -49,6 +50,7 @@ class FuzzyMemory(NamedTuple):
     orders: np.ndarray  # (3,) the order of each state
     safe_distance: float  # [m]
     mission_step: float  # [s]
+    way: GiveWay  # to other agents
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class FMS:
     """near -> OA on top; mid and closing -> FR; mid and opening -> keep; far -> FM.
 
     An agent switches when the strongest rule leads that of its order in force by ``lead``. The first mission step has no rate:
-    d' = 0.
+    d' = 0. Where the scenario has agent avoidance, it goes on top of the order in force while a neighbor is too close.
     """
 
     lead: float = 0.1  # firing strength, which lies in [0, 1]
@@ -69,7 +71,7 @@ class FMS:
         """Every agent in formation."""
         orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
         state = np.zeros(scenario.agents, dtype=np.int64)
-        return FuzzyMemory(state, None, orders, scenario.safe_distance, scenario.mission_step)
+        return FuzzyMemory(state, None, orders, scenario.safe_distance, scenario.mission_step, give_way(scenario))
 
     def decide(self, situation: Situation, memory: FuzzyMemory) -> tuple[np.ndarray, FuzzyMemory]:
         """One rule base per agent, on its own clearance."""
@@ -81,7 +83,8 @@ class FMS:
         winner = strength.argmax(axis=0)
         ahead = strength[winner, agents] - strength[memory.state, agents]
         state = np.where((ahead >= self.lead) & (winner != memory.state), winner, memory.state)
-        return memory.orders[state], memory._replace(state=state, clearance=clearance.copy())
+        orders = lift(memory.orders[state], situation, memory.way)
+        return orders, memory._replace(state=state, clearance=clearance.copy())
 
 
 def _rate(clearance: np.ndarray, memory: FuzzyMemory) -> np.ndarray:

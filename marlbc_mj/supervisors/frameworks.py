@@ -15,38 +15,45 @@ import numpy as np
 
 from marlbc_mj.behaviors import nearest_obstacle
 from marlbc_mj.engine.loop import path_at, set_references
-from marlbc_mj.engine.plan import behavior_arrays
+from marlbc_mj.engine.plan import behavior_arrays, grid_room, sees_array
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend, Situation
 from marlbc_mj.supervisors.fms import memberships
+from marlbc_mj.supervisors.neighbors import GiveWay, crowded, give_way
 
-_FM, _FR, _OA = 0, 1, 2
-_ALONE = np.array([[_FM], [_FR], [_OA]])  # (3, 1): a table of orders that hold one behavior each
+_FM, _FR, _OA, _AA = 0, 1, 2, 3
+_ALONE = np.array([[_FM], [_FR], [_OA], [_AA]])  # (4, 1): a table of orders that hold one behavior each
 
 
 class Repertoire(NamedTuple):
     """What a framework blends, fixed for an episode."""
 
-    laws: np.ndarray  # (3,) FM, FR, OA, as the engine calls them
+    laws: np.ndarray  # (3,) FM, FR, OA, or (4,) with AA, as the engine calls them
     params: np.ndarray  # (3, N, P)
+    sees: np.ndarray  # (3,) what each looks at
     orders: np.ndarray  # (3,) the order that labels each
     path: np.ndarray  # (2, 2) p_cd(0) [m], its velocity [m/s]
     safe_distance: float  # d_OA [m]
     virtual: bool  # behaviors are evaluated at p_r
+    way: GiveWay  # to other agents
+    grid: np.ndarray  # scratch
 
 
-def repertoire(scenario: Scenario) -> Repertoire:
-    """FM, FR and OA of a scenario.
+def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) -> Repertoire:
+    """FM, FR and OA of a scenario, with AA too if it is named.
 
     Raises:
         ConfigurationError: the scenario lacks one of them.
     """
-    orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
+    labels = {"FM": "FM", "FR": "FR", "OA": "OA>FM", "AA": "AA>FM"}
+    orders = np.array([scenario.orders.index(labels[name]) for name in names])
     by_name = {b.name: b for b in scenario.behaviors}
-    laws, params = behavior_arrays((by_name["FM"], by_name["FR"], by_name["OA"]), scenario.agents)
+    behaviors = [by_name[name] for name in names]
+    laws, params = behavior_arrays(behaviors, scenario.agents)
     path = np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64)
-    return Repertoire(laws, params, orders, path, scenario.safe_distance, scenario.reference == "virtual")
+    virtual, way, grid = scenario.reference == "virtual", give_way(scenario), np.zeros(grid_room(scenario))
+    return Repertoire(laws, params, sees_array(behaviors), orders, path, scenario.safe_distance, virtual, way, grid)
 
 
 def evaluated_at(situation: Situation, memory: Repertoire) -> np.ndarray:
@@ -55,14 +62,16 @@ def evaluated_at(situation: Situation, memory: Repertoire) -> np.ndarray:
 
 
 def behavior_velocities(situation: Situation, memory: Repertoire) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (8) of FM, FR and OA, each alone, for every agent, (3, N, 2) [m/s]; and p_cd, p_cd' (2, 2) [m, m/s]."""
+    """Velocity (8) of FM, FR, OA (and AA), each alone, for every agent, (3 or 4, N, 2) [m/s]; and p_cd, p_cd' (2, 2)."""
     at = evaluated_at(situation, memory)
-    now, scratch = np.empty((2, 2)), np.empty((5, 2))
+    now, scratch = np.empty((2, 2)), np.empty((7, 2))
     path_at(situation.time, memory.path, now)
-    velocities = np.empty((3, *at.shape))
-    for behavior in (_FM, _FR, _OA):
+    velocities = np.empty((len(memory.laws), *at.shape))
+    for behavior, velocity in enumerate(velocities):
         alone = np.full(len(at), behavior)
-        set_references(memory.laws, memory.params, _ALONE, alone, at, now, situation.obstacles, scratch, velocities[behavior])
+        set_references(
+            memory.laws, memory.params, memory.sees, _ALONE, alone, at, now, situation.obstacles, memory.grid, scratch, velocity
+        )  # fmt: skip
     return velocities, now
 
 
@@ -72,7 +81,8 @@ class Layered:
 
     Subsumption of whole layers: those below are suppressed, not projected, so an agent that avoids an obstacle neither follows
     the path nor keeps its slot meanwhile. OA brings it to d = d_OA, where OA is still active: it can rest there for good
-    while the path goes on. The regions are those of FSAMS as printed.
+    while the path goes on. The regions are those of FSAMS as printed. Where the scenario has agent avoidance, AA is the layer
+    above OA, active while a neighbor is within d_AA.
     """
 
     reach: float = 2.0  # FR is active within this many d_OA
@@ -83,7 +93,8 @@ class Layered:
 
     def start(self, scenario: Scenario) -> Repertoire:
         """The scenario's behaviors."""
-        return repertoire(scenario)
+        avoiding = any(b.name == "AA" for b in scenario.behaviors)
+        return repertoire(scenario, ("FM", "FR", "OA", "AA") if avoiding else ("FM", "FR", "OA"))
 
     def weights(self, clearance: np.ndarray, safe_distance: float) -> np.ndarray:
         """(3, N), 1 for the highest active of FM, FR and OA and 0 for the others, at clearances (N,) [m]."""
@@ -93,6 +104,9 @@ class Layered:
     def decide(self, situation: Situation, memory: Repertoire) -> tuple[Blend, Repertoire]:
         """One behavior per agent."""
         weights = self.weights(situation.clearance, memory.safe_distance)
+        if len(memory.laws) > _AA:
+            close = crowded(situation, memory.way, reach=1.0)  # alone, AA has an agent stand still from d_AA on
+            weights = np.concatenate([weights * ~close, close[None].astype(np.float64)])
         velocities, _ = behavior_velocities(situation, memory)
         return _blend(weights, velocities, memory), memory
 

@@ -8,6 +8,7 @@ import numpy as np
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 
 _FAR, _MIDDLE, _NEAR = 0, 1, 2
 
@@ -19,6 +20,7 @@ class Automaton(NamedTuple):
     entered: np.ndarray  # (N,) [s] when it got there
     orders: np.ndarray  # (3,) the order of each state
     safe_distance: float  # [m]
+    way: GiveWay  # to other agents
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class FSAMS:
     inwards at -hysteresis and outwards at +hysteresis, and a state lasts at least ``dwell`` before a less urgent one may
     follow: the
     fair baseline. A dwell that also delays the more urgent states drives agents deep into the discs, so that reading is an
-    option only.
+    option only. Where the scenario has agent avoidance, it goes on top of the state's order while a neighbor is too close.
     """
 
     hysteresis: float = 0.0  # [m]
@@ -47,7 +49,7 @@ class FSAMS:
         """Every agent in formation, free to switch at once."""
         orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
         state = np.zeros(scenario.agents, dtype=np.int64)
-        return Automaton(state, np.full(scenario.agents, -np.inf), orders, scenario.safe_distance)
+        return Automaton(state, np.full(scenario.agents, -np.inf), orders, scenario.safe_distance, give_way(scenario))
 
     def decide(self, situation: Situation, memory: Automaton) -> tuple[np.ndarray, Automaton]:
         """One automaton per agent, on its own clearance."""
@@ -57,7 +59,8 @@ class FSAMS:
             at_once = wanted > state[i] and not self.dwell_delays_urgent
             if wanted != state[i] and (at_once or situation.time - entered[i] >= self.dwell - 1e-9):
                 state[i], entered[i] = wanted, situation.time
-        return memory.orders[state], memory._replace(state=state, entered=entered)
+        orders = lift(memory.orders[state], situation, memory.way)
+        return orders, memory._replace(state=state, entered=entered)
 
     def _level(self, clearance: float, state: int, safe_distance: float) -> int:
         """How many thresholds lie at or above the clearance, each shifted away from the side the agent is on."""

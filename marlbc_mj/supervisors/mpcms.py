@@ -22,7 +22,7 @@ that within the 2 s of H = 40 leaving it never pays, and the case study ends in 
 """
 
 from dataclasses import dataclass, field
-from functools import cache
+from functools import lru_cache
 from itertools import combinations
 from time import perf_counter
 from typing import Literal, NamedTuple
@@ -36,8 +36,10 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.errors import ConfigurationError, SimulationError, unknown
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.supervisors.prediction import follow, judge, simulate
 
+MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision
 PREDICTIONS = ("kinematic", "mujoco")
 STARTS = ("measured", "reference")
 AVOIDANCE = "OA"
@@ -66,6 +68,7 @@ class Forecast(NamedTuple):
     reference: np.ndarray | None  # (N, 2) its own copy of p_r [m]; None before the first decision
     twin: World | None  # MuJoCo prediction: one world that was given the same orders
     worlds: World | None  # MuJoCo prediction: one world a candidate
+    way: GiveWay  # to other agents
     solver_ms: float = 0.0  # what the prediction took in the last decision [ms]
 
 
@@ -76,8 +79,9 @@ class MPCMS:
     The kinematic prediction integrates the reference with the laws of the mission itself, from the ``measured`` positions or from
     its own copy of the reference. The MuJoCo prediction simulates force law, limit and drag of every candidate; what a supervisor
     cannot measure (reference, controller state) comes from a twin world that was given the same orders, the drag is the nominal
-    one. That twin is part of the memory and moves with every decision. If no candidate keeps the clearance, the least violation
-    is chosen.
+    one. That twin is part of the memory and moves with every decision. Where the scenario has agent avoidance, it goes on top
+    of the orders given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least
+    violation is chosen.
 
     Raises:
         ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
@@ -128,13 +132,18 @@ class MPCMS:
         plan = make_plan(scenario, self.controller)
         joint = Joint(0, (False,) * scenario.agents)
         most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True, *joint.avoiding[1:]))))
+        if most * self.horizon * scenario.agents > MOST_ORDERS:
+            raise ConfigurationError(
+                f"MPCMS would predict {most} candidates over {self.horizon} steps for {scenario.agents} agents: more than "
+                f"{MOST_ORDERS} orders a decision; choose fewer instants or a supervisor that decides per agent"
+            )
         self._candidates(scenario, joint)
         if self.prediction == "kinematic":
-            return Forecast(plan, joint, None, None, None)
+            return Forecast(plan, joint, None, None, None, give_way(scenario))
         if not plan.native:
             raise ConfigurationError("MPCMS prediction 'mujoco' needs a compiled controller and disturbance")
         twin, worlds = World(scenario, self.controller), World(scenario, self.controller, worlds=most, threads=self.threads)
-        return Forecast(plan, joint, None, twin, worlds)
+        return Forecast(plan, joint, None, twin, worlds, give_way(scenario))
 
     def decide(self, situation: Situation, memory: Forecast) -> tuple[np.ndarray, Forecast]:
         """The first orders of the cheapest sequence; ties go to the earlier candidate, holding first."""
@@ -146,7 +155,7 @@ class MPCMS:
         best = int(costs.argmin())
         if not np.isfinite(costs[best]):
             raise SimulationError(f"MPCMS: no candidate has a finite cost at t = {situation.time:.3f} s")
-        orders = candidates.orders[best, 0].copy()
+        orders = lift(candidates.orders[best, 0], situation, memory.way)
         if memory.twin is not None:
             memory.twin.step(orders[None])
         return orders, memory._replace(joint=candidates.first[best], reference=reached[best], solver_ms=solver_ms)
@@ -184,7 +193,7 @@ class MPCMS:
         return _sequences(joint, tuple(self._changes(joint)), orders, self.horizon, self.instants)
 
 
-@cache
+@lru_cache(maxsize=256)
 def _sequences(
     joint: Joint, changes: tuple[Joint, ...], orders: tuple[tuple[int, int], ...], horizon: int, instants: tuple[int, ...]
 ) -> Candidates:

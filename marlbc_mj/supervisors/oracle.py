@@ -150,8 +150,13 @@ def search(
         progress: called with the episodes simulated so far and the best safe return (-inf before there is one).
 
     Raises:
-        ConfigurationError: a perturbed scenario, no schedule to start from, too small a budget, or no safe schedule found.
+        ConfigurationError: a perturbed scenario, drawn or moving obstacles, no schedule to start from, too small a budget, or no
+            safe schedule found.
     """
+    if scenario.layout is not None or scenario.moving:
+        raise ConfigurationError(
+            f"the oracle plans around obstacles at rest in known places; scenario {scenario.name!r} has others"
+        )
     if scenario.perturbation != Perturbation():
         raise ConfigurationError("the oracle's schedule is for one draw; search on a scenario without perturbation")
     if population < 2 or budget < population:

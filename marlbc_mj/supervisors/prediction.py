@@ -1,7 +1,8 @@
 """What candidate order sequences lead to: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
 
 Both predictions fill the same *trails* (C, H, N, 2): the position of every agent at the end of every predicted mission step, for
-each of C candidates. One cost judges them. Candidates are shared out over threads; results do not depend on how many.
+each of C candidates. One cost judges them. Candidates are shared out over threads; results do not depend on how many. Obstacles
+that move are predicted to keep the velocity they have.
 """
 
 import numba
@@ -13,16 +14,17 @@ from marlbc_mj.engine.loop import path_at, set_references
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.laws import allocation_free, compiled
+from marlbc_mj.motion import drift
 from marlbc_mj.supervisors.base import Situation
 
-SCRATCH = 9
+SCRATCH = 11
 """Rows of two that one candidate needs: desired path, what ``set_references`` asks for, and a normal."""
 
 
 @allocation_free
 def roll_out(  # type: ignore[no-untyped-def]
-    start, moving, first, mission_step, orders, behavior_laws, behavior_params, table, path, limits, obstacles, scratch, v_r,
-    before_v, trail,
+    start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits, obstacles, drifted,
+    grid, scratch, v_r, before_v, trail,
 ):  # fmt: skip
     """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
 
@@ -30,8 +32,8 @@ def roll_out(  # type: ignore[no-untyped-def]
         start: (N, 2) [m] at mission step ``first``; moving: (N, 2) its velocity [m/s], from which limited references go on.
         limits: speed [m/s] and acceleration [m/s^2] of references; before_v: (N, 2), scratch.
         orders: (H, N) int64, indices into ``table``.
-        path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3).
-        scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
+        path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3), or (K, 5) now; drifted: the same, scratch.
+        sees, grid: as ``set_references`` takes them; scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
         trail: (H, N, 2) [m], written in place.
     """
     now = scratch[:2]
@@ -42,9 +44,8 @@ def roll_out(  # type: ignore[no-untyped-def]
     for k in range(orders.shape[0]):
         path_at((first + k) * mission_step, path, now)
         keep(limits, v_r, before_v)
-        set_references(
-            behavior_laws, behavior_params, table, orders[k], before, now, obstacles, scratch[2:7], v_r
-        )  # fmt: skip
+        seen = _after(k * mission_step, obstacles, drifted)
+        set_references(behavior_laws, behavior_params, sees, table, orders[k], before, now, seen, grid, scratch[2:9], v_r)
         limit(limits, mission_step, before_v, v_r)
         for i in range(start.shape[0]):
             for axis in range(2):
@@ -53,37 +54,47 @@ def roll_out(  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def trail_cost(trail, first, mission_step, path, formations, obstacles, weights, scratch):  # type: ignore[no-untyped-def]
+def _after(t, obstacles, drifted):  # type: ignore[no-untyped-def]
+    """Obstacles after ``t`` [s]: themselves where they are at rest."""
+    if obstacles.shape[1] == 3:
+        return obstacles
+    drift(t, obstacles, drifted)
+    return drifted
+
+
+@allocation_free
+def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted, weights, scratch):  # type: ignore[no-untyped-def]
     """Sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
 
     Slots are those of the desired centroid. ``weights`` (5,): w_F, w_R, w_slack [1/m], d_min [m], scale [m];
     ``formations`` (2, N, 2) [m]; ``scratch`` (SCRATCH, 2).
     """
-    now, normal = scratch[:2], scratch[7]
+    now, normal = scratch[:2], scratch[9]
     cost = 0.0
     for k in range(trail.shape[0]):
         path_at((first + k + 1) * mission_step, path, now)
+        seen = _after((k + 1) * mission_step, obstacles, drifted)
         for i in range(trail.shape[1]):
             for which in range(2):
                 x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
                 y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
                 cost += weights[which] * min(1.0, np.sqrt(x * x + y * y) / weights[4])
-            cost += weights[2] * max(0.0, weights[3] - nearest_obstacle(trail[k, i], obstacles, normal))
+            cost += weights[2] * max(0.0, weights[3] - nearest_obstacle(trail[k, i], seen, normal))
     return cost
 
 
 @allocation_free
 def judge_candidate(  # type: ignore[no-untyped-def]
-    c, kinematic, start, moving, first, mission_step, orders, behavior_laws, behavior_params, table, path, limits, formations,
-    obstacles, weights, scratch, v_r, before_v, trails, costs,
+    c, kinematic, start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits,
+    formations, obstacles, drifted, grid, weights, scratch, v_r, before_v, trails, costs,
 ):  # fmt: skip
     """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
     if kinematic:
         roll_out(
-            start, moving, first, mission_step, orders[c], behavior_laws, behavior_params, table, path, limits, obstacles,
-            scratch[c], v_r[c], before_v[c], trails[c],
+            start, moving, first, mission_step, orders[c], behavior_laws, behavior_params, sees, table, path, limits, obstacles,
+            drifted[c], grid[c], scratch[c], v_r[c], before_v[c], trails[c],
         )  # fmt: skip
-    costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, weights, scratch[c])
+    costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, drifted[c], weights, scratch[c])
 
 
 @compiled
@@ -116,8 +127,9 @@ def judge(
     costs = np.empty(candidates)
     arguments = (
         kinematic, np.ascontiguousarray(start), np.ascontiguousarray(np.zeros_like(start) if moving is None else moving), first,
-        scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params, scenario.orders.table, plan.path, plan.limits,
-        scenario.formations, obstacles, weights, np.zeros((candidates, SCRATCH, 2)),
+        scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params, plan.sees, scenario.orders.table, plan.path,
+        plan.limits, scenario.formations, np.ascontiguousarray(obstacles), np.zeros((candidates, *obstacles.shape)),
+        np.zeros((candidates, plan.grid_room)), weights, np.zeros((candidates, SCRATCH, 2)),
         *np.zeros((2, candidates, scenario.agents, 2)), trails, costs,
     )  # fmt: skip
     if threads == 1 or candidates == 1:
@@ -132,6 +144,11 @@ def follow(twin: World, situation: Situation) -> None:
     """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
     state = twin.state
     state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
+    if state.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
+        place, velocity = situation.obstacles[:, :3], situation.obstacles[:, 3:]
+        state.motions[0, :, :2], state.motions[0, :, 2:] = velocity, 0.0
+        state.anchors[0] = place
+        state.anchors[0, :, :2] -= velocity * situation.time
     state.put(0, twin.data[0], situation.position, situation.velocity)
 
 

@@ -1,0 +1,175 @@
+"""What all families of missions share: a team, its formation and its way. A frozen dataclass that builds a scenario.
+
+A team in formation at rest at the origin travels ``length`` along +x at ``speed``, and reforms into a column (FR) where its
+supervisor says so. Every length, speed, gain and limit is a field, so a family fits robots of any size; what cannot be flown is
+refused with the reason when the scenario is built.
+"""
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from marlbc_mj.behaviors import Behavior
+from marlbc_mj.disturbances import Disturbance, PaperDrag
+from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
+from marlbc_mj.scenarios.base import Obstacle, Perturbation, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.formations import column, make_formation
+from marlbc_mj.scenarios.layout import Layout, motions_of
+from marlbc_mj.scenarios.obstacles import Range
+
+NOMINAL = 0
+"""Number of the layout that a scenario shows before a seed is drawn: a training one."""
+SHARED = (
+    "name", "safe_distance", "formation_tolerance", "mission_step", "substep", "reference", "robot", "mass", "force_limit",
+    "unit_force", "speed_limit", "acceleration_limit", "imperfections", "disturbance", "perturbation", "split",
+)  # fmt: skip
+"""Fields that mean the same in a scenario."""
+UNPERTURBED = Perturbation()
+
+
+@dataclass(frozen=True)
+class Family:
+    """What all families share; alone, it is a mission with nothing in the way.
+
+    Raises:
+        ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
+    """
+
+    name: str = "open"
+    agents: int = 4  # 2 to 256
+    formation: str = "wedge"  # line, wedge, circle or grid
+    spacing: float = 6.0  # between neighbors in formation [m]
+    files: int = 1  # columns side by side that FR forms
+    column_spacing: float = 3.0  # between neighbors in the column [m]
+    length: float = 60.0  # of the way [m]
+    speed: float = 1.0  # [m/s]
+    safe_distance: float = 1.0  # to obstacles: d_OA [m]
+    agent_avoidance: bool = True  # whether AA is among the behaviors
+    agent_distance: float = 1.5  # between agents: d_AA [m]
+    avoidance_gain: float = 20.0  # of OA and AA [1/s]
+    formation_gain: float = 4.0  # of FM and FR [1/s]; half of the case study's, whose references jump at 96 m/s
+    formation_tolerance: float = 0.5  # [m]
+    mission_step: float = 0.05  # [s]
+    substep: float = 0.005  # [s]
+    reference: Literal["virtual", "actual"] = "virtual"
+    robot: str = "point_mass"
+    mass: float = 1.0  # [kg]
+    force_limit: float = 200.0  # per axis [N]
+    unit_force: float = 1.0  # what a controller's output of 1 is [N]: a robot's mass
+    speed_limit: float = np.inf  # of references [m/s]
+    acceleration_limit: float = np.inf  # of references [m/s^2]
+    imperfections: Imperfections = NO_IMPERFECTIONS
+    disturbance: Disturbance = field(default_factory=PaperDrag)
+    perturbation: Perturbation = UNPERTURBED
+    two_sided: bool = False  # OA as the printed equality (erratum 6)
+    split: Literal["train", "test"] = "train"  # whose layouts are drawn; the held-out ones are "test"
+    summary: ClassVar[str] = "nothing in the way"
+    cluttered: ClassVar[bool] = False  # whether the way must have room for obstacles
+
+    @cached_property
+    def slots(self) -> np.ndarray:
+        """(N, 2) of the formation [m]."""
+        return make_formation(self.formation, self.agents, self.spacing)
+
+    @cached_property
+    def column(self) -> np.ndarray:
+        """(N, 2) of the column [m]."""
+        return column(self.slots, self.column_spacing, self.files)
+
+    @property
+    def way(self) -> Range:
+        """Where along x surfaces of obstacles may be, so that the formation is clear of them at both ends [m]."""
+        margin = self.safe_distance + self.formation_tolerance
+        return float(self.slots[:, 0].max() + margin), float(self.length + self.slots[:, 0].min() - margin)
+
+    @property
+    def reach(self) -> float:
+        """Half the width of the formation [m]."""
+        return float(np.abs(self.slots[:, 1]).max())
+
+    def layout(self) -> Layout | None:
+        """What draws the obstacles; None where there are none."""
+        return None
+
+    def schedule(self) -> tuple[Window, ...]:
+        """For the scripted supervisor, where the family's geometry is the same for every seed."""
+        return (Window(0.0, 0.0, -1, "FM"),)
+
+    def starts(self) -> np.ndarray:
+        """(N, 2) [m]."""
+        return self.slots
+
+    def build(self, **changes: Any) -> Scenario:
+        """The scenario; ``changes`` replace fields of the family, or of the scenario where the family has none of that name."""
+        own = {f.name for f in fields(self)}
+        family = replace(self, **{key: value for key, value in changes.items() if key in own})
+        rest = {key: value for key, value in changes.items() if key not in own}
+        unfit = set(rest) - {f.name for f in fields(Scenario)}
+        if unfit:
+            raise ConfigurationError(
+                f"scenario {self.name!r} has no setting {sorted(unfit)[0]!r}; it has: {', '.join(sorted(own))}"
+            )
+        family.check()
+        return family._scenario(rest)
+
+    def check(self) -> None:
+        """Raise ConfigurationError for what cannot be flown."""
+        slots = self.slots  # refuses an unknown formation and a team that is too small or too large
+        for key in ("length", "speed", "column_spacing", "agent_distance"):
+            value = getattr(self, key)
+            if not (np.isfinite(value) and value > 0):
+                raise self.infeasible(f"{key} must be positive and finite, got {value}")
+        if not 1 <= self.files <= self.agents:
+            raise self.infeasible(f"files must be from 1 to {self.agents}, got {self.files}")
+        for key in ("spacing", "column_spacing") if self.agent_avoidance else ():
+            if getattr(self, key) < 1.1 * self.agent_distance:
+                least = f"1.1 times the agent_distance of {self.agent_distance:g} m"
+                value = getattr(self, key)
+                raise self.infeasible(f"{key} must be at least {least}, or AA would break it up; got {value:g} m")
+        if self.cluttered and not self.way[0] < self.way[1]:
+            extent = float(np.ptp(slots[:, 0]))
+            raise self.infeasible(f"a formation {extent:g} m long leaves nothing of a way of {self.length:g} m; make it longer")
+
+    def behaviors(self) -> tuple[Behavior, ...]:
+        """OA, FM and FR, and AA where agents avoid each other."""
+        return standard_behaviors(
+            points(self.slots),
+            points(self.column),
+            avoidance_gain=self.avoidance_gain,
+            formation_gain=self.formation_gain,
+            safe_distance=self.safe_distance,
+            two_sided=self.two_sided,
+            agent_distance=self.agent_distance if self.agent_avoidance else None,
+        )
+
+    def infeasible(self, reason: str) -> ConfigurationError:
+        """The error that rejects this family's parameters."""
+        return ConfigurationError(f"scenario {self.name!r} cannot be flown: {reason}")
+
+    def _scenario(self, rest: dict[str, Any]) -> Scenario:
+        layout = self.layout()
+        try:
+            sample = None if layout is None else layout.sample(np.random.default_rng(NOMINAL))
+        except ConfigurationError as error:
+            raise self.infeasible(str(error)) from error
+        made: dict[str, Any] = {
+            **{key: getattr(self, key) for key in SHARED},
+            "starts": points(self.starts()),
+            "behaviors": self.behaviors(),
+            "path_velocity": (self.speed, 0.0),
+            "obstacles": () if sample is None else tuple(Obstacle(*row) for row in sample.obstacles.tolist()),
+            "motions": () if sample is None else motions_of(sample.motions),
+            "layout": layout,
+            "duration": self.mission_step * round(self.length / self.speed / self.mission_step),
+            "schedule": self.schedule(),
+            "description": f"{self.agents} agents in a {self.formation}: {self.summary}",
+        }
+        return Scenario(**{**made, **rest})
+
+
+def points(rows: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """(n, 2) as a tuple of points."""
+    return tuple((float(x), float(y)) for x, y in rows)
