@@ -4,7 +4,6 @@ import re
 import runpy
 import shlex
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,8 +66,6 @@ def own_names():
 @pytest.mark.parametrize("page", HOW_TO, ids=lambda page: page.stem)
 def test_a_how_to_runs(page, tmp_path, monkeypatch):
     """Everything on the page, in an empty folder."""
-    if page.stem == "scenario" and find_spec("marlbc_mj.scenarios.families") is None:
-        pytest.skip("scenario families are not in this tree yet")
     monkeypatch.chdir(tmp_path)
     run_page(page, tmp_path)
 
