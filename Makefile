@@ -1,9 +1,9 @@
-# make test | benchmark | lint | wheel | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
+# make test | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test lint wheel clean
+.PHONY: help venv benchmark test lint wheel docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -25,6 +25,8 @@ help:
 	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
 	@echo 'make lint        ruff and mypy'
 	@echo 'make wheel       sdist and wheel, into dist'
+	@echo 'make docs        the documentation, into out/docs'
+	@echo 'make gallery     draw the pictures in docs/gallery anew'
 	@echo 'make clean       remove .venv, builds and caches; results in out and runs stay'
 
 benchmark: venv
@@ -44,6 +46,16 @@ wheel: venv
 	@rm -rf build dist
 	@$(BIN)/python -m build --no-isolation --outdir dist . >/dev/null
 	@ls dist/*
+
+# The tool is installed here and not with the rest: only this target needs it.
+docs: venv
+	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings_handlers.python' 2>/dev/null || \
+		$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir out/docs
+	@echo out/docs/index.html
+
+gallery: venv
+	@MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/make_gallery.py
 
 clean:
 	@rm -rf .venv .cache build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -1,0 +1,38 @@
+"""Where the reference finds what a field is: the comment behind it in the source, which also has its unit."""
+
+import io
+import re
+import tokenize
+from typing import Any
+
+from griffe import Attribute, Docstring, Extension, Object
+
+NOT_TEXT = re.compile(r"(type: ignore|noqa)")
+ROLE = re.compile(r":(?:class|func|meth|data|mod):`~?(?:[\w.]+\.)?(\w+)`")
+
+
+def comment_behind(lines: list[str]) -> str:
+    """The comment at the end of a definition's last line; empty where there is none."""
+    try:
+        found = [token.string for token in tokenize.generate_tokens(io.StringIO("\n".join(lines)).readline)
+                 if token.type == tokenize.COMMENT]  # fmt: skip
+    except (tokenize.TokenError, IndentationError):
+        return ""
+    text = found[-1].lstrip("# ").strip() if found else ""
+    return "" if NOT_TEXT.match(text) else text
+
+
+class FieldComments(Extension):
+    """Comments become the docstrings of fields without one; Sphinx roles in docstrings become plain code."""
+
+    def on_attribute_instance(self, *, attr: Attribute, **_: Any) -> None:
+        """A field: its comment, unless it has a docstring."""
+        if attr.docstring is None and attr.lineno is not None and attr.endlineno is not None:
+            text = comment_behind([line.strip() for line in attr.lines])
+            if text:
+                attr.docstring = Docstring(text, parent=attr)
+
+    def on_instance(self, *, obj: Object, **_: Any) -> None:
+        """Whatever has a docstring."""
+        if obj.docstring is not None:
+            obj.docstring.value = ROLE.sub(r"`\1`", obj.docstring.value)

@@ -1,0 +1,117 @@
+"""What the documentation shows runs as shown: each how-to in a folder of its own, files, Python and commands in reading order."""
+
+import re
+import runpy
+import shlex
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from marlbc_mj.cli import main
+from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.supervisors import SUPERVISORS
+
+DOCS = Path(__file__).parent.parent / "docs"
+HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
+FENCE = re.compile(r'^```(\w+)(?: title="([\w./-]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
+MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp))""")
+MOST_LINES = 60
+MOST_BYTES, MOST_BYTES_TOGETHER = 150_000, 1_500_000
+
+pytestmark = pytest.mark.skipif(not DOCS.exists(), reason="needs the repository's files")
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    language: str
+    title: str  # the file that it is; empty for what is run
+    text: str
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(*found) for found in FENCE.findall(page.read_text())]
+
+
+def run_page(page: Path, folder: Path) -> None:
+    """Write the files of a page, then run its Python as one module and its commands, both in reading order."""
+    scripts, commands = [], []
+    for block in blocks(page):
+        if block.title:
+            (folder / block.title).write_text(block.text)
+        elif block.language == "python":
+            scripts.append(block.text)
+        elif block.language == "sh":
+            commands += [shlex.split(line) for line in block.text.splitlines()]
+    (folder / "how_to.py").write_text("\n".join(scripts))
+    runpy.run_path(str(folder / "how_to.py"), run_name="how_to")
+    for command in commands:
+        assert command[0] == "marlbc", command
+        main(command[1:])
+
+
+@pytest.fixture
+def own_names():
+    """Controllers and supervisors that a page registers are forgotten again."""
+    before = [(registry, dict(registry)) for registry in (CONTROLLERS, SUPERVISORS)]
+    yield
+    for registry, entries in before:
+        registry.clear()
+        registry.update(entries)
+
+
+@pytest.mark.usefixtures("own_names")
+@pytest.mark.parametrize("page", HOW_TO, ids=lambda page: page.stem)
+def test_a_how_to_runs(page, tmp_path, monkeypatch):
+    """Everything on the page, in an empty folder."""
+    monkeypatch.chdir(tmp_path)
+    run_page(page, tmp_path)
+
+
+def test_there_are_four_how_tos():
+    assert [page.stem for page in HOW_TO] == ["controller", "robot", "scenario", "supervisor"]
+
+
+def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():
+    """The how-to's two files are all of it."""
+    files = {block.title: block.text for block in blocks(DOCS / "how-to" / "robot.md") if block.title}
+    assert sorted(Path(name).suffix for name in files) == [".py", ".xml"]
+    (script,) = (text for name, text in files.items() if name.endswith(".py"))
+    assert len(script.splitlines()) < MOST_LINES
+
+
+def test_pictures_are_there_and_small():
+    """Every picture and clip that a page shows is in the repository, every one there is shown, and all together are small."""
+    pages = [page for page in DOCS.rglob("*.md") if "out" not in page.parts]
+    shown = {(page.parent / path).resolve() for page in pages for path in re.findall(MEDIA, page.read_text())}
+    kept = {path.resolve() for path in (DOCS / "gallery").iterdir()} | {(DOCS / "mission.png").resolve()}
+    assert shown == kept
+    sizes = [path.stat().st_size for path in kept]
+    assert max(sizes) < MOST_BYTES and sum(sizes) < MOST_BYTES_TOGETHER
+
+
+def test_pages_load_nothing_from_elsewhere():
+    """No script, style, font or picture from another host; links are links."""
+    for page in DOCS.rglob("*.md"):
+        assert not re.search(r"""<(?:script|link|iframe)|src=["']?(?:https?:)?//|!\[[^]]*\]\(http""", page.read_text()), page
+    assert "font: false" in (DOCS.parent / "mkdocs.yml").read_text()
+
+
+def test_every_page_is_in_the_navigation():
+    """And everything in the navigation is a page."""
+    listed = set(re.findall(r"^\s+- [^:]+: (\S+\.md)$", (DOCS.parent / "mkdocs.yml").read_text(), re.MULTILINE))
+    assert listed == {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
+
+
+def test_names_in_the_reference_exist():
+    """Each ``::: name`` of the reference pages can be imported."""
+    names = [name for page in (DOCS / "api").glob("*.md") for name in re.findall(r"^::: (\S+)", page.read_text(), re.MULTILINE)]
+    assert len(names) == len(set(names)) > 60
+    assert [name for name in names if not _found(name)] == []
+
+
+def _found(name: str) -> bool:
+    module, _, attribute = name.rpartition(".")
+    return hasattr(import_module(module), attribute)
