@@ -11,11 +11,15 @@ from marlbc_mj.controllers import Controller
 from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.motion import obstacles_at
 from marlbc_mj.orders import SEPARATOR
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.tasks.states import OLD, make_state
 
 ACTIONS = ("commands", "orders", "avoidance")
+TRIES = 20
+"""Places along the route that are tried for an exploring start."""
 
 
 def order_of(scenario: Scenario, actions: str) -> np.ndarray:
@@ -45,9 +49,10 @@ def order_of(scenario: Scenario, actions: str) -> np.ndarray:
 class Starts:
     """Where episodes begin: this share of them anywhere along the route, in formation or in column, at rest in the slots.
 
-    An exploring start lasts ``length`` and then ends without being terminal. A formation whose slots come within the safe
-    distance of an obstacle starts as a column. Where a slot becomes blocked or free is where orders have to change: decisions are
-    rare elsewhere, so that a uniform start spends most of its time where there is nothing to learn.
+    An exploring start lasts ``length`` and then ends without being terminal. Where slots of the first formation come within the
+    safe distance of an obstacle, it starts as a column; where those of the column do, too, somewhere else. Where a slot becomes
+    blocked or free is where orders have to change: decisions are rare elsewhere, so that a uniform start spends most of its
+    time where there is nothing to learn.
     """
 
     exploring: float = 0.0  # share of episodes in [0, 1]
@@ -266,19 +271,30 @@ class FormationBatch:
             self.last[b] = self.action_of[self.world.state.command[b]]
 
     def _explore(self, b: int, rng: np.random.Generator) -> None:
-        scenario, state = self.scenario, self.world.state
-        step = self._start(rng) * self.interval
-        which = int(rng.integers(2))
-        centre = self._centre(step)
-        positions = centre + scenario.formations[which]
-        if which == 0 and self._blocked(positions, state.obstacles[b]).any():
-            which = 1
-            positions = centre + scenario.formations[1]
+        """Begin world ``b`` along the route, where one of the formations is clear of obstacles; as it is if none is found."""
+        scenario = self.scenario
+        for _ in range(TRIES):
+            step = self._start(rng) * self.interval
+            for which in ((0, 1), (1,))[int(rng.integers(2))]:
+                positions = self._centre(step) + scenario.formations[which]
+                if not self._blocked(positions, self._obstacles(b, step)).any():
+                    self._begin(b, step, which, positions, rng)
+                    return
+
+    def _begin(self, b: int, step: int, which: int, positions: np.ndarray, rng: np.random.Generator) -> None:
+        """Put world ``b`` at a mission step, its team in one of the formations."""
+        scenario = self.scenario
         commands = rng.choice(self.keeping[which], size=scenario.agents)
         if happens(self.starts.turning, rng):
             self.turn[b] = self.action_of[self.keeping[int(rng.integers(2))][0]]
         self.world.place(b, step, positions, np.tile(scenario.path_velocity, (scenario.agents, 1)), commands)
         self.cut[b] = step + round(self.starts.length / scenario.mission_step)
+
+    def _obstacles(self, b: int, step: int) -> np.ndarray:
+        """(K, 3 or more) x, y, radius [m] of world ``b``'s obstacles at a mission step."""
+        state = self.world.state
+        anchors = state.anchors[b] if self.scenario.moving else state.obstacles[b]
+        return obstacles_at(step * self.scenario.mission_step, anchors, state.motions[b])
 
     def _start(self, rng: np.random.Generator) -> int:
         """The decision with which an exploring start begins."""
@@ -292,7 +308,9 @@ class FormationBatch:
         """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
         decisions = np.arange(self.decisions) * self.interval
         slots = [self._centre(int(step)) + self.scenario.formations[0] for step in decisions]
-        blocked = np.array([self._blocked(positions, self.scenario.obstacle_array()) for positions in slots])
+        anchors, motions = self.scenario.obstacle_array(), motion_array(self.scenario.motions)
+        places = [obstacles_at(step * self.scenario.mission_step, anchors, motions) for step in decisions]
+        blocked = np.array([self._blocked(*pair) for pair in zip(slots, places, strict=True)])
         return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
 
     def _centre(self, step: int) -> np.ndarray:

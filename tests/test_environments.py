@@ -11,7 +11,7 @@ from pettingzoo.test import parallel_api_test
 from marlbc_mj import World, paper
 from marlbc_mj.behaviors import clearances
 from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.scenarios import Perturbation
+from marlbc_mj.scenarios import Perturbation, make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Starts
 from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
@@ -303,6 +303,15 @@ def test_a_turning_start_is_to_begin_with_one_formation_or_the_other():
         for _ in range(2):
             outcome = batch.step(batch.last)
         assert outcome.truncated.sum() > 50
+
+
+def test_exploring_starts_are_clear_of_obstacles_that_move():
+    batch = FormationBatch(make_scenario("traffic"), worlds=40, interval=10, starts=Starts(exploring=1.0, focus=0.5))
+    batch.reset(0)
+    state = batch.world.state
+    assert (state.steps > 0).sum() > 30
+    gaps = [clearances(state.position[b], state.obstacles[b]).min() for b in range(40)]
+    assert min(gaps) > batch.scenario.safe_distance
 
 
 @given(
