@@ -1,4 +1,4 @@
-"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the team or a part of it."""
+"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the team."""
 
 import numpy as np
 
@@ -15,7 +15,8 @@ class Exploration:
     Every agent has random orders of its own, and the team has joint ones, which go before: while an agent takes part in a joint
     exploration its own stands still. Each of these is busy for a share of the decisions, see :meth:`_hold`, independently of
     the others, so that an agent's actions are random in exactly the share T^zeta of all decisions, the first of an episode as
-    well as the last, for any ``hold`` and ``together``.
+    well as the last, for any ``hold`` and ``together``. Beyond that share come :meth:`begin` and agreement; short of it falls
+    an agent to which the joint order is not allowed.
 
     Args:
         config: hold, together and least_exploration of it are used.
