@@ -9,7 +9,6 @@ from time import perf_counter
 from typing import Any
 
 import numpy as np
-import torch
 
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
@@ -96,7 +95,6 @@ def spread(batch: FormationBatch, rng: np.random.Generator) -> None:
 
 def warm_up(trainer: BaseTrainer) -> None:
     """Advance until there have been updates."""
-    torch.set_num_threads(trainer.config.threads)
     while not trainer.updates:
         trainer.advance()
 
@@ -107,7 +105,6 @@ def _play(batch: FormationBatch, rng: np.random.Generator) -> None:
 
 
 def _learn(trainer: BaseTrainer, decisions: int) -> None:
-    torch.set_num_threads(trainer.config.threads)
     for _ in range(decisions):
         trainer.advance()
 

@@ -60,6 +60,19 @@ def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     assert equal(*(trainer.snapshot()[0] for trainer in (one, other)))
 
 
+def test_what_is_learned_does_not_depend_on_the_threads():
+    """With two, the networks learn while the worlds move: the same numbers to the bit, and what fails there stops the run."""
+    one, two = (Trainer(small(threads=threads)) for threads in (1, 2))
+    for _ in range(90):  # past the warm-up
+        assert (one.advance().state == two.advance().state).all()
+    assert one.error == two.error != 0.0
+    assert one.updates == two.updates > 0
+    assert equal(*(trainer.snapshot()[0] for trainer in (one, two)))
+    two.learner.network.biases[0].data[:] = np.nan
+    with pytest.raises(ConfigurationError, match="diverged after"):
+        two.advance()
+
+
 def test_seeds_differ_and_repeat():
     def rewards(seed):
         trainer = Trainer(small(seed=seed))

@@ -25,7 +25,7 @@ class BaseTrainer(ABC):
     def __init__(self, config: TrainConfig) -> None:
         if config.device == "cuda" and not torch.cuda.is_available():
             raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
-        torch.set_num_threads(config.threads)
+        torch.set_num_threads(1)  # the networks are small: a second thread gains nothing, and results would depend on it
         self.config = config
         self.scenario = make_scenario(config.scenario)
         self.batch = FormationBatch(

@@ -74,7 +74,7 @@ class Learner:
 
     def make_optimiser(self) -> torch.optim.Optimizer:
         """Of ``parameters``."""
-        return torch.optim.Adam(self.parameters, lr=self.config.learning_rate, eps=1e-5)
+        return torch.optim.Adam(self.parameters, lr=self.config.learning_rate, eps=1e-5, fused=True)
 
     @torch.no_grad()
     def values(self, state: np.ndarray) -> np.ndarray:
@@ -119,8 +119,7 @@ class Learner:
     @torch.no_grad()
     def _smooth(self) -> None:
         share = max(1.0 - self.config.smoothing, 1.0 / self.updates)
-        for mean, p in zip(self.smooth.parameters(), self.network.parameters(), strict=True):
-            mean.lerp_(p, share)
+        torch._foreach_lerp_(list(self.smooth.parameters()), list(self.network.parameters()), share)
 
     def _masked(self, values: Tensor, risks: Tensor) -> tuple[Tensor, Tensor]:
         """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M)."""
@@ -171,8 +170,7 @@ class Learner:
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         """Go back to a :meth:`snapshot`."""
         restore(arrays, self.parameters, self.optimiser)
-        for k, tensor in enumerate(self.targets.tensors):
-            tensor.copy_(torch.from_numpy(arrays[f"target{k}"]))
+        self.targets.restore([torch.from_numpy(arrays[f"target{k}"]) for k in range(len(self.targets.tensors))])
         for k, p in enumerate(self.smooth.parameters()):
             p.copy_(torch.from_numpy(arrays[f"smooth{k}"]))
 

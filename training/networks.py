@@ -79,17 +79,25 @@ class TeamNetwork(nn.Module):
         return value + advantage - advantage.mean(dim=-1, keepdim=True), risk
 
 
-def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor) -> Tensor:
-    """(N, B, O) outputs from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in)."""
-    networks, inputs, width = weights[0].shape
+def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """Weights (N, in, out) and biases (N, 1, out) of N layers with the same input as one layer's, (in, N out) and (N out,)."""
+    networks, inputs, width = weight.shape
+    return weight.permute(1, 0, 2).reshape(inputs, networks * width), bias.reshape(-1)
+
+
+def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[Tensor, Tensor] | None = None) -> Tensor:
+    """(N, B, O) outputs from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in).
+
+    ``first`` is the first layer :func:`side_by_side`, where it is at hand; it saves time with inputs (B, in) and changes nothing.
+    """
     if x.ndim == 3:
-        y = torch.baddbmm(biases[0], x, weights[0])
+        y = torch.baddbmm(biases[0], x, weights[0]).relu_()
     else:
-        first = x @ weights[0].permute(1, 0, 2).reshape(inputs, networks * width)
-        y = first.view(len(x), networks, width).transpose(0, 1) + biases[0]
-    for weight, bias in zip(weights[1:], biases[1:], strict=True):
-        y = torch.baddbmm(bias, torch.relu(y), weight)
-    return y
+        weight, bias = first or side_by_side(weights[0], biases[0])
+        y = torch.addmm(bias, x, weight).relu_().view(len(x), len(weights[0]), -1).transpose(0, 1)
+    for weight, bias in zip(weights[1:-1], biases[1:-1], strict=True):
+        y = torch.baddbmm(bias, y, weight).relu_()
+    return torch.baddbmm(biases[-1], y, weights[-1])
 
 
 class TargetRing:
@@ -101,6 +109,7 @@ class TargetRing:
         self.agents = network.weights[0].shape[0]
         self.tensors = [p.detach().repeat(copies, 1, 1) for p in self._parameters()]  # (copies N, ., .)
         self.next = 0
+        self.first: tuple[Tensor, Tensor] | None = None  # the copies' first layers side by side, until they change
 
     def _parameters(self) -> Iterator[Tensor]:
         yield from self.network.weights
@@ -112,6 +121,13 @@ class TargetRing:
         for copy, parameter in zip(self.tensors, self._parameters(), strict=True):
             copy[rows] = parameter.detach()
         self.next = (self.next + 1) % self.copies
+        self.first = None
+
+    def restore(self, tensors: Sequence[Tensor]) -> None:
+        """Take over the ``tensors`` of another ring."""
+        for copy, tensor in zip(self.tensors, tensors, strict=True):
+            copy.copy_(tensor)
+        self.first = None
 
     def __call__(self, state: Tensor) -> Tensor:
         """(N, B, A) averaged action values of states (B, S), or of (N, B, S) where every agent has its own."""
@@ -123,7 +139,10 @@ class TargetRing:
         layers = len(self.network.weights)
         if state.ndim == 3:
             state = state.repeat(self.copies, 1, 1)
-        outputs = apply(self.tensors[:layers], self.tensors[layers:], state / self.network.scale)
+        weights, biases = self.tensors[:layers], self.tensors[layers:]
+        if self.first is None:
+            self.first = side_by_side(weights[0], biases[0])
+        outputs = apply(weights, biases, state / self.network.scale, self.first)
         values, risks = self.network.split(outputs.view(self.copies, self.agents, *outputs.shape[1:]))
         return values.mean(dim=0), torch.sigmoid(risks).mean(dim=0)
 

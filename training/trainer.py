@@ -1,9 +1,13 @@
 """A training run of a learner with a replay buffer: worlds, learner, replay and temperatures in one loop."""
 
 import math
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
+import torch
 
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.base import BaseTrainer, lost, prefixed, shaped_reward, unprefixed
@@ -26,7 +30,10 @@ LATE_TEMPERATURE = 0.05
 
 
 class Trainer(BaseTrainer):
-    """One run of a method with a replay buffer. :meth:`advance` makes a decision in every world and the updates that follow it.
+    """One run of a method with a replay buffer. :meth:`advance` makes a decision in every world and updates the networks.
+
+    The updates draw from what was stored before the decision, so that the networks can learn while the worlds move. With one
+    thread one follows the other, to the same numbers.
 
     Raises:
         ConfigurationError: a method, scenario, controller or device that cannot be used.
@@ -44,6 +51,7 @@ class Trainer(BaseTrainer):
         self.exploration = Exploration(config, agents, actions)
         self.exploration.begin(self.batch.turn, self.rng)
         self.first = np.zeros(config.worlds, dtype=np.int64)  # row at which each world's episode began
+        self.aside = ThreadPoolExecutor(1, "updates", torch.set_num_threads, (1,)) if config.threads > 1 else None
 
     @property
     def updates(self) -> int:
@@ -61,7 +69,7 @@ class Trainer(BaseTrainer):
         return self.learner.smooth
 
     def advance(self) -> Outcome:
-        """One decision in every world, then ``updates`` gradient steps."""
+        """One decision in every world, and ``updates`` gradient steps."""
         config, replay = self.config, self.replay
         share = self.steps / config.budget
         self.temperatures.nu = max(math.exp(math.log(LATE_TEMPERATURE) * share / config.cool_by), 1e-6)
@@ -75,7 +83,8 @@ class Trainer(BaseTrainer):
         actions = self.exploration(best, warmth.mean(axis=-1), self.rng, last=self.batch.last, allowed=allowed)
         self.explored = float((actions != best).mean())
         lenient = leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0])
-        outcome = self.batch.step(actions)
+        with self._learning(share):
+            outcome = self.batch.step(actions)
         reward, over, gone = self.judge(outcome)
         replay.store(
             state=self.state,
@@ -91,8 +100,6 @@ class Trainer(BaseTrainer):
         self._end_episodes(outcome.ended)
         self.state = outcome.state
         self.steps += config.worlds * config.interval
-        if replay.count * config.worlds >= WARM_UP and replay.count > config.n_step:
-            self._learn(share)
         return outcome
 
     def _seen_enough(self) -> bool:
@@ -118,6 +125,25 @@ class Trainer(BaseTrainer):
         self.exploration.forget(ended)
         if self.steps < self.config.turn_until * self.config.budget:
             self.exploration.begin(np.where(ended, self.batch.turn, -1), self.rng)
+
+    @contextmanager
+    def _learning(self, share: float) -> Iterator[None]:
+        """Learn while the block runs, or before it, if there is enough to learn from."""
+        replay, config = self.replay, self.config
+        if replay.count * config.worlds < WARM_UP or replay.count <= config.n_step:
+            yield
+        elif self.aside is None:
+            self._learn(share)
+            yield
+        else:
+            learnt = self.aside.submit(self._learn, share)
+            try:
+                yield
+            finally:
+                self._await(learnt)
+
+    def _await(self, learnt: Future[None]) -> None:
+        learnt.result()
 
     def _learn(self, share: float) -> None:
         config = self.config
