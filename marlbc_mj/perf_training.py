@@ -5,6 +5,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from statistics import median
+from threading import get_ident
 from time import perf_counter
 from typing import Any
 
@@ -66,9 +67,11 @@ def measure_training(
         f"{what}_mission_steps_per_s": {str(n): 1.0 / median(each[what, n]) for n in threads}
         for what in ("environment", "training")
     }
-    profiles = {str(n): profile(trainers[n], PROFILED) for n in threads}
+    profiles, aside = {}, {}
+    for n in threads:
+        profiles[str(n)], aside[str(n)] = profile(trainers[n], PROFILED)
     ratios = {f"training_over_environment_{n}": ratio(each["environment", n], each["training", n]) for n in threads}
-    return {**figures, "training_profile": profiles, "decision_us": decision}, ratios
+    return {**figures, "training_profile": profiles, "training_profile_aside": aside, "decision_us": decision}, ratios
 
 
 def _environment(config: TrainConfig) -> FormationBatch:
@@ -110,9 +113,14 @@ def _learn(trainer: BaseTrainer, decisions: int) -> None:
 
 
 class Clock:
-    """Seconds by part of a program. Parts may call each other: only the innermost one's time runs."""
+    """Seconds by part of a program. Parts may call each other: only the innermost one's time runs.
+
+    ``seconds`` are those of the thread that made the clock; ``aside``, of one other thread, whose parts must not call each other.
+    """
 
     def __init__(self) -> None:
+        self.thread = get_ident()
+        self.aside: dict[str, float] = {}
         self.seconds: dict[str, float] = {REST: 0.0}
         self.part = REST
         self.since = perf_counter()
@@ -137,6 +145,12 @@ class Clock:
 
     def _timed(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
         def run(*arguments: Any, **keywords: Any) -> Any:
+            if get_ident() != self.thread:
+                began = perf_counter()
+                try:
+                    return method(*arguments, **keywords)
+                finally:
+                    self.aside[part] = self.aside.get(part, 0.0) + perf_counter() - began
             before = self.turn_to(part)
             try:
                 return method(*arguments, **keywords)
@@ -146,11 +160,13 @@ class Clock:
         return run
 
 
-def profile(trainer: Any, decisions: int) -> dict[str, float]:
-    """Shares of the wall time of training with a replay buffer.
+def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Shares of the wall time of training with a replay buffer: of the thread that simulates, and of the one that learns
+    meanwhile, if there is one.
 
     Simulation is the worlds' steps and resets; state the state vectors; exploration the hash codes, temperatures and random
-    orders; replay what is stored and drawn; the rest the greedy choice, rewards and leniency.
+    orders; replay what is stored and drawn; waiting is for updates that take longer than the worlds; the rest the greedy choice,
+    rewards and leniency.
     """
     parts = (
         (trainer.batch.world, ("advance", "reset", "place"), "simulation"),
@@ -161,6 +177,7 @@ def profile(trainer: Any, decisions: int) -> dict[str, float]:
         (trainer.hash, ("__call__",), "exploration"),
         (trainer.temperatures, ("read", "cool"), "exploration"),
         (trainer.replay, ("store", "sample", "learnt"), "replay"),
+        (trainer, ("_await",), "waiting"),
     )
     clock = Clock()
     with ExitStack() as stack:
@@ -170,7 +187,9 @@ def profile(trainer: Any, decisions: int) -> dict[str, float]:
         _learn(trainer, decisions)
         clock.turn_to(REST)
     total = sum(clock.seconds.values())
-    return {part: seconds / total for part, seconds in clock.seconds.items()}
+    return tuple(  # type: ignore[return-value]  # mypy sees a tuple of any length
+        {part: seconds / total for part, seconds in taken.items() if seconds > 0} for taken in (clock.seconds, clock.aside)
+    )
 
 
 def _measure_decisions(trainer: BaseTrainer, episodes: int) -> dict[str, dict[str, float]]:
@@ -206,9 +225,10 @@ def training_lines(figures: dict[str, Any]) -> list[str]:
         for what, key in ((f"FormationBatch, B = {WORLDS}", "environment"), ("training, preset fast", "training"))
         for threads, rate in figures[f"{key}_mission_steps_per_s"].items()
     ]
-    for threads, shares in figures["training_profile"].items():
-        named = ", ".join(f"{part.replace('_', ' ')} {share:.1%}" for part, share in shares.items())
-        lines.append(f"time of training, {threads} thread(s): {named}")
+    for key, which in (("training_profile", ""), ("training_profile_aside", ", meanwhile in the one that learns")):
+        for threads, shares in figures[key].items():
+            named = ", ".join(f"{part.replace('_', ' ')} {share:.1%}" for part, share in shares.items())
+            lines += [f"time of training, {threads} thread(s){which}: {named}"] if shares else []
     for name, taken in figures["decision_us"].items():
         lines.append(f"learned, {name.replace('_', ' ')}: median {taken['median']:.0f} us, p99 {taken['p99']:.0f} us")
     return lines

@@ -71,7 +71,7 @@ class ExtendedState:
         self.commands = len(scenario.orders.commands)
         self.slots = scenario.formations
         self.velocity = np.array(scenario.path_velocity)
-        self.safe = np.array([0.0, 0.0, scenario.safe_distance])
+        self.safe = scenario.safe_distance
         self.size = scenario.agents * (2 * LENGTHS + 3 + self.commands) + 3
         self.layout = {"version": 1, "size": self.size, "range": RANGE, "close": CLOSE, "speed": SPEED, "old": OLD}
         self.scale = np.ones(self.size)
@@ -79,44 +79,50 @@ class ExtendedState:
 
     def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
         """(B, N (23 + C) + 3) float32 from a batch observation, obstacles (B, K, 3) [m] and ages (B, N) [s]; C commands."""
-        position = observation.position
-        worlds = len(position)
-        centroid = position.mean(axis=1, keepdims=True)
-        slots = centroid[:, None] + self.slots  # (B, 2, N, 2)
-        lengths = np.concatenate(
-            [
-                position - slots[:, 0],
-                position - slots[:, 1],
-                nearest(position, obstacles) - self.safe,
-                nearest(slots[:, 0], obstacles) - self.safe,
-            ],
-            axis=-1,
-        )
-        speeds = (observation.velocity - self.velocity) / SPEED
-        commands = np.eye(self.commands)[observation.command]
-        parts = [lengths / RANGE, lengths / CLOSE, speeds, commands, age[..., None] / OLD]
-        agents = np.concatenate(parts, axis=-1).reshape(worlds, -1)
-        joint = np.concatenate([agents, np.eye(3)[observation.formation]], axis=-1)
-        return np.asarray(np.clip(joint, -1.0, 1.0), dtype=np.float32)
+        out = np.zeros((len(observation.position), self.size), dtype=np.float32)
+        _fill(
+            observation.position, observation.velocity, observation.command, observation.formation, obstacles, age, self.slots,
+            self.velocity, self.safe, out,
+        )  # fmt: skip
+        return out
 
 
 @laws.compiled
-def _fill_nearest(points, obstacles, out):  # type: ignore[no-untyped-def]
-    for b in range(points.shape[0]):
-        for i in range(points.shape[1]):
-            normal = out[b, i, :2]
-            clearance = min(nearest_obstacle(points[b, i], obstacles[b], normal), RANGE)
-            normal *= -clearance
-            out[b, i, 2] = clearance
-
-
-def nearest(points: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-    """(B, N, 3) [m]: offset of the nearest obstacle's surface along x and y, and the clearance, at most ``RANGE``, seen from
-    ``points`` (B, N, 2) among ``obstacles`` (B, K, 3). Without obstacles the offset is zero.
+def nearest_surface(point, obstacles, out):  # type: ignore[no-untyped-def]
+    """Write into ``out`` (3,) [m]: offset of the nearest obstacle's surface along x and y, and the clearance, at most ``RANGE``,
+    seen from ``point`` (2,) among ``obstacles`` (K, 3). Without obstacles the offset is zero.
     """
-    out = np.empty((*points.shape[:2], 3))
-    _fill_nearest(np.ascontiguousarray(points), obstacles, out)
-    return out
+    out[2] = min(nearest_obstacle(point, obstacles, out[:2]), RANGE)
+    out[:2] *= -out[2]
+
+
+@laws.compiled
+def _fill(position, velocity, command, formation, obstacles, age, slots, path, safe, out):  # type: ignore[no-untyped-def]
+    """The extended state of every world into ``out`` (B, S), which is 0."""
+    agents = position.shape[1]
+    width = out.shape[1] // agents
+    centroid, slot, lengths = np.empty(2), np.empty(2), np.empty(LENGTHS)
+    for b in range(position.shape[0]):
+        for c in range(2):
+            centroid[c] = position[b, :, c].sum() / agents
+        for i in range(agents):
+            for c in range(2):
+                slot[c] = centroid[c] + slots[0, i, c]
+                lengths[c] = position[b, i, c] - slot[c]
+                lengths[2 + c] = position[b, i, c] - (centroid[c] + slots[1, i, c])
+            nearest_surface(position[b, i], obstacles[b], lengths[4:7])
+            nearest_surface(slot, obstacles[b], lengths[7:])
+            lengths[6] -= safe
+            lengths[9] -= safe
+            own = out[b, i * width : (i + 1) * width]
+            for k in range(LENGTHS):
+                own[k] = laws.clip(lengths[k] / RANGE, 1.0)
+                own[LENGTHS + k] = laws.clip(lengths[k] / CLOSE, 1.0)
+            for c in range(2):
+                own[2 * LENGTHS + c] = laws.clip((velocity[b, i, c] - path[c]) / SPEED, 1.0)
+            own[2 * LENGTHS + 2 + command[b, i]] = 1.0
+            own[width - 1] = laws.clip(age[b, i] / OLD, 1.0)
+        out[b, agents * width + formation[b]] = 1.0
 
 
 STATES: dict[str, Callable[[Scenario], State]] = {"printed": PrintedState, "extended": ExtendedState}

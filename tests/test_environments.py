@@ -15,7 +15,7 @@ from marlbc_mj.scenarios import Perturbation, make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Starts
 from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
-from marlbc_mj.tasks.states import RANGE, make_state, nearest
+from marlbc_mj.tasks.states import CLOSE, OLD, RANGE, SPEED, make_state, nearest_surface
 
 AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
 
@@ -319,12 +319,40 @@ def test_exploring_starts_are_clear_of_obstacles_that_move():
     st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50), st.floats(0, 5)), max_size=5),
 )
 def test_nearest_points_at_the_nearest_surface(points, discs):
-    obstacles = np.array(discs, dtype=float).reshape(1, -1, 3)
-    seen = nearest(np.array([points]), obstacles)[0]
-    expected = np.minimum(clearances(np.array(points), obstacles[0]), RANGE)
+    obstacles = np.array(discs, dtype=float).reshape(-1, 3)
+    seen = np.empty((len(points), 3))
+    for point, out in zip(np.array(points), seen, strict=True):
+        nearest_surface(point, obstacles, out)
+    expected = np.minimum(clearances(np.array(points), obstacles), RANGE)
     assert np.allclose(seen[:, 2], expected)
     if len(discs):
         assert np.allclose(np.hypot(seen[:, 0], seen[:, 1]), np.abs(expected), atol=1e-9)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_the_extended_state_is_what_it_says(seed):
+    """Every entry against its definition, with numbers beyond the range of some; NaN stays NaN."""
+    scenario, rng = paper(), np.random.default_rng(seed)
+    read, world = make_state("extended", scenario), World(scenario, worlds=3)
+    shape = 3, scenario.agents
+    position, velocity = rng.normal(size=(*shape, 2)) * 8.0, rng.normal(size=(*shape, 2)) * 4.0
+    command, formation, age = rng.integers(4, size=shape), rng.integers(3, size=3), rng.uniform(0.0, 8.0, size=shape)
+    obstacles = np.concatenate([rng.normal(size=(3, 6, 2)) * 10.0, rng.uniform(0.0, 3.0, size=(3, 6, 1))], axis=-1)
+    seen = world.observe()._replace(position=position, velocity=velocity, command=command, formation=formation)
+    state = read(seen, obstacles, age)
+    surfaces = np.empty((2, *shape, 3))
+    slots = position.mean(axis=1)[:, None, None] + scenario.formations  # (B, 2, N, 2)
+    for b, i in np.ndindex(shape):
+        nearest_surface(position[b, i], obstacles[b], surfaces[0, b, i])
+        nearest_surface(slots[b, 0, i], obstacles[b], surfaces[1, b, i])
+    surfaces[..., 2] -= scenario.safe_distance
+    lengths = np.concatenate([position - slots[:, 0], position - slots[:, 1], *surfaces], axis=-1)
+    speeds = (velocity - np.array(scenario.path_velocity)) / SPEED
+    parts = [lengths / RANGE, lengths / CLOSE, speeds, np.eye(4)[command], age[..., None] / OLD]
+    expected = np.concatenate([np.concatenate(parts, axis=-1).reshape(3, -1), np.eye(3)[formation]], axis=-1)
+    np.testing.assert_allclose(state, np.clip(expected, -1.0, 1.0), atol=1e-7)
+    position[1, 2, 0] = np.nan
+    assert np.isnan(read(seen, obstacles, age)).any(axis=1).tolist() == [False, True, False]
 
 
 def test_the_extended_state_does_not_know_where_on_the_path_it_is():

@@ -1,5 +1,7 @@
 """The measuring command measures: a smoke run with small bursts. The figures themselves are the machine's."""
 
+from threading import Thread
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from marlbc_mj.scenarios import paper
 from marlbc_mj.training import trainer
 from marlbc_mj.training.config import TrainConfig, make_config
 
-PARTS = {"simulation", "state", "action_values", "exploration", "replay", "updates", "rest"}
+PARTS = {"simulation", "state", "action_values", "exploration", "replay", "rest"}
 
 
 def small(threads: int) -> TrainConfig:
@@ -51,10 +53,13 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert min(rates) > 0
     assert figures["episode_s"] > 0
     assert figures["record_s"] > 0
-    for shares in figures["training_profile"].values():
-        assert set(shares) == PARTS
+    for threads, shares in figures["training_profile"].items():
+        assert set(shares) == PARTS | ({"updates"} if threads == "1" else {"waiting"})
         assert min(shares.values()) > 0
         assert sum(shares.values()) == pytest.approx(1.0)
+        aside = figures["training_profile_aside"][threads]
+        assert set(aside) == (set() if threads == "1" else {"updates", "replay"})
+        assert sum(aside.values()) <= 1.0
     for taken in figures["decision_us"].values():
         assert 0 < taken["median"] <= taken["p99"]
     assert figures["decision_us"]["decision_step"]["median"] > figures["decision_us"]["all_mission_steps"]["median"]
@@ -77,7 +82,11 @@ def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> No
     clock, work = perf_training.Clock(), Work()
     with clock.timing(work, ("outer",), "a"), clock.timing(work, ("__call__",), "b"):
         work.outer()
+        other = Thread(target=work)
+        other.start()
+        other.join()
     assert clock.seconds == {"rest": 1.0, "a": 2.0, "b": 1.0}
+    assert clock.aside == {"b": 1.0}
     assert type(work) is Work
 
 

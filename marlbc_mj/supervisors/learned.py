@@ -1,4 +1,4 @@
-"""Learned supervisors: a checkpoint's greedy policy, evaluated in NumPy every few mission steps."""
+"""Learned supervisors: a checkpoint's greedy policy, evaluated without torch every few mission steps."""
 
 from dataclasses import dataclass
 from pathlib import Path
