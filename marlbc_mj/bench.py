@@ -22,7 +22,7 @@ from marlbc_mj.report.results import Result, method_key
 from marlbc_mj.report.seed_page import write_seed_report
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.seeds import SeedResults, check_free, perturbed, run_methods, seed_range
-from marlbc_mj.supervisors import SLOW, SUPERVISORS, Decision, Situation, Supervisor, make_supervisor
+from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS, Decision, Situation, Supervisor, make_supervisor
 
 Progress = Callable[[str, float, float], None]
 """Called with what is being done, how much of it is done and how much there is."""
@@ -68,12 +68,12 @@ class BenchConfig:
 def matrix(supervisors: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> list[tuple[str, str]]:
     """The methods of a benchmark, as names of supervisor and controller.
 
-    Without names: every registered supervisor but those of ``SLOW`` with ``sorlc``, then ``scripted`` with every other
+    Without names: every registered supervisor but those ``ON_REQUEST`` with ``sorlc``, then ``scripted`` with every other
     controller; ``scripted`` with ``sorlc`` comes first. With names: every named supervisor with every named controller, where
     ``sorlc`` stands for controllers and ``scripted`` for supervisors that are not named.
     """
     if supervisors is None and controllers is None:
-        first = sorted((name for name in SUPERVISORS if name not in SLOW), key=lambda name: name != "scripted")
+        first = sorted((name for name in SUPERVISORS if name not in ON_REQUEST), key=lambda name: name != "scripted")
         return [(name, "sorlc") for name in first] + [("scripted", name) for name in CONTROLLERS if name != "sorlc"]
     return list(
         product(("scripted",) if supervisors is None else supervisors, ("sorlc",) if controllers is None else controllers)

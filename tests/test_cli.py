@@ -15,7 +15,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
-from marlbc_mj.supervisors import MPCMS, SLOW, SUPERVISORS, make_supervisor
+from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import METHODS, PRESETS
 
 SHORT = ("--duration", "1.0")
@@ -138,7 +138,7 @@ def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.Captu
 
 def test_the_matrix_is_all_supervisors_and_all_controllers() -> None:
     """Each once, the video's method first; names make a cross product, and what is not named is sorlc or scripted."""
-    methods, usual = matrix(), set(SUPERVISORS) - set(SLOW)
+    methods, usual = matrix(), set(SUPERVISORS) - set(ON_REQUEST)
     assert methods[0] == ("scripted", "sorlc") and len(set(methods)) == len(methods) == len(usual) + len(CONTROLLERS) - 1
     assert {s for s, c in methods if c == "sorlc"} == usual
     assert {c for s, c in methods if s == "scripted"} == set(CONTROLLERS)
@@ -147,9 +147,9 @@ def test_the_matrix_is_all_supervisors_and_all_controllers() -> None:
     assert matrix(("fsams", "fms"), ("pd",)) == [("fsams", "pd"), ("fms", "pd")]
 
 
-def test_slow_supervisors_run_where_they_are_named() -> None:
+def test_some_supervisors_run_only_where_they_are_named() -> None:
     """MPCMS that simulates its candidates takes minutes an episode: no part of the default matrix."""
-    assert SLOW == ("mpcms-mujoco",) and "mpcms-mujoco" not in {s for s, _ in matrix()}
+    assert "mpcms-mujoco" in ON_REQUEST and not set(ON_REQUEST) & {s for s, _ in matrix()}
     assert matrix(("mpcms", "mpcms-mujoco")) == [("mpcms", "sorlc"), ("mpcms-mujoco", "sorlc")]
     slow = make_supervisor("mpcms-mujoco")
     assert isinstance(slow, MPCMS) and slow.prediction == "mujoco"

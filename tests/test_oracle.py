@@ -1,6 +1,7 @@
 """The oracle: shipped schedules reproduce their entries, never violate, and the search is deterministic."""
 
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -67,6 +68,16 @@ def test_another_scenario_has_no_schedule_and_says_how_to_get_one(scenario):
     """The message names scenario, controller and command."""
     with pytest.raises(ConfigurationError, match="no schedule for scenario 'paper' under 'sorlc' .* marlbc oracle"):
         Oracle().start(scenario)
+
+
+def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
+    """Of its controller; other settings still have none."""
+    draws = paper(perturbation=Perturbation(start_spread=1.0, drag_scale=(0.0, 2.0)))
+    for controller in ("sorlc", "pd"):
+        supervisor = make_supervisor("oracle-schedule", controller)
+        assert supervisor.schedule(draws) == Oracle(controller).schedule(PAPER)
+    with pytest.raises(ConfigurationError, match="no schedule"):
+        supervisor.start(replace(draws, force_limit=150.0))
 
 
 def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):

@@ -54,7 +54,7 @@ class ScenarioOptions:
 class Bench:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
-    By default every supervisor but the slow ones (mpcms-mujoco) runs with sorlc, and scripted with every controller.
+    By default every supervisor but two (mpcms-mujoco, oracle-schedule) runs with sorlc, and scripted with every controller.
     """
 
     scenario: Positional[str] = "paper"

@@ -1,6 +1,7 @@
 """Mission supervisors: one per file, and the names under which the command line offers them."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from marlbc_mj.errors import unknown
 from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, situation
@@ -21,6 +22,10 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
         "the same with 0.3 m hysteresis and 0.5 s dwell: the fair baseline",
     ),
     "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known that never violates"),
+    "oracle-schedule": (
+        lambda: Oracle(unperturbed=True),
+        "the oracle's switch times, played on any draw around the scenario: what foresight for one is worth elsewhere",
+    ),
     "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
     "mpcms": (MPCMS, "model predictive: the cheapest order sequence over a 2 s horizon of the kinematic reference"),
     "mpcms-mujoco": (
@@ -38,10 +43,11 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
 """Factory and one line of description by name."""
 LEARNED = ("marlms",)
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
-UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, "mpcms-mujoco"))
-"""Supervisors that nothing was trained for, without the slow ones."""
-SLOW = ("mpcms-mujoco",)
-"""Supervisors that take minutes an episode: a benchmark runs them where they are named, not by default."""
+ON_REQUEST = ("mpcms-mujoco", "oracle-schedule")
+"""Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
+oracle itself where nothing is perturbed."""
+UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
+"""Supervisors that nothing was trained for, without those on request."""
 
 
 def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
@@ -52,7 +58,8 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
     """
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, SUPERVISORS)
-    return Oracle(controller) if name == "oracle" else SUPERVISORS[name][0]()
+    supervisor = SUPERVISORS[name][0]()
+    return replace(supervisor, controller=controller) if isinstance(supervisor, Oracle) else supervisor
 
 
 __all__ = [
@@ -60,7 +67,7 @@ __all__ = [
     "FSAMS",
     "LEARNED",
     "MPCMS",
-    "SLOW",
+    "ON_REQUEST",
     "SUPERVISORS",
     "UNLEARNED",
     "Blend",

@@ -98,6 +98,7 @@ class Oracle:
 
     controller: str = "sorlc"  # name of the controller that the schedule was found with
     cache: Path | None = None  # None: the one that comes with the package
+    unperturbed: bool = False  # play the schedule of the unperturbed scenario on its draws, for which it is no oracle
 
     def start(self, scenario: Scenario) -> Any:
         """Memory: the schedule's.
@@ -118,7 +119,8 @@ class Oracle:
     def entry(self, scenario: Scenario) -> dict[str, Any]:
         """The cache's entry: windows, total (return), seed, budget, episodes, versions."""
         entries = read_cache(self.cache or shipped())
-        key = cache_key(scenario, make_controller(self.controller))
+        known = replace(scenario, perturbation=Perturbation()) if self.unperturbed else scenario
+        key = cache_key(known, make_controller(self.controller))
         if key not in entries:
             command = f"marlbc oracle --scenario {scenario.name} --controller {self.controller}"
             raise ConfigurationError(
