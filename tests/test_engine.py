@@ -23,6 +23,7 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.scenarios import Obstacle, Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.tasks.batch import FormationBatch
 
 STILL = PaperDrag(scale=0.0)  # no disturbance
 PERTURBED = Perturbation(start_spread=0.5, obstacle_spread=0.3, drag_scale=(0.5, 1.5))
@@ -517,6 +518,16 @@ def test_a_plain_python_law_takes_the_python_path_and_nothing_else():
     assert not World(paper(disturbance=Pulse(law=laws.plain(pulse))), PD()).native
     with pytest.raises(ConfigurationError, match="native=True needs compiled laws"):
         World(paper(), plain, native=True)
+
+
+def test_a_learners_batch_takes_a_plain_python_law_too():
+    """To the same states and rewards."""
+    plain = UserPD(law=laws.plain(user_pd))
+    compiled, python = (FormationBatch(paper(), law, worlds=2, interval=10) for law in (UserPD(), plain))
+    assert_same_bits([compiled.reset(3)], [python.reset(3)])
+    for action in (2, 0):
+        one, other = (batch.step(np.full((2, 4), action)) for batch in (compiled, python))
+        assert_same_bits([one.state, one.reward, one.clearance], [other.state, other.reward, other.clearance])
 
 
 @pytest.mark.parametrize(

@@ -91,7 +91,7 @@ class TrainConfig:
     """Scenario that is trained on."""
     controller: str = "sorlc"
     """Controller that tracks the references."""
-    budget: int = 2_000_000
+    budget: int = 1_200_000
     """Mission steps, over all worlds."""
 
     worlds: int = 128

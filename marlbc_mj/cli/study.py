@@ -34,7 +34,7 @@ class Study:
     """Variants to train; all of them by default."""
     seeds: int = 5
     """Runs of a variant, with seeds from 0 on."""
-    budget: int = 5_000_000
+    budget: int = 1_200_000
     """Mission steps of a run."""
     workers: int = 2
     """Processes that share the runs, one thread each."""

@@ -163,8 +163,7 @@ class World:
         orders = self._checked(orders)
         if velocity is not None:
             velocity = self._checked_velocity(velocity)
-        failed = self.advance(orders, velocity) if self.native else self._advance_in_python(orders, velocity)
-        if failed:
+        if self.advance(orders, velocity):
             self.raise_if_diverged()
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
@@ -202,9 +201,11 @@ class World:
             raise self.state.diverged(b, int(self._status[b]))
 
     def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
-        """The compiled call of :meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both
-        contiguous: no checks, no copies; how many worlds failed.
+        """:meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both contiguous: no checks, no
+        copies; how many worlds failed.
         """
+        if not self.native:
+            return self._advance_in_python(orders, velocity)
         args = self._arguments(orders, velocity)
         if self.threads == 1 or self.worlds == 1:
             return int(loop.step_serial(self.worlds, *args))

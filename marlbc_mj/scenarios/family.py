@@ -15,42 +15,25 @@ from marlbc_mj.behaviors import Behavior
 from marlbc_mj.disturbances import Disturbance, PaperDrag
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
-from marlbc_mj.scenarios.base import Obstacle, Perturbation, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.base import Obstacle, Perturbation, Point, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.formations import column, make_formation
 from marlbc_mj.scenarios.layout import Layout, motions_of
 from marlbc_mj.scenarios.obstacles import Range
 
 NOMINAL = 0
 """Number of the layout that a scenario shows before a seed is drawn: a training one."""
-SHARED = (
-    "name", "safe_distance", "formation_tolerance", "mission_step", "substep", "reference", "robot", "mass", "force_limit",
-    "unit_force", "speed_limit", "acceleration_limit", "imperfections", "disturbance", "perturbation", "split",
-)  # fmt: skip
-"""Fields that mean the same in a scenario."""
-UNPERTURBED = Perturbation()
 
 
-@dataclass(frozen=True)
-class Family:
-    """What all families share; alone, it is a mission with nothing in the way.
+@dataclass(frozen=True, kw_only=True)
+class Mission:
+    """What has nothing to do with where a mission leads: its clocks, its robots and how its agents avoid and keep formation."""
 
-    Raises:
-        ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
-    """
-
-    name: str = "open"
-    agents: int = 4  # 2 to 256
-    formation: str = "wedge"  # line, wedge, circle or grid
-    spacing: float = 6.0  # between neighbors in formation [m]
-    files: int = 1  # columns side by side that FR forms
-    column_spacing: float = 3.0  # between neighbors in the column [m]
-    length: float = 60.0  # of the way [m]
-    speed: float = 1.0  # [m/s]
+    name: str
     safe_distance: float = 1.0  # to obstacles: d_OA [m]
     agent_avoidance: bool = True  # whether AA is among the behaviors
     agent_distance: float = 1.5  # between agents: d_AA [m]
     avoidance_gain: float = 20.0  # of OA and AA [1/s]
-    formation_gain: float = 4.0  # of FM and FR [1/s]; half of the case study's, whose references jump at 96 m/s
+    formation_gain: float  # of FM and FR [1/s]
     formation_tolerance: float = 0.5  # [m]
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
@@ -63,7 +46,45 @@ class Family:
     acceleration_limit: float = np.inf  # of references [m/s^2]
     imperfections: Imperfections = NO_IMPERFECTIONS
     disturbance: Disturbance = field(default_factory=PaperDrag)
-    perturbation: Perturbation = UNPERTURBED
+    perturbation: Perturbation = field(default_factory=Perturbation)
+
+    def shared(self) -> dict[str, Any]:
+        """The fields that mean the same in a scenario."""
+        known = {f.name for f in fields(Scenario)}
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name in known}
+
+    def behaviors_for(
+        self, slots: tuple[Point, ...], column: tuple[Point, ...], *, two_sided: bool = False
+    ) -> tuple[Behavior, ...]:
+        """OA, FM and FR, and AA where agents avoid each other."""
+        return standard_behaviors(
+            slots,
+            column,
+            avoidance_gain=self.avoidance_gain,
+            formation_gain=self.formation_gain,
+            safe_distance=self.safe_distance,
+            two_sided=two_sided,
+            agent_distance=self.agent_distance if self.agent_avoidance else None,
+        )
+
+
+@dataclass(frozen=True)
+class Family(Mission):
+    """What all families share; alone, it is a mission with nothing in the way.
+
+    Raises:
+        ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
+    """
+
+    name: str = "open"
+    formation_gain: float = 4.0  # of FM and FR [1/s]; half of the case study's, whose references jump at 96 m/s
+    agents: int = 4  # 2 to 256
+    formation: str = "wedge"  # line, wedge, circle or grid
+    spacing: float = 6.0  # between neighbors in formation [m]
+    files: int = 1  # columns side by side that FR forms
+    column_spacing: float = 3.0  # between neighbors in the column [m]
+    length: float = 60.0  # of the way [m]
+    speed: float = 1.0  # [m/s]
     two_sided: bool = False  # OA as the printed equality (erratum 6)
     split: Literal["train", "test"] = "train"  # whose layouts are drawn; the held-out ones are "test"
     summary: ClassVar[str] = "nothing in the way"
@@ -134,16 +155,8 @@ class Family:
             raise self.infeasible(f"a formation {extent:g} m long leaves nothing of a way of {self.length:g} m; make it longer")
 
     def behaviors(self) -> tuple[Behavior, ...]:
-        """OA, FM and FR, and AA where agents avoid each other."""
-        return standard_behaviors(
-            points(self.slots),
-            points(self.column),
-            avoidance_gain=self.avoidance_gain,
-            formation_gain=self.formation_gain,
-            safe_distance=self.safe_distance,
-            two_sided=self.two_sided,
-            agent_distance=self.agent_distance if self.agent_avoidance else None,
-        )
+        """Of the family's formation and column."""
+        return self.behaviors_for(points(self.slots), points(self.column), two_sided=self.two_sided)
 
     def infeasible(self, reason: str) -> ConfigurationError:
         """The error that rejects this family's parameters."""
@@ -156,7 +169,7 @@ class Family:
         except ConfigurationError as error:
             raise self.infeasible(str(error)) from error
         made: dict[str, Any] = {
-            **{key: getattr(self, key) for key in SHARED},
+            **self.shared(),
             "starts": points(self.starts()),
             "behaviors": self.behaviors(),
             "path_velocity": (self.speed, 0.0),

@@ -22,11 +22,10 @@ import numpy as np
 
 from marlbc_mj.disturbances import DISTURBANCES, Disturbance
 from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
-from marlbc_mj.scenarios.base import Obstacle, Perturbation, Point, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.base import Obstacle, Point, Scenario, Window
 from marlbc_mj.scenarios.case_study import cruise, paper
 from marlbc_mj.scenarios.families import FAMILIES
-from marlbc_mj.scenarios.family import UNPERTURBED
+from marlbc_mj.scenarios.family import Mission
 from marlbc_mj.scenarios.layout import Motion
 
 SUFFIX = ".toml"
@@ -34,55 +33,27 @@ MOST_BYTES = 1_000_000
 _NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "a text"}
 
 
-@dataclass(frozen=True)
-class Custom:
+@dataclass(frozen=True, kw_only=True)
+class Custom(Mission):
     """A mission given point by point."""
 
     starts: tuple[Point, ...]  # [m]
     slots: tuple[Point, ...]  # FM: offsets from the desired centroid [m]
     column: tuple[Point, ...]  # FR [m]
     name: str = "custom"
+    formation_gain: float = 2.0  # [1/s]
     path_origin: Point = (0.0, 0.0)  # [m]
     path_velocity: Point = (1.0, 0.0)  # [m/s]
     obstacles: tuple[Obstacle, ...] = ()  # [x, y] or [x, y, radius] each [m]
     motions: tuple[Motion, ...] = ()  # [vx, vy, ax, ay, period, phase] each, as many of them as are not zero
     schedule: tuple[Window, ...] = ()  # [start, end, agent, order] each
     duration: float = 60.0  # [s]
-    safe_distance: float = 1.0  # [m]
-    agent_avoidance: bool = True
-    agent_distance: float = 1.5  # [m]
-    avoidance_gain: float = 20.0  # [1/s]
-    formation_gain: float = 2.0  # [1/s]
-    formation_tolerance: float = 0.5  # [m]
-    mission_step: float = 0.05  # [s]
-    substep: float = 0.005  # [s]
-    reference: Literal["virtual", "actual"] = "virtual"
-    robot: str = "point_mass"
-    mass: float = 1.0  # [kg]
-    force_limit: float = 200.0  # [N]
-    unit_force: float = 1.0  # [N]
-    speed_limit: float = np.inf  # of references [m/s]
-    acceleration_limit: float = np.inf  # of references [m/s^2]
-    imperfections: Imperfections = NO_IMPERFECTIONS
-    disturbance: Disturbance | None = None  # None: the case study's drag
-    perturbation: Perturbation = UNPERTURBED
 
     def build(self, **changes: Any) -> Scenario:
         """The scenario, with any of its fields changed."""
-        own = {f.name: getattr(self, f.name) for f in fields(self)}
-        keys = ("slots", "column", "avoidance_gain", "formation_gain", "agent_avoidance", "agent_distance")
-        slots, column, avoidance_gain, formation_gain, avoiding, distance = (own.pop(key) for key in keys)
-        own["behaviors"] = standard_behaviors(
-            slots,
-            column,
-            avoidance_gain=avoidance_gain,
-            formation_gain=formation_gain,
-            safe_distance=self.safe_distance,
-            agent_distance=distance if avoiding else None,
-        )
-        if self.disturbance is None:
-            del own["disturbance"]
-        return Scenario(**{**own, "description": f"{len(self.starts)} agents, given point by point", **changes})
+        behaviors = self.behaviors_for(self.slots, self.column)
+        description = f"{len(self.starts)} agents, given point by point"
+        return Scenario(**{**self.shared(), "behaviors": behaviors, "description": description, **changes})
 
 
 def load_scenario(path: str | Path, **changes: Any) -> Scenario:
