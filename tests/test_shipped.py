@@ -8,9 +8,10 @@ from marlbc_mj import World, make_supervisor, measure, paper, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.supervisors import LEARNED
+from marlbc_mj.tasks.batch import ACTIONS
 from marlbc_mj.training.config import make_config
 from marlbc_mj.training.run import scores, train
-from marlbc_mj.training.shipped import ship, shipped
+from marlbc_mj.training.shipped import CHOICE, ship, shipped
 
 
 @pytest.mark.parametrize("name", LEARNED)
@@ -38,7 +39,7 @@ def test_a_run_becomes_a_shipped_checkpoint(tmp_path, capsys):
     assert {p.name for p in path.parent.iterdir()} == {"mine.safetensors", "mine.json", "mine.md"}
     card = path.with_suffix(".md").read_text()
     assert "marlbc train marlms --preset fast --seed 0 --budget 1000 --threads 1 --set worlds=64 hidden=8 capacity=7000" in card
-    assert "torch" in card
+    assert "torch" in card and "one of the commands" in card and set(CHOICE) == set(ACTIONS)
     with pytest.raises(ConfigurationError, match="exists"):
         ship(tmp_path / "run", "mine", tmp_path / "shipped")
     with pytest.raises(SystemExit):

@@ -281,7 +281,16 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
         "single agents side by side: own state, formation with or without avoidance, prioritised replay",
     ),
     "mappo": (
-        {**CARE, "learner": "plain", "switching_margin": 0.0, "learning_rate": 5e-4, "final_learning_rate": 5e-5},
+        {
+            **CARE,
+            "learner": "plain",
+            "switching_margin": 0.0,
+            "learning_rate": 5e-4,
+            "final_learning_rate": 5e-5,
+            "ppo": PPO(rollout=8),
+            # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
+            "shaping": replace(CARE["shaping"], own_switch_cost=0.0),
+        },
         "multi-agent PPO: an actor each, one critic on the state, rollouts instead of a replay buffer",
     ),
 }

@@ -12,6 +12,8 @@ from marlbc_mj.training.checkpoint import read_policy
 from marlbc_mj.training.config import METHODS, flat_settings, make_config
 
 FOLDER = Path(__file__).parent / "checkpoints"
+CHOICE = {"commands": "one of the commands", "orders": "one of all orders", "avoidance": "formation with or without avoidance"}
+"""What is chosen from an action set."""
 
 
 def shipped(name: str) -> Path:
@@ -59,7 +61,7 @@ def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> 
         f"# {name}",
         "",
         f"Greedy policy of a team on scenario `{train['scenario']}` with controller `{train['controller']}`: every "
-        f"{train['interval']} mission steps one of the {train['actions']} for each agent, from the {train['state']} state. "
+        f"{train['interval']} mission steps {CHOICE[train['actions']]} for each agent, from the {train['state']} state. "
         "Trained on the unperturbed scenario alone; it knows no other team, slots or mission step, and refuses them.",
         "",
         f"- Command: `{command}`",

@@ -36,12 +36,16 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
         lambda: Learned.load(shipped("marlms")),
         "MARLMS: the shipped checkpoint of lenient, dueling, averaged Q-networks, one an agent",
     ),
+    "rlms": (
+        lambda: Learned.load(shipped("rlms")),
+        "RLMS: the shipped checkpoint of single-agent Q-networks side by side, formation with or without avoidance",
+    ),
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
     "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
 }
 """Factory and one line of description by name."""
-LEARNED = ("marlms",)
+LEARNED = ("marlms", "rlms")
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
 ON_REQUEST = ("mpcms-mujoco", "oracle-schedule")
 """Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
