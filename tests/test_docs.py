@@ -12,6 +12,9 @@ import pytest
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.supervisors import SUPERVISORS
+from marlbc_mj.training.config import METHODS
+from marlbc_mj.training.rivals import LEARNERS
+from marlbc_mj.training.study import VARIANTS
 
 DOCS = Path(__file__).parent.parent / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
@@ -54,8 +57,8 @@ def run_page(page: Path, folder: Path) -> None:
 
 @pytest.fixture
 def own_names():
-    """Controllers and supervisors that a page registers are forgotten again."""
-    before = [(registry, dict(registry)) for registry in (CONTROLLERS, SUPERVISORS)]
+    """What a page registers is forgotten again."""
+    before = [(registry, dict(registry)) for registry in (CONTROLLERS, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
     yield
     for registry, entries in before:
         registry.clear()
@@ -70,8 +73,8 @@ def test_a_how_to_runs(page, tmp_path, monkeypatch):
     run_page(page, tmp_path)
 
 
-def test_there_are_four_how_tos():
-    assert [page.stem for page in HOW_TO] == ["controller", "robot", "scenario", "supervisor"]
+def test_there_are_five_how_tos():
+    assert [page.stem for page in HOW_TO] == ["controller", "learner", "robot", "scenario", "supervisor"]
 
 
 def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():

@@ -79,7 +79,7 @@ class Learner:
     @torch.no_grad()
     def values(self, state: np.ndarray) -> np.ndarray:
         """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
-        q, logits = self.network.heads(self._tensor(state))
+        q, logits = self.network.heads(self.tensor(state))
         q = self._masked(q, torch.sigmoid(logits))[0]
         return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
 
@@ -87,13 +87,13 @@ class Learner:
         """One gradient step; returns the mean absolute TD error."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        now, logits = self.network.heads(self._tensor(batch.state))
-        ahead, least = self._masked(*self.targets.heads(self._tensor(batch.next_state)))
+        now, logits = self.network.heads(self.tensor(batch.state))
+        ahead, least = self._masked(*self.targets.heads(self.tensor(batch.next_state)))
         chosen, target = self.estimates(batch, now, ahead)
         error = (target - chosen).detach()
-        weight = td_weight(error, self._tensor(batch.leniency.T), self.config.learner, self.generator)
+        weight = td_weight(error, self.tensor(batch.leniency.T), self.config.learner, self.generator)
         if batch.weight is not None:
-            weight = weight * self._tensor(batch.weight.T)
+            weight = weight * self.tensor(batch.weight.T)
         errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)
         loss = (errors * weight).sum(dim=0).mean()
         if self.network.risk:
@@ -135,10 +135,10 @@ class Learner:
         The risk of an action is so the discounted chance that coming too close can no longer be avoided (Bharadhwaj et al.,
         ICLR 2021, learn a safety critic alike). ``batch`` must be of single decisions; ``logits`` (N, M, A), ``least`` (N, M).
         """
-        goes_on = self._tensor(batch.discount.T) > 0
+        goes_on = self.tensor(batch.discount.T) > 0
         assert batch.lost is not None
-        target = torch.maximum(self._tensor(batch.lost.T), self.config.risk_gamma * goes_on * least)
-        chosen = self._chosen(batch, logits)
+        target = torch.maximum(self.tensor(batch.lost.T), self.config.risk_gamma * goes_on * least)
+        chosen = self.chosen(batch, logits)
         return nn.functional.binary_cross_entropy_with_logits(chosen, target, reduction="none").sum(dim=0).mean()
 
     def push(self) -> None:
@@ -153,10 +153,10 @@ class Learner:
             now: (N, M, A) values in ``batch.state``.
             ahead: (N, M, A) averaged values in ``batch.next_state``, -inf for actions that are too risky.
         """
-        target = self._tensor(batch.reward.T) + self._tensor(batch.discount.T) * ahead.amax(dim=-1)
-        return self._chosen(batch, now), target
+        target = self.tensor(batch.reward.T) + self.tensor(batch.discount.T) * ahead.amax(dim=-1)
+        return self.chosen(batch, now), target
 
-    def _chosen(self, batch: Batch, values: Tensor) -> Tensor:
+    def chosen(self, batch: Batch, values: Tensor) -> Tensor:
         """(N, M) entries of ``values`` (N, M, A) for the actions that were taken."""
         actions = torch.from_numpy(np.ascontiguousarray(batch.action.T)).to(self.config.device)
         return values.gather(-1, actions[..., None]).squeeze(-1)
@@ -174,7 +174,8 @@ class Learner:
         for k, p in enumerate(self.smooth.parameters()):
             p.copy_(torch.from_numpy(arrays[f"smooth{k}"]))
 
-    def _tensor(self, array: np.ndarray) -> Tensor:
+    def tensor(self, array: np.ndarray) -> Tensor:
+        """float32, on the device of the networks."""
         return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
 
 

@@ -97,9 +97,9 @@ class QMIX(Learner):
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the team's action and its target."""
         reward, discount = team_return(batch)
-        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self._tensor(batch.next_state))
-        target = self._tensor(reward) + self._tensor(discount) * mixed
-        return self.mixer(self._chosen(batch, now), self._tensor(batch.state)), target
+        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
+        target = self.tensor(reward) + self.tensor(discount) * mixed
+        return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
 
     def push(self) -> None:
         """Network and mixer join those that targets are made of."""
@@ -146,10 +146,10 @@ class Central(Learner):
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, M) value of the joint action and its target."""
         reward, discount = team_return(batch)
-        best = self.network(self._tensor(batch.next_state)).detach().argmax(dim=-1, keepdim=True)
-        target = self._tensor(reward) + self._tensor(discount) * ahead.gather(-1, best).squeeze(-1)
+        best = self.network(self.tensor(batch.next_state)).detach().argmax(dim=-1, keepdim=True)
+        target = self.tensor(reward) + self.tensor(discount) * ahead.gather(-1, best).squeeze(-1)
         joint = np.ravel_multi_index(tuple(batch.action.T), self.each)
-        return self._chosen(batch._replace(action=joint[:, None]), now), target
+        return self.chosen(batch._replace(action=joint[:, None]), now), target
 
 
 class RLMS(Learner):
