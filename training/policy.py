@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 import numpy as np
 
-from marlbc_mj.laws import compiled
+from marlbc_mj.laws import compiled, inlined
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,53 +36,18 @@ class Policy(NamedTuple):
 
     def values(self, state: np.ndarray) -> np.ndarray:
         """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
-        y = outputs((state / self.scale).astype(np.float32), self.weights, self.biases)
-        actions = self.columns
-        values, logits = y[..., self.dueling : self.dueling + actions], y[..., self.dueling + actions :]
-        if self.dueling:
-            values = y[..., :1] + values - values.mean(axis=-1, keepdims=True)
-        if self.risk:
-            risks = 1.0 / (1.0 + np.exp(-logits))
-            values = np.where(admissible(risks, risks.min(axis=-1, keepdims=True), self.risk), values, -np.inf)
-        return np.asarray(values)
-
-
-@compiled
-def outputs(x, weights, biases):  # type: ignore[no-untyped-def]
-    """(B, N, O) of the last layers for inputs (B, in), all float32, summed in the order of the inputs for any B.
-
-    For one team a loop takes less time than a BLAS call a layer; for many, it costs no more than their simulation by far.
-    """
-    networks, last = len(weights[0]), len(weights) - 1
-    widest = 0
-    for bias in biases:
-        widest = max(widest, bias.shape[2])
-    out = np.empty((len(x), networks, biases[last].shape[2]), dtype=np.float32)
-    layers = np.empty((2, widest), dtype=np.float32)
-    for b in range(len(x)):
-        for i in range(networks):
-            y = x[b]
-            for k in range(last + 1):
-                weight = weights[k][i]
-                z = layers[k % 2, : weight.shape[1]]
-                z[:] = biases[k][i, 0]
-                for j in range(weight.shape[0]):
-                    factor = y[j]
-                    if factor != 0.0:
-                        for o in range(len(z)):
-                            z[o] += factor * weight[j, o]
-                if k < last:
-                    for o in range(len(z)):
-                        if z[o] < 0.0:  # NaN passes through
-                            z[o] = 0.0
-                y = z
-            out[b, i] = y
-    return out
+        state = np.ascontiguousarray(state, dtype=np.float32)
+        scale = np.asarray(self.scale, dtype=np.float32)
+        values: np.ndarray = action_values(
+            state, scale, self.weights, self.biases, self.dueling, self.columns, np.float32(self.risk)
+        )
+        return values
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
 
 
+@inlined
 def admissible(risks: Array, least: Array, limit: float) -> Array:
     """Bool (..., A): which actions may be taken, by their risks (..., A) and the least of these (..., 1)."""
     return (risks <= limit) | (risks <= least + SLACK)
@@ -102,7 +67,73 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
         each = (round(values.shape[2] ** (1 / agents)),) * agents
         joint = greedy(values, np.ravel_multi_index(tuple(last.T), each)[:, None], fresh, margin)
         return np.stack(np.unravel_index(joint[:, 0], each), axis=-1)
-    best = values.argmax(axis=-1)
-    world, agent = np.arange(len(last))[:, None], np.arange(agents)
-    lead = values[world, agent, best] - values[world, agent, last]
-    return np.where((lead > margin) | fresh[:, None], best, last)
+    best: np.ndarray = best_actions(values, last, fresh, values.dtype.type(margin))
+    return best
+
+
+@compiled
+def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
+    """:func:`greedy` for values (B, N, A)."""
+    best = np.empty(last.shape, dtype=np.int64)
+    for b in range(last.shape[0]):
+        for i in range(last.shape[1]):
+            action = values[b, i].argmax()
+            leads = values[b, i, action] - values[b, i, last[b, i]] > margin
+            best[b, i] = action if leads or fresh[b] else last[b, i]
+    return best
+
+
+@compiled
+def action_values(state, scale, weights, biases, dueling, actions, limit):  # type: ignore[no-untyped-def]
+    """(B, N, A) values of ``Policy``'s networks for states (B, S), all float32; ``limit`` is the largest admissible risk, or 0.
+
+    For one team, loops take less time than a BLAS call a layer and a NumPy call an operation.
+    """
+    networks, last, widest = len(weights[0]), len(weights) - 1, 0
+    for bias in biases:
+        widest = max(widest, bias.shape[2])
+    values = np.empty((len(state), networks, actions), dtype=np.float32)
+    layers, risks, one = np.empty((2, widest), dtype=np.float32), np.empty(actions, dtype=np.float32), np.float32(1.0)
+    for b in range(len(state)):
+        x = state[b] / scale
+        for i in range(networks):
+            y = x
+            for k in range(last + 1):
+                z = layers[k % 2, : weights[k].shape[2]]
+                dense(y, weights[k][i], biases[k][i, 0], z)
+                if k < last:
+                    rectify(z)
+                y = z
+            q = values[b, i]
+            q[:] = y[dueling : dueling + actions]
+            if dueling:
+                mean = q.sum() / np.float32(actions)
+                for a in range(actions):
+                    q[a] = y[0] + q[a] - mean
+            if limit > 0.0:
+                for a in range(actions):
+                    risks[a] = one / (one + np.exp(-y[dueling + actions + a]))
+                least = risks.min()
+                for a in range(actions):
+                    if not admissible(risks[a], least, limit):
+                        q[a] = -np.inf
+    return values
+
+
+@compiled
+def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
+    """``x @ weight + bias`` into ``out``, summed in the order of the inputs, those that are 0 left out."""
+    out[:] = bias
+    for j in range(len(x)):
+        factor = x[j]
+        if factor != 0.0:
+            for o in range(len(out)):
+                out[o] += factor * weight[j, o]
+
+
+@compiled
+def rectify(x):  # type: ignore[no-untyped-def]
+    """The larger of ``x`` and 0, in place; NaN passes through."""
+    for j in range(len(x)):
+        if x[j] < 0.0:
+            x[j] = 0.0

@@ -21,7 +21,8 @@ class LearnedMemory(NamedTuple):
 
     read: State
     order_of: np.ndarray  # (A,) index into scenario.orders of every action
-    scenario: Scenario
+    command_of: np.ndarray  # (A,) index into scenario.orders.commands of every action
+    hold: float  # how long a decision holds [s]
     actions: np.ndarray  # (1, N) in force
     age: np.ndarray  # (1, N) how long their commands have been in force [s]
     solver_ms: float = 0.0  # what state and networks took in the last mission step [ms]
@@ -48,6 +49,11 @@ class Learned:
         policy, description = read_policy(path)
         return cls(policy, description["signature"], path)
 
+    @property
+    def interval(self) -> int:
+        """Mission steps that a decision holds for."""
+        return int(self.signature["interval"])  # type: ignore[call-overload, no-any-return]  # checked when read
+
     def start(self, scenario: Scenario) -> LearnedMemory:
         """Check the scenario against what the policy was trained for.
 
@@ -60,19 +66,18 @@ class Learned:
         orders = order_of(scenario, str(self.signature["actions"]))
         check_policy(self.path, self.policy, scenario.agents, len(orders), read.size)
         none = np.zeros((1, scenario.agents), dtype=np.int64)
-        return LearnedMemory(read, orders, scenario, none, np.full(none.shape, OLD))
+        hold = self.interval * scenario.mission_step
+        return LearnedMemory(read, orders, scenario.orders.command_of[orders], hold, none, np.full(none.shape, OLD))
 
     def decide(self, situation: Situation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
         """The greedy action of every agent; the one in force unless another is better by more than the margin."""
         actions, age, began = memory.actions, memory.age, perf_counter()
-        interval = int(self.signature["interval"])  # type: ignore[call-overload]  # checked by the signature
-        if situation.step % interval == 0:
+        if situation.step % self.interval == 0:
             state = memory.read(_batch(situation), situation.obstacles[None], age)
-            fresh = np.array([situation.step == 0])
-            actions = greedy(self.policy.values(state), memory.actions, fresh, self.policy.margin)
-            command = memory.scenario.orders.command_of[memory.order_of[actions]]
-            switches = (command != situation.command) & ~fresh[:, None]
-            age = np.where(switches, 0.0, age) + interval * memory.scenario.mission_step
+            fresh = situation.step == 0
+            actions = greedy(self.policy.values(state), actions, np.array([fresh]), self.policy.margin)
+            kept = age if fresh else np.where(memory.command_of[actions] == situation.command, age, 0.0)
+            age = kept + memory.hold
         solver_ms = 1e3 * (perf_counter() - began)
         return memory.order_of[actions[0]], memory._replace(actions=actions, age=age, solver_ms=solver_ms)
 
