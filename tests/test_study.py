@@ -30,7 +30,7 @@ from marlbc_mj.training.study import (
     scripted_return,
     write_csvs,
 )
-from marlbc_mj.training.study_report import WIDE, by_variant, study_table, write_report
+from marlbc_mj.training.study_report import WIDE, by_variant, rows_of_panels, study_table, write_report
 from marlbc_mj.training.trainer import Trainer
 
 TINY = {"worlds": 8, "hidden": (8,), "batch": 16, "updates": 1, "capacity": 400, "start_length": 1.0, "evaluate_every": 1_600}
@@ -233,6 +233,15 @@ def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
     groups = [variant.group for variant in VARIANTS.values()]
     assert all(groups.count(group) <= WIDE for group in groups)
     assert groups == sorted(groups, key=groups.index)
+
+
+def test_a_row_of_panels_holds_whole_groups():
+    """As many as have room; nothing is lost or moved."""
+    every = rows_of_panels(list(VARIANTS))
+    assert [len(row) for row in every] == [6, 6, 6]
+    some = ["marlms", "no-leniency", "no-averaging", "no-dueling", "plain-hash", "paper", "hysteretic", "vdn"]
+    assert rows_of_panels(some) == [some[:6], some[6:]]
+    assert rows_of_panels(["vdn"]) == [["vdn"]]
 
 
 def test_the_goal_is_the_scripted_supervisors() -> None:

@@ -114,10 +114,9 @@ def _until(estimate: Estimate, digits: int) -> str:
 
 
 def draw_curves(rows: Sequence[Record], curves: Sequence[Record]) -> Figure:
-    """Return and violation time against mission steps, a pair of panels a variant on common axes; a row a group of variants."""
+    """Return and violation time against mission steps, a pair of panels a variant on common axes; see :func:`rows_of_panels`."""
     runs, evaluations = by_variant(rows), by_variant(curves)
-    blocks = [[name for name in runs if VARIANTS[name].group == g] for g in dict.fromkeys(VARIANTS[n].group for n in runs)]
-    blocks = [list(runs)] if len(runs) <= WIDE else blocks
+    blocks = rows_of_panels(list(runs))
     columns = max(3, *map(len, blocks))
     left, right, top, bottom, gap, inner, between = 0.48, 0.1, 0.42, 0.36, 0.1, 0.09, 0.46
     heights = 0.85, 0.6
@@ -155,6 +154,17 @@ def draw_curves(rows: Sequence[Record], curves: Sequence[Record]) -> Figure:
     return figure
 
 
+def rows_of_panels(names: Sequence[str]) -> list[list[str]]:
+    """Variants row by row: a group is never split, and takes the rest of a row where all of it has room there."""
+    blocks: list[list[str]] = [[]]
+    for group in dict.fromkeys(VARIANTS[name].group for name in names):
+        members = [name for name in names if VARIANTS[name].group == group]
+        if len(blocks[-1]) + len(members) > WIDE:
+            blocks.append([])
+        blocks[-1] += members
+    return blocks
+
+
 def _draw_panel(axes: Axes, key: str, rows: Sequence[Record], curves: Sequence[Record], reference: Sequence[Record]) -> None:
     unit = 1e3 if key == "return" else 1.0
     for lines, color, span in ((reference, REFERENCE_COLOR, False), (curves, COLOR, True)):
@@ -169,8 +179,9 @@ def _draw_panel(axes: Axes, key: str, rows: Sequence[Record], curves: Sequence[R
         met = [float(row["goal_mission_steps"]) / 1e6 for row in rows if row["goal_mission_steps"]]
         axes.plot(met, [0.97] * len(met), **_GOAL, transform=axes.get_xaxis_transform(), clip_on=False)
         failed = sum(row["failure"] not in ("", UNFINISHED) for row in rows)
-        ended = sum(row["failure"] != UNFINISHED for row in rows)
-        axes.text(0.97, 0.04, f"goal {len(met)} of {ended}", transform=axes.transAxes, ha="right", fontsize=6.5)
+        ended = [row for row in rows if row["failure"] != UNFINISHED]
+        reached = sum(bool(row["goal_mission_steps"]) for row in ended)
+        axes.text(0.97, 0.04, f"goal {reached} of {len(ended)}", transform=axes.transAxes, ha="right", fontsize=6.5)
         if failed:
             axes.text(0.97, 0.2, f"{failed} failed", transform=axes.transAxes, ha="right", fontsize=6.5, color=FAILED_COLOR)
     else:
