@@ -260,7 +260,15 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "iql": ({"learner": "plain"}, "independent Q-learning: the same without leniency"),
     "vdn": ({"learner": "plain"}, "value decomposition: the team's value is the sum of the agents'"),
     "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', mixed as the state says"),
-    "central": ({"learner": "plain", **CARE}, "one double, dueling network over all joint orders of the team"),
+    "central": (
+        # the team's return would end with any member's, and nobody would learn to get everybody out again: a punishment instead
+        {
+            "learner": "plain",
+            "risk_gamma": 0.0,
+            "shaping": Shaping(centre=10.0, scale=100.0, violation=5.0, own_switch_cost=40.0),
+        },
+        "one double, dueling network over all joint orders of the team",
+    ),
     "rlms": (
         {
             **CARE,
