@@ -21,6 +21,7 @@ OLD = 5.0
 """A command that has been in force for this long is 1 in the extended state, and so is any older one [s]."""
 
 LENGTHS = 10  # an agent has
+TEAM_ENTRIES = 3  # G one-hot, behind all agents'
 
 SPEED = 5.0
 """A velocity error of this size is 1 in the extended state [m/s]."""
@@ -72,7 +73,7 @@ class ExtendedState:
         self.slots = scenario.formations
         self.velocity = np.array(scenario.path_velocity)
         self.safe = scenario.safe_distance
-        self.size = scenario.agents * (2 * LENGTHS + 3 + self.commands) + 3
+        self.size = scenario.agents * (2 * LENGTHS + 3 + self.commands) + TEAM_ENTRIES
         self.layout = {"version": 1, "size": self.size, "range": RANGE, "close": CLOSE, "speed": SPEED, "old": OLD}
         self.scale = np.ones(self.size)
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
@@ -100,7 +101,7 @@ def nearest_surface(point, obstacles, out):  # type: ignore[no-untyped-def]
 def _fill(position, velocity, command, formation, obstacles, age, slots, path, safe, out):  # type: ignore[no-untyped-def]
     """The extended state of every world into ``out`` (B, S), which is 0."""
     agents = position.shape[1]
-    width = out.shape[1] // agents
+    width = (out.shape[1] - TEAM_ENTRIES) // agents
     centroid, slot, lengths = np.empty(2), np.empty(2), np.empty(LENGTHS)
     for b in range(position.shape[0]):
         for c in range(2):
@@ -120,6 +121,8 @@ def _fill(position, velocity, command, formation, obstacles, age, slots, path, s
                 own[LENGTHS + k] = laws.clip(lengths[k] / CLOSE, 1.0)
             for c in range(2):
                 own[2 * LENGTHS + c] = laws.clip((velocity[b, i, c] - path[c]) / SPEED, 1.0)
+            if not 0 <= command[b, i] < width - 2 * LENGTHS - 3:
+                raise IndexError("a command is none of the scenario's")
             own[2 * LENGTHS + 2 + command[b, i]] = 1.0
             own[width - 1] = laws.clip(age[b, i] / OLD, 1.0)
         out[b, agents * width + formation[b]] = 1.0

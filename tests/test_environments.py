@@ -12,6 +12,7 @@ from marlbc_mj import World, paper
 from marlbc_mj.behaviors import clearances
 from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Perturbation, make_scenario
+from marlbc_mj.scenarios.family import Family
 from marlbc_mj.tasks.batch import FormationBatch, Starts
 from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
@@ -329,14 +330,15 @@ def test_nearest_points_at_the_nearest_surface(points, discs):
         assert np.allclose(np.hypot(seen[:, 0], seen[:, 1]), np.abs(expected), atol=1e-9)
 
 
-@given(st.integers(0, 2**32 - 1))
-def test_the_extended_state_is_what_it_says(seed):
-    """Every entry against its definition, with numbers beyond the range of some; NaN stays NaN."""
-    scenario, rng = paper(), np.random.default_rng(seed)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3, 4, 5, 9]))
+def test_the_extended_state_is_what_it_says(seed, agents):
+    """Every entry against its definition, with numbers beyond the range of some, for any team; NaN stays NaN."""
+    scenario, rng = paper() if agents == 4 else Family(agents=agents).build(), np.random.default_rng(seed)
+    commands = len(scenario.orders.commands)
     read, world = make_state("extended", scenario), World(scenario, worlds=3)
     shape = 3, scenario.agents
     position, velocity = rng.normal(size=(*shape, 2)) * 8.0, rng.normal(size=(*shape, 2)) * 4.0
-    command, formation, age = rng.integers(4, size=shape), rng.integers(3, size=3), rng.uniform(0.0, 8.0, size=shape)
+    command, formation, age = rng.integers(commands, size=shape), rng.integers(3, size=3), rng.uniform(0.0, 8.0, size=shape)
     obstacles = np.concatenate([rng.normal(size=(3, 6, 2)) * 10.0, rng.uniform(0.0, 3.0, size=(3, 6, 1))], axis=-1)
     seen = world.observe()._replace(position=position, velocity=velocity, command=command, formation=formation)
     state = read(seen, obstacles, age)
@@ -348,11 +350,14 @@ def test_the_extended_state_is_what_it_says(seed):
     surfaces[..., 2] -= scenario.safe_distance
     lengths = np.concatenate([position - slots[:, 0], position - slots[:, 1], *surfaces], axis=-1)
     speeds = (velocity - np.array(scenario.path_velocity)) / SPEED
-    parts = [lengths / RANGE, lengths / CLOSE, speeds, np.eye(4)[command], age[..., None] / OLD]
+    parts = [lengths / RANGE, lengths / CLOSE, speeds, np.eye(commands)[command], age[..., None] / OLD]
     expected = np.concatenate([np.concatenate(parts, axis=-1).reshape(3, -1), np.eye(3)[formation]], axis=-1)
     np.testing.assert_allclose(state, np.clip(expected, -1.0, 1.0), atol=1e-7)
-    position[1, 2, 0] = np.nan
+    position[1, 1, 0] = np.nan
     assert np.isnan(read(seen, obstacles, age)).any(axis=1).tolist() == [False, True, False]
+    command[2, 0] = commands
+    with pytest.raises(IndexError):
+        read(seen, obstacles, age)
 
 
 def test_the_extended_state_does_not_know_where_on_the_path_it_is():

@@ -21,7 +21,7 @@ from safetensors.numpy import load_file, save_file
 from marlbc_mj import World, paper, provenance, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.cli.training import with_settings
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.supervisors.learned import Learned
@@ -53,6 +53,8 @@ def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     arrays, scalars = one.snapshot()
     arrays, scalars = {name: array.copy() for name, array in arrays.items()}, json.loads(json.dumps(scalars))
     other = Trainer(replace(config, seed=5))
+    for _ in range(85):  # past the warm-up, too: nothing of it may remain
+        other.advance()
     other.restore(arrays, scalars)
     for _ in range(40):
         a, b = one.advance(), other.advance()
@@ -63,13 +65,25 @@ def test_a_restored_trainer_goes_on_bit_for_bit(changes):
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core only")
 def test_what_is_learned_does_not_depend_on_the_threads():
-    """With two, the networks learn while the worlds move: the same numbers to the bit, and what fails there stops the run."""
+    """With two, the networks learn while the worlds move: the same numbers to the bit, also where one goes on from the other's
+    snapshot, and what fails on either side stops the run.
+    """
     one, two = (Trainer(small(threads=threads)) for threads in (1, 2))
     for _ in range(90):  # past the warm-up
         assert (one.advance().state == two.advance().state).all()
     assert one.error == two.error != 0.0
     assert one.updates == two.updates > 0
     assert equal(*(trainer.snapshot()[0] for trainer in (one, two)))
+    arrays, scalars = one.snapshot()
+    kept = {name: array.copy() for name, array in arrays.items()}
+    two.restore(kept, scalars)
+    for _ in range(12):  # past a push of the targets
+        assert (one.advance().state == two.advance().state).all()
+    assert one.error == two.error
+    two.batch.world.state.reference[3] = np.nan
+    with pytest.raises(SimulationError, match="world 3"):
+        two.advance()
+    two.restore(kept, scalars)
     two.replay.arrays["reward"][:] = np.nan
     with pytest.raises(ConfigurationError, match="diverged after"):
         two.advance()

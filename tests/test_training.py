@@ -79,7 +79,7 @@ def test_averaged_targets_are_the_mean_over_the_last_copies():
         assert torch.allclose(ring(x), torch.stack(past).mean(dim=0), atol=1e-5)
 
 
-def test_numpy_policy_equals_the_network():
+def test_a_policy_equals_the_network():
     for dueling in (True, False):
         net = network(dueling)
         states = np.random.default_rng(1).normal(size=(9, S)).astype(np.float32)
@@ -87,6 +87,9 @@ def test_numpy_policy_equals_the_network():
         policy = Policy(*arrays, scale=np.arange(1.0, S + 1, dtype=np.float32), dueling=dueling, margin=0.0)
         expected = net(torch.from_numpy(states)).detach().numpy().transpose(1, 0, 2)
         assert np.allclose(policy.values(states), expected, atol=1e-6)
+        mixed = policy._replace(weights=(np.asfortranarray(policy.weights[0]), *policy.weights[1:]))
+        mixed.weights[1].flags.writeable = False
+        assert (mixed.values(states[:, ::-1][:, ::-1]) == policy.values(states)).all()
         risky = network(dueling, risk=True)
         risky.biases[-1].data += torch.randn(risky.biases[-1].shape, generator=generator(4))  # risks apart from 1/2
         arrays = [tuple(p.detach().numpy() for p in ps) for ps in (risky.weights, risky.biases)]
@@ -109,6 +112,21 @@ def test_greedy_leaves_an_order_only_for_a_lead_above_the_margin(seed, margin):
             best = int(values[b, i].argmax())
             leads = values[b, i, best] - values[b, i, last[b, i]] > margin
             assert chosen[b, i] == (best if leads or fresh[b] else last[b, i])
+
+
+def test_a_last_action_that_is_none_is_refused():
+    """By every entry, since compiled code would read beyond the values."""
+    values, fresh = np.zeros((2, N, A)), np.zeros(2, dtype=bool)
+    for wrong in (-1, A):
+        last = np.zeros((2, N), dtype=np.int64)
+        last[1, N - 1] = wrong
+        with pytest.raises(IndexError, match="last action"):
+            greedy(values, last, fresh, 0.1)
+
+
+def test_networks_have_a_hidden_layer():
+    with pytest.raises(ConfigurationError, match="hidden"):
+        TeamNetwork(N, S, A, (), torch.ones(S))
 
 
 def test_leniency_is_the_printed_formula():

@@ -8,6 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.errors import ConfigurationError
+
 
 class TeamNetwork(nn.Module):
     """One dueling network per agent, Q_i(s, b) = V_i(s) + B_i(s, b) - mean_b B_i (Wang et al. 2016), all on the same state.
@@ -16,13 +18,16 @@ class TeamNetwork(nn.Module):
         agents: N.
         state: S, the size of the state.
         actions: A.
-        hidden: widths of the ReLU layers.
+        hidden: widths of the ReLU layers, at least one.
         scale: (S,) the state is divided by it.
         dueling: False makes the last layer give Q itself.
         risk: the last layer gives the logit of a risk for every action, too.
         generator: of the initial weights.
         mask: (N, S) of 0 and 1, the entries that each agent's network sees; all by default. The others' weights in the first
             layer are 0 and stay 0.
+
+    Raises:
+        ConfigurationError: no hidden layer.
     """
 
     def __init__(
@@ -39,6 +44,8 @@ class TeamNetwork(nn.Module):
         mask: Tensor | None = None,
     ) -> None:
         super().__init__()
+        if not hidden:
+            raise ConfigurationError(f"networks must have at least one hidden layer, got {hidden}")
         self.dueling = dueling
         self.risk = risk
         self.actions = actions
@@ -86,7 +93,8 @@ def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """(N, B, O) outputs from stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or (N, B, in).
+    """(N, B, O) outputs from two or more layers of stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or
+    (N, B, in).
 
     ``first`` is the first layer :func:`side_by_side`, where it is at hand; it saves time with inputs (B, in) and changes nothing.
     """
@@ -109,7 +117,7 @@ class TargetRing:
         self.agents = network.weights[0].shape[0]
         self.tensors = [p.detach().repeat(copies, 1, 1) for p in self._parameters()]  # (copies N, ., .)
         self.next = 0
-        self.first: tuple[Tensor, Tensor] | None = None  # the copies' first layers side by side, until they change
+        self.first_layer: tuple[Tensor, Tensor] | None = None  # the copies' side by side, until they change
 
     def _parameters(self) -> Iterator[Tensor]:
         yield from self.network.weights
@@ -121,13 +129,13 @@ class TargetRing:
         for copy, parameter in zip(self.tensors, self._parameters(), strict=True):
             copy[rows] = parameter.detach()
         self.next = (self.next + 1) % self.copies
-        self.first = None
+        self.first_layer = None
 
     def restore(self, tensors: Sequence[Tensor]) -> None:
-        """Take over the ``tensors`` of another ring."""
+        """Copy the ``tensors`` of another ring; ``next`` is set apart."""
         for copy, tensor in zip(self.tensors, tensors, strict=True):
             copy.copy_(tensor)
-        self.first = None
+        self.first_layer = None
 
     def __call__(self, state: Tensor) -> Tensor:
         """(N, B, A) averaged action values of states (B, S), or of (N, B, S) where every agent has its own."""
@@ -140,9 +148,9 @@ class TargetRing:
         if state.ndim == 3:
             state = state.repeat(self.copies, 1, 1)
         weights, biases = self.tensors[:layers], self.tensors[layers:]
-        if self.first is None:
-            self.first = side_by_side(weights[0], biases[0])
-        outputs = apply(weights, biases, state / self.network.scale, self.first)
+        if self.first_layer is None and state.ndim == 2:
+            self.first_layer = side_by_side(weights[0], biases[0])
+        outputs = apply(weights, biases, state / self.network.scale, self.first_layer)
         values, risks = self.network.split(outputs.view(self.copies, self.agents, *outputs.shape[1:]))
         return values.mean(dim=0), torch.sigmoid(risks).mean(dim=0)
 
@@ -172,6 +180,5 @@ def restore(arrays: Mapping[str, np.ndarray], parameters: Sequence[nn.Parameter]
         p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
         prefix = f"adam{k}."
         moments = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
-        optimiser.state[p] = {
-            name: torch.from_numpy(array.copy()).to("cpu" if name == "step" else p.device) for name, array in moments.items()
-        }
+        for name, array in moments.items():
+            optimiser.state[p][name].copy_(torch.from_numpy(array))

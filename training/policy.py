@@ -11,7 +11,7 @@ from marlbc_mj.laws import compiled, inlined
 if TYPE_CHECKING:
     from torch import Tensor
 
-SLACK = 0.05
+SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
 """Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
 
@@ -38,9 +38,12 @@ class Policy(NamedTuple):
         """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
         state = np.ascontiguousarray(state, dtype=np.float32)
         scale = np.asarray(self.scale, dtype=np.float32)
-        values: np.ndarray = action_values(
-            state, scale, self.weights, self.biases, self.dueling, self.columns, np.float32(self.risk)
-        )
+        weights, biases = self.weights, self.biases
+        if not all(array.flags.carray for array in (*weights, *biases)):  # compiled code takes arrays of one kind
+            weights, biases = (
+                tuple(np.require(array, np.float32, ("C", "W")) for array in arrays) for arrays in (weights, biases)
+            )
+        values: np.ndarray = action_values(state, scale, weights, biases, self.dueling, self.columns, np.float32(self.risk))
         return values
 
 
@@ -61,13 +64,16 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
         last: (B, N) actions before.
         fresh: (B,) bool, no action has been taken yet, so there is nothing to keep.
         margin: of the action values.
+
+    Raises:
+        IndexError: a last action that is none.
     """
     agents = last.shape[1]
     if values.shape[1] != agents:
         each = (round(values.shape[2] ** (1 / agents)),) * agents
         joint = greedy(values, np.ravel_multi_index(tuple(last.T), each)[:, None], fresh, margin)
         return np.stack(np.unravel_index(joint[:, 0], each), axis=-1)
-    best: np.ndarray = best_actions(values, last, fresh, values.dtype.type(margin))
+    best: np.ndarray = best_actions(values, last, fresh, np.result_type(values, np.float32).type(margin))
     return best
 
 
@@ -77,6 +83,8 @@ def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
     best = np.empty(last.shape, dtype=np.int64)
     for b in range(last.shape[0]):
         for i in range(last.shape[1]):
+            if not 0 <= last[b, i] < values.shape[2]:
+                raise IndexError("a last action is no index into the action values")
             action = values[b, i].argmax()
             leads = values[b, i, action] - values[b, i, last[b, i]] > margin
             best[b, i] = action if leads or fresh[b] else last[b, i]

@@ -7,15 +7,13 @@ import torch
 from torch import Tensor, nn
 
 from marlbc_mj.errors import unknown
-from marlbc_mj.tasks.states import PrintedState, State
+from marlbc_mj.tasks.states import TEAM_ENTRIES, PrintedState, State
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.replay import Batch
 
 EMBEDDING = 32
 """Units of QMIX's mixing network (Rashid et al. 2018)."""
-TEAM_ENTRIES = 3
-"""Entries behind the agents' in the extended state: G one-hot."""
 
 
 class VDN(Learner):

@@ -143,6 +143,7 @@ class Trainer(BaseTrainer):
                 self._await(learnt)
 
     def _await(self, learnt: Future[None]) -> None:
+        """Until the networks have learned; a method of its own for the profile's sake."""
         learnt.result()
 
     def _learn(self, share: float) -> None:

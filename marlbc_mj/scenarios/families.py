@@ -18,7 +18,7 @@ from marlbc_mj.scenarios.obstacles import Range, Scatter, Traffic, Walls
 START_SPREAD = Perturbation(start_spread=0.5)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Exchange(Family):
     """Everyone starts where the agent opposite in a circle belongs: without agent avoidance all meet in the middle."""
 
@@ -37,7 +37,7 @@ class Exchange(Family):
         return -self.slots
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Field(Family):
     """Discs of different size at random places."""
 
@@ -81,7 +81,7 @@ class Field(Family):
         return ()  # every seed would need another
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Forest(Field):
     """Many thin trunks, none nearer to another than an agent needs to pass."""
 
@@ -111,7 +111,7 @@ class Forest(Field):
         return self.scatter(self.trunks, self.radius, self.gap)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Gates(Family):
     """Walls of discs across the way, each with one opening, all of a given width."""
 
@@ -172,7 +172,7 @@ class Gates(Family):
         return tuple(windows)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Corridor(Gates):
     """One long passage between two walls."""
 
@@ -183,7 +183,7 @@ class Corridor(Gates):
     summary: ClassVar[str] = "a wall across the way, and behind its opening a corridor"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Crossing(Family):
     """Obstacles that move, beyond the paper's Assumption 2: some cross the way when the team comes, others swing across it."""
 

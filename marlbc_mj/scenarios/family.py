@@ -68,7 +68,7 @@ class Mission:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Family(Mission):
     """What all families share; alone, it is a mission with nothing in the way.
 

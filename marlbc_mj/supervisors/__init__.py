@@ -63,7 +63,8 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, SUPERVISORS)
     supervisor = SUPERVISORS[name][0]()
-    return replace(supervisor, controller=controller) if isinstance(supervisor, Oracle) else supervisor
+    own = isinstance(supervisor, Oracle) and name in ("oracle", "oracle-schedule")
+    return replace(supervisor, controller=controller) if own else supervisor  # type: ignore[type-var]  # a dataclass
 
 
 __all__ = [
