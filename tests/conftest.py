@@ -5,6 +5,7 @@ from functools import cache
 from typing import Any
 
 import pytest
+import torch._dynamo  # noqa: F401  # builds with CUDA bring triton, whose LLVM crashes if a software renderer's is loaded first
 from hypothesis import settings
 
 from marlbc_mj.controllers import make_controller
