@@ -187,9 +187,10 @@ def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, f
         _learn(trainer, decisions)
         clock.turn_to(REST)
     total = sum(clock.seconds.values())
-    return tuple(  # type: ignore[return-value]  # mypy sees a tuple of any length
+    own, aside = (
         {part: seconds / total for part, seconds in taken.items() if seconds > 0} for taken in (clock.seconds, clock.aside)
     )
+    return own, aside
 
 
 def _measure_decisions(trainer: BaseTrainer, episodes: int) -> dict[str, dict[str, float]]:

@@ -177,7 +177,8 @@ class TrainConfig:
     save_every: float = 60.0
     """Seconds between saves for --resume."""
     threads: int = 2
-    """Threads of the simulation. With more than one, the networks learn in another one meanwhile; the results are the same."""
+    """Threads of the simulation. With more than one, networks that learn from a replay buffer do so in another one meanwhile; the
+    results are the same."""
     device: str = "cpu"
     """Device of the networks: cpu or cuda."""
 

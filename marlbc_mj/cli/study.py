@@ -34,8 +34,8 @@ class Study:
     """Variants to train; all of them by default."""
     seeds: int = 5
     """Runs of a variant, with seeds from 0 on."""
-    budget: int = 1_200_000
-    """Mission steps of a run."""
+    budget: int | None = None
+    """Mission steps of a run; by default those of the preset `fast`."""
     workers: int = 2
     """Processes that share the runs, one thread each."""
     out: Path = Path("runs/study")
@@ -49,12 +49,14 @@ class Study:
         """Train what is missing, then write and print the comparison; a stopped study compares what there is."""
         from marlbc_mj.report.table import to_markdown
         from marlbc_mj.training import study, study_report
+        from marlbc_mj.training.config import make_config
 
         if self.source is not None:
             rows, curves, folder, stopped = *study.read_study(self.source), self.source, 0
         else:
             adjust = partial(with_settings, settings=self.set)
-            jobs = plan(self.variants, self.seeds, self.budget, self.out, adjust)
+            budget = make_config("fast").budget if self.budget is None else self.budget
+            jobs = plan(self.variants, self.seeds, budget, self.out, adjust)
             stopped = run_study(jobs, self.workers, partial(print, file=sys.stderr, flush=True))
             rows, curves = study.collect(self.out)
             folder = self.out

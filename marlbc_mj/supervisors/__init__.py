@@ -1,7 +1,7 @@
 """Mission supervisors: one per file, and the names under which the command line offers them."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from functools import partial
 
 from marlbc_mj.errors import unknown
 from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, situation
@@ -14,7 +14,7 @@ from marlbc_mj.supervisors.oracle import Oracle
 from marlbc_mj.supervisors.scripted import Scripted
 from marlbc_mj.training.shipped import shipped
 
-SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
+SUPERVISORS: dict[str, tuple[Callable[..., Supervisor], str]] = {
     "scripted": (Scripted, "the scenario's schedule: the fewest switches its geometry allows"),
     "fsams": (FSAMS, "finite state automaton on the clearance, thresholds as printed (chatters)"),
     "fsams-hysteresis": (
@@ -23,7 +23,7 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
     ),
     "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known that never violates"),
     "oracle-schedule": (
-        lambda: Oracle(unperturbed=True),
+        partial(Oracle, unperturbed=True),
         "the oracle's switch times, played on any draw around the scenario: what foresight for one is worth elsewhere",
     ),
     "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
@@ -45,6 +45,8 @@ SUPERVISORS: dict[str, tuple[Callable[[], Supervisor], str]] = {
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
 }
 """Factory and one line of description by name."""
+ORACLES = ("oracle", "oracle-schedule")
+"""Supervisors whose factories take the name of the controller that the schedule was found with."""
 LEARNED = ("marlms", "rlms")
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
 ON_REQUEST = ("mpcms-mujoco", "oracle-schedule")
@@ -62,9 +64,8 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
     """
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, SUPERVISORS)
-    supervisor = SUPERVISORS[name][0]()
-    own = isinstance(supervisor, Oracle) and name in ("oracle", "oracle-schedule")
-    return replace(supervisor, controller=controller) if own else supervisor  # type: ignore[type-var]  # a dataclass
+    factory = SUPERVISORS[name][0]
+    return factory(controller) if name in ORACLES else factory()
 
 
 __all__ = [

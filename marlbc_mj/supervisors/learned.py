@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ class Learned:
     """
 
     policy: Policy
-    signature: dict[str, object]
+    signature: dict[str, Any]
     path: Path
 
     @classmethod
@@ -52,7 +52,7 @@ class Learned:
     @property
     def interval(self) -> int:
         """Mission steps that a decision holds for."""
-        return int(self.signature["interval"])  # type: ignore[call-overload, no-any-return]  # checked when read
+        return int(self.signature["interval"])
 
     def start(self, scenario: Scenario) -> LearnedMemory:
         """Check the scenario against what the policy was trained for.
@@ -62,8 +62,8 @@ class Learned:
                 :func:`~marlbc_mj.training.checkpoint.signature`; or networks that do not fit them.
         """
         check_signature(self.path, self.signature, scenario)
-        read = make_state(str(self.signature["state"]), scenario)
-        orders = order_of(scenario, str(self.signature["actions"]))
+        read = make_state(self.signature["state"], scenario)
+        orders = order_of(scenario, self.signature["actions"])
         check_policy(self.path, self.policy, scenario.agents, len(orders), read.size)
         none = np.zeros((1, scenario.agents), dtype=np.int64)
         hold = self.interval * scenario.mission_step
