@@ -14,7 +14,7 @@ from marlbc_mj import World, make_controller, make_supervisor, paper, run_episod
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.video import render_still, render_video
 from marlbc_mj.robots import make_robot
-from marlbc_mj.robots.gate import CONTROLLERS, SHOWN, fly_gate
+from marlbc_mj.studies.robot_gate import CONTROLLERS, SHOWN, fly_gate
 
 GALLERY = Path(__file__).parent / "gallery"
 STILL, CLIP = (960, 540), (640, 360)  # [pixels]

@@ -4,34 +4,34 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from marlbc_mj import laws
-    from marlbc_mj.bench import run_bench
     from marlbc_mj.controllers import PD, SORLC, make_controller
+    from marlbc_mj.core import laws
     from marlbc_mj.engine.world import World
     from marlbc_mj.episode import Trajectory, run_episode
-    from marlbc_mj.errors import ConfigurationError, MarlbcError, SimulationError
-    from marlbc_mj.metrics import measure
     from marlbc_mj.recording.reader import read_log
     from marlbc_mj.recording.video import render_video
     from marlbc_mj.recording.writer import LogWriter
+    from marlbc_mj.results.metrics import measure
     from marlbc_mj.scenarios import Scenario, make_scenario, paper
+    from marlbc_mj.studies.bench import run_bench
     from marlbc_mj.supervisors import FSAMS, Scripted, make_supervisor
+    from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "laws": "marlbc_mj.laws",
-    "run_bench": "marlbc_mj.bench",
+    "laws": "marlbc_mj.core.laws",
+    "run_bench": "marlbc_mj.studies.bench",
     "PD": "marlbc_mj.controllers",
     "SORLC": "marlbc_mj.controllers",
     "make_controller": "marlbc_mj.controllers",
     "World": "marlbc_mj.engine.world",
     "Trajectory": "marlbc_mj.episode",
     "run_episode": "marlbc_mj.episode",
-    "ConfigurationError": "marlbc_mj.errors",
-    "MarlbcError": "marlbc_mj.errors",
-    "SimulationError": "marlbc_mj.errors",
-    "measure": "marlbc_mj.metrics",
+    "ConfigurationError": "marlbc_mj.util.errors",
+    "MarlbcError": "marlbc_mj.util.errors",
+    "SimulationError": "marlbc_mj.util.errors",
+    "measure": "marlbc_mj.results.metrics",
     "read_log": "marlbc_mj.recording.reader",
     "render_video": "marlbc_mj.recording.video",
     "LogWriter": "marlbc_mj.recording.writer",

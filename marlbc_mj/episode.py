@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import clearances, clearances_among
+from marlbc_mj.core.behaviors import clearances, clearances_among
+from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.engine.world import World
-from marlbc_mj.motion import NUMBERS, moved
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Blend, Supervisor, situation
 

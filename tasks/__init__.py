@@ -7,8 +7,8 @@ import gymnasium
 import numpy as np
 
 from marlbc_mj.controllers import Controller
-from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.util.errors import unknown
 
 DOMAINS = ("formation",)
 

@@ -6,43 +6,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import clearances
 from marlbc_mj.controllers import Controller
+from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.core.motion import obstacles_at
+from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.motion import obstacles_at
-from marlbc_mj.orders import SEPARATOR
+from marlbc_mj.policies.actions import order_of
+from marlbc_mj.policies.states import OLD, make_state
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.layout import motion_array
-from marlbc_mj.tasks.states import OLD, make_state
+from marlbc_mj.util.errors import ConfigurationError
 
-ACTIONS = ("commands", "orders", "avoidance")
 TRIES = 20
 """Places along the route that are tried for an exploring start."""
-
-
-def order_of(scenario: Scenario, actions: str) -> np.ndarray:
-    """(A,) index into ``scenario.orders`` of every action of a set.
-
-    Args:
-        scenario: whose orders they are.
-        actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, those
-            commands that end in the first formation, the shortest first: FM and OA>FM in the case study.
-
-    Raises:
-        ConfigurationError: there is no such set.
-    """
-    orders = scenario.orders
-    if actions == "commands":
-        return orders.representative
-    if actions == "orders":
-        return np.arange(len(orders))
-    if actions != "avoidance":
-        raise unknown("action set", actions, ACTIONS)
-    parts = [name.split(SEPARATOR) for name in orders.commands]
-    kept = [c for c, names in enumerate(parts) if names[-1] == scenario.formation_names[0]]
-    return orders.representative[sorted(kept, key=lambda c: len(parts[c]))]
 
 
 @dataclass(frozen=True)

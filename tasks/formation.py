@@ -14,11 +14,11 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
+from marlbc_mj.core.imperfections import weaken
 from marlbc_mj.engine.body import actuate, measure
 from marlbc_mj.engine.loop import team_forces, team_forces_compiled
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.engine.state import TeamState
-from marlbc_mj.imperfections import weaken
 from marlbc_mj.scenarios import Scenario
 
 

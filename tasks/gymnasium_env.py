@@ -7,10 +7,10 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from marlbc_mj.controllers import Controller
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.states import State
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
-from marlbc_mj.tasks.states import State
+from marlbc_mj.util.errors import ConfigurationError
 
 ID = "marlbc_mj/PaperFormation-v0"
 """Known to ``gymnasium.make`` and ``gymnasium.make_vec`` once :mod:`marlbc_mj.tasks` is imported."""

@@ -7,10 +7,10 @@ from gymnasium.spaces import Discrete, Space
 from pettingzoo import ParallelEnv
 
 from marlbc_mj.controllers import Controller
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj import laws
-from marlbc_mj.disturbances import LinearDrag
+from marlbc_mj.core import laws
+from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.engine.world import Record, World
 from marlbc_mj.robots import make_robot
-from marlbc_mj.robots.checklist import step_scenario
+from marlbc_mj.studies.robot_check import step_scenario
 
 
 @laws.controller

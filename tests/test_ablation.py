@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from marlbc_mj.ablation import STUDIES, Case, Row, Study, run_study, select_studies, study_table, write_page
-from marlbc_mj.ablation.studies import _largest_changes, half_mission, variants
 from marlbc_mj.cli import main
 from marlbc_mj.cli.studies import Ablation
 from marlbc_mj.controllers import SORLC
-from marlbc_mj.disturbances import PaperDrag
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core.disturbances import PaperDrag
 from marlbc_mj.scenarios import Scenario, cruise, paper
+from marlbc_mj.studies.ablation import STUDIES, Case, Row, Study, run_study, select_studies, study_table, write_page
+from marlbc_mj.studies.ablation.studies import _largest_changes, half_mission, variants
+from marlbc_mj.util.errors import ConfigurationError
 
 
 def compare(scenario: Scenario) -> dict[str, Row]:

@@ -8,14 +8,14 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from marlbc_mj.behaviors import AgentAvoidance
+from marlbc_mj.core.behaviors import AgentAvoidance
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.supervisors import Blend, make_supervisor, situation
 from marlbc_mj.supervisors.neighbors import REACH
+from marlbc_mj.util.errors import ConfigurationError
 
 TEAM = st.integers(2, 8).flatmap(lambda n: arrays(np.float64, (n, 2), elements=st.floats(-3, 3)))
 PATH = np.array([[0.0, 0.0], [1.0, -0.5]])

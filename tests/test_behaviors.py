@@ -6,8 +6,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from marlbc_mj.behaviors import Behavior, Formation, ObstacleAvoidance, nearest_obstacle
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core.behaviors import Behavior, Formation, ObstacleAvoidance, nearest_obstacle
+from marlbc_mj.util.errors import ConfigurationError
 
 STEP = 1e-6  # of the finite differences [m]
 

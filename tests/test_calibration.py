@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marlbc_mj.calibration import CALIBRATED, Calibration, calibrate, calibration_lines, maxima
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import make_controller
-from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.report.paper_values import INPUT_MAX
 from marlbc_mj.scenarios import Scenario, Window, paper
 from marlbc_mj.scenarios.case_study import SLOTS
+from marlbc_mj.studies.calibration import CALIBRATED, Calibration, calibrate, calibration_lines, maxima
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def test_wrong_requests_are_refused(switch: Scenario) -> None:
 
 def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, switch: Scenario) -> None:
     """Printed, found and shipped row of each controller; an unknown controller is one line."""
-    monkeypatch.setattr("marlbc_mj.calibration.paper", lambda: switch)
+    monkeypatch.setattr("marlbc_mj.studies.calibration.paper", lambda: switch)
     main(["calibrate", "--controllers", "fixed-time"])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split("|")[1].strip() for line in lines[2:]] == [f"fixed-time, {row}" for row in ("printed", "found", "shipped")]

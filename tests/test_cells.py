@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from marlbc_mj.behaviors import nearest_obstacle
-from marlbc_mj.cells import FARTHEST, fill, nearest, room, spacing
+from marlbc_mj.core.behaviors import nearest_obstacle
+from marlbc_mj.core.cells import FARTHEST, fill, nearest, room, spacing
 from marlbc_mj.engine import plan as plans
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario, make_scenario

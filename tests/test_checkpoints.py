@@ -11,12 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from safetensors.numpy import save_file
 
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.checkpoint import FORMAT, digest, read_arrays, read_policy, signature, write_arrays, write_policy
+from marlbc_mj.policies.greedy import Policy
+from marlbc_mj.policies.states import make_state
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.tasks.states import make_state
-from marlbc_mj.training.checkpoint import FORMAT, digest, read_arrays, read_policy, signature, write_arrays, write_policy
-from marlbc_mj.training.policy import Policy
+from marlbc_mj.util.errors import ConfigurationError
 
 SIZE = make_state("extended", paper()).size
 

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from marlbc_mj.bench import Stopwatch, matrix
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
-from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
+from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.studies.bench import Stopwatch, matrix
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import METHODS, PRESETS
 

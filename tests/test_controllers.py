@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from marlbc_mj.controllers import CONTROLLERS, PD, SORLC, Controller, largest_stable_substep, make_controller
 from marlbc_mj.controllers.sorlc import NEURONS, weights
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError
 
 H = 0.005  # [s]
 ZERO = np.zeros(2)

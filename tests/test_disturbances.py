@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from marlbc_mj.disturbances import ConstantWind, LinearDrag, PaperDrag, QuadraticDrag
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core.disturbances import ConstantWind, LinearDrag, PaperDrag, QuadraticDrag
+from marlbc_mj.util.errors import ConfigurationError
 
 vectors = arrays(np.float64, 2, elements=st.floats(-100.0, 100.0))
 scales = st.floats(-3.0, 3.0)

@@ -11,10 +11,10 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.studies.learners import VARIANTS
 from marlbc_mj.supervisors import SUPERVISORS
 from marlbc_mj.training.config import METHODS
 from marlbc_mj.training.rivals import LEARNERS
-from marlbc_mj.training.study import VARIANTS
 
 DOCS = Path(__file__).parent.parent / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))

@@ -9,21 +9,21 @@ import numba
 import numpy as np
 import pytest
 
-from marlbc_mj import laws
-from marlbc_mj.behaviors import Formation, ObstacleAvoidance
 from marlbc_mj.controllers import PD, SORLC, make_controller
 from marlbc_mj.controllers.pd import pd
-from marlbc_mj.disturbances import PaperDrag, constant_wind, linear_drag
+from marlbc_mj.core import laws
+from marlbc_mj.core.behaviors import Formation, ObstacleAvoidance
+from marlbc_mj.core.disturbances import PaperDrag, constant_wind, linear_drag
 from marlbc_mj.engine.assembly import assemble
 from marlbc_mj.engine.loop import judge
 from marlbc_mj.engine.native import call_step, step_address
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.scenarios import Obstacle, Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 STILL = PaperDrag(scale=0.0)  # no disturbance
 PERTURBED = Perturbation(start_spread=0.5, obstacle_spread=0.3, drag_scale=(0.5, 1.5))

@@ -9,14 +9,14 @@ from hypothesis import strategies as st
 from pettingzoo.test import parallel_api_test
 
 from marlbc_mj import World, paper
-from marlbc_mj.behaviors import clearances
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.policies.states import CLOSE, OLD, RANGE, SPEED, make_state, nearest_surface
 from marlbc_mj.scenarios import Perturbation, make_scenario
 from marlbc_mj.scenarios.family import Family
 from marlbc_mj.tasks.batch import FormationBatch, Starts
 from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
-from marlbc_mj.tasks.states import CLOSE, OLD, RANGE, SPEED, make_state, nearest_surface
+from marlbc_mj.util.errors import ConfigurationError
 
 AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
 

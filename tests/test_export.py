@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
+from marlbc_mj.policies.checkpoint import signature, write_policy
+from marlbc_mj.policies.greedy import Policy, greedy
+from marlbc_mj.policies.states import make_state
 from marlbc_mj.scenarios import paper
-from marlbc_mj.tasks.states import make_state
-from marlbc_mj.training.checkpoint import signature, write_policy
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.policy import Policy, greedy
 
 pytest.importorskip("onnx")
 runtime = pytest.importorskip("onnxruntime")

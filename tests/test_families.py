@@ -8,11 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from marlbc_mj.behaviors import clearances
-from marlbc_mj.disturbances import LinearDrag, WindGusts
+from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.core.disturbances import LinearDrag, WindGusts
+from marlbc_mj.core.motion import moved
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.motion import moved
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import FAMILIES, SCENARIOS, Perturbation, held_out, load_scenario, make_scenario
 from marlbc_mj.scenarios.families import Corridor, Crossing, Exchange, Field, Forest, Gates
@@ -20,6 +19,7 @@ from marlbc_mj.scenarios.family import Family
 from marlbc_mj.scenarios.formations import FORMATIONS, column, make_formation
 from marlbc_mj.scenarios.layout import layout_number
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError
 
 DRAWN = [name for name, family in FAMILIES.items() if family().layout() is not None]
 

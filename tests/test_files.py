@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import remove_leftovers, staged_file, write_json
-from marlbc_mj.training.checkpoint import read_arrays, write_arrays
+from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.training.run import write_table
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import remove_leftovers, staged_file, write_json
 
 WRITERS = {
     "arrays": lambda path, size: write_arrays(path.with_suffix(".safetensors"), {"x": np.zeros(size)}, {}),
@@ -53,7 +53,7 @@ LIMITED = """
 import resource, signal, sys
 from pathlib import Path
 from test_files import LARGE, LIMIT, WRITERS
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, LIMIT))
 for kind, write in WRITERS.items():

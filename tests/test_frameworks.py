@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from marlbc_mj.controllers import PD
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, Scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Blend, Situation, Supervisor, make_supervisor
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
+from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))

@@ -6,14 +6,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.controllers import PD
+from marlbc_mj.core.imperfections import Imperfections, normal
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.imperfections import Imperfections, normal
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.tasks.formation import make_environment
+from marlbc_mj.util.errors import ConfigurationError
 
 NOISY = Imperfections(position_noise=0.02, velocity_noise=0.05, delay=0.02, loss=0.3, loss_agent=1, loss_start=0.5)
 

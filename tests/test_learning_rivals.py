@@ -13,20 +13,21 @@ from hypothesis import strategies as st
 
 from marlbc_mj import paper
 from marlbc_mj.engine.state import Observation
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.provenance import plain_data
+from marlbc_mj.policies.actions import ACTIONS, order_of
+from marlbc_mj.policies.checkpoint import read_arrays
+from marlbc_mj.policies.greedy import greedy
+from marlbc_mj.policies.states import STATES, make_state
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.tasks.batch import ACTIONS, FormationBatch, Starts, order_of
-from marlbc_mj.tasks.states import STATES, make_state
-from marlbc_mj.training.checkpoint import read_arrays
+from marlbc_mj.tasks.batch import FormationBatch, Starts
 from marlbc_mj.training.config import METHODS, PPO, TrainConfig, from_json, make_config
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss, log_probability
-from marlbc_mj.training.policy import greedy
 from marlbc_mj.training.prioritised import ALPHA, BETA, LEAST_ERROR, PrioritisedReplay
 from marlbc_mj.training.replay import Batch
 from marlbc_mj.training.rivals import LEARNERS, QMIX, RLMS, VDN, Central, Mixer, learner_class, own_entries
 from marlbc_mj.training.run import RESUME, Interrupted, make_trainer, resume, train
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.provenance import plain_data
 
 N, S, A = 3, 5, 4
 

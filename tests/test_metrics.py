@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from marlbc_mj.behaviors import clearances
+from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.metrics import convergence_time, measure
+from marlbc_mj.results.metrics import convergence_time, measure
 from marlbc_mj.scenarios import Obstacle, Scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import make_supervisor
 

@@ -7,17 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marlbc_mj import scale
 from marlbc_mj.cli import main
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
-from marlbc_mj.outcomes import FAILED, outcome
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.outcomes import FAILED, outcome
+from marlbc_mj.results.seeds import perturbed, run_methods
 from marlbc_mj.scenarios import held_out, make_scenario
 from marlbc_mj.scenarios.families import Gates
-from marlbc_mj.seeds import perturbed, run_methods
+from marlbc_mj.studies import scale
 from marlbc_mj.supervisors import UNLEARNED, make_supervisor
+from marlbc_mj.util.errors import ConfigurationError
 
 
 @pytest.fixture(scope="module")

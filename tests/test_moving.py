@@ -7,22 +7,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.behaviors import ObstacleAvoidance, clearances
 from marlbc_mj.controllers import SORLC
-from marlbc_mj.disturbances import LinearDrag
+from marlbc_mj.core.behaviors import ObstacleAvoidance, clearances
+from marlbc_mj.core.disturbances import LinearDrag
+from marlbc_mj.core.motion import MOVING, drift, move, moved, obstacles_at
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
-from marlbc_mj.motion import MOVING, drift, move, moved, obstacles_at
 from marlbc_mj.recording.log import from_trajectory
 from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Motion, Obstacle, make_scenario
 from marlbc_mj.scenarios.layout import motion_array, motions_of
 from marlbc_mj.supervisors import MPCMS, make_supervisor, situation
 from marlbc_mj.tasks.formation import make_environment
+from marlbc_mj.util.errors import ConfigurationError
 
 NUMBER = st.floats(-5, 5)
 MOTION = st.builds(Motion, NUMBER, NUMBER, NUMBER, NUMBER, st.floats(0.5, 50), st.floats(-7, 7))

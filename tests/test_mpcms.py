@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from marlbc_mj.controllers import PD, SORLC
+from marlbc_mj.core.laws import plain
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.laws import plain
-from marlbc_mj.metrics import measure
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors import Situation, situation
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
 from marlbc_mj.supervisors.prediction import judge
+from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 PLAN = make_plan(PAPER, SORLC())

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.nullspace import compose, projector
+from marlbc_mj.core.nullspace import compose, projector
 
 OA, FM, FR = 0, 1, 2
 seeds = st.integers(0, 2**32 - 1)

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, Window, paper
 from marlbc_mj.supervisors import Oracle, Scripted, make_supervisor
 from marlbc_mj.supervisors.oracle import command_table, evaluate, read_cache, save, search, segments, shipped, windows_of
+from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 SHORT = paper(

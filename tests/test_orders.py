@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.orders import Orders
+from marlbc_mj.core.orders import Orders
+from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = Orders(("OA", "FM", "FR"), (False, True, True))
 teams = st.lists(st.booleans(), min_size=1, max_size=5)

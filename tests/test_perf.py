@@ -5,9 +5,9 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from marlbc_mj import perf, perf_training
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import paper
+from marlbc_mj.studies import perf, perf_training
 from marlbc_mj.training import trainer
 from marlbc_mj.training.config import TrainConfig, make_config
 

@@ -27,14 +27,14 @@ from marlbc_mj.cli import main
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.errors import ConfigurationError, SimulationError
-from marlbc_mj.provenance import config_hash
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.reader import export_log, log_info, read_log, recover_log
 from marlbc_mj.recording.writer import LogWriter, partial_name
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.provenance import config_hash
 
 CONFIG = {"steps": 3, "nested": {"a": [1.5, None, "µ"]}}
 JSON_TOPICS = [topic.name for topic in schemas.TOPICS]

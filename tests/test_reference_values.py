@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from marlbc_mj.behaviors import clearances
 from marlbc_mj.controllers import SORLC
+from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.metrics import measure
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
 

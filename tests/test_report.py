@@ -15,8 +15,6 @@ from PIL import Image
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import AgentMetrics, TeamMetrics
 from marlbc_mj.report import curves, figures, paper_values, plotting, write_report
 from marlbc_mj.report.arena import trajectories
 from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actuator
@@ -24,11 +22,13 @@ from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_page
 from marlbc_mj.report.paper_values import order_mark
 from marlbc_mj.report.pareto import coincident, pareto
-from marlbc_mj.report.results import Result, summary, write_csv
 from marlbc_mj.report.table import Column, Table, latex, to_html, to_markdown
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
+from marlbc_mj.results.metrics import AgentMetrics, TeamMetrics
+from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError
 
 REASON = "world 0, agent 3, t = 1.25 s: force | 100% of <limit> & more_so\nsecond line"
 

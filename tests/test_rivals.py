@@ -9,10 +9,10 @@ from marlbc_mj.controllers import CONTROLLERS, LQR, FiniteTime, PredefinedTime, 
 from marlbc_mj.controllers.lqr import riccati_gains
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import convergence_time, measure
+from marlbc_mj.results.metrics import convergence_time, measure
 from marlbc_mj.scenarios import Window, paper
 from marlbc_mj.supervisors import Scripted
+from marlbc_mj.util.errors import ConfigurationError
 
 LIMIT = 200.0  # [N]
 H = 0.005  # [s]

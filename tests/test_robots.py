@@ -10,23 +10,23 @@ import numpy as np
 import pytest
 from robot_worlds import Push, push
 
-from marlbc_mj import laws
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import PD
+from marlbc_mj.core import laws
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.recording.log import from_trajectory
 from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.robots import ROBOTS, Robot, make_robot, register
-from marlbc_mj.robots.checklist import checklist, step_scenario
-from marlbc_mj.robots.gate import fly_gate
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.scenarios.robot_gate import robot_gate
+from marlbc_mj.studies.robot_check import checklist, step_scenario
+from marlbc_mj.studies.robot_gate import fly_gate
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.tasks.formation import make_environment
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 crazyflie = import_module("marlbc_mj.robots.crazyflie")
 REAL = [name for name in ROBOTS if name != "point_mass"]
@@ -53,7 +53,7 @@ from pathlib import Path
 
 import numpy as np
 
-from marlbc_mj import laws
+from marlbc_mj.core import laws
 from marlbc_mj.robots import Robot
 
 

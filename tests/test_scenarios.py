@@ -5,14 +5,14 @@ import re
 import numpy as np
 import pytest
 
-from marlbc_mj.behaviors import Formation, clearances
 from marlbc_mj.controllers import PD, SORLC
-from marlbc_mj.disturbances import make_disturbance
+from marlbc_mj.core.behaviors import Formation, clearances
+from marlbc_mj.core.disturbances import make_disturbance
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError, MarlbcError
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Obstacle, Perturbation, make_scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 
 SLOTS = paper().behaviors[1].offsets
 COLUMN = paper().behaviors[2].offsets

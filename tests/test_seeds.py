@@ -8,19 +8,16 @@ import numpy as np
 import pytest
 
 from marlbc_mj.controllers import make_controller
-from marlbc_mj.disturbances import ConstantWind, PaperDrag
+from marlbc_mj.core.disturbances import ConstantWind, PaperDrag
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.metrics import measure
-from marlbc_mj.report.results import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.report.seed_files import summary, write_csv
 from marlbc_mj.report.seed_page import write_seed_report
-from marlbc_mj.report.seed_statistics import analyse, by_supervisor, group
 from marlbc_mj.report.seed_tables import make_tables
 from marlbc_mj.report.table import to_html, to_latex, to_markdown
-from marlbc_mj.scenarios import Perturbation, Scenario, paper
-from marlbc_mj.seeds import (
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.seed_statistics import analyse, by_supervisor, group
+from marlbc_mj.results.seeds import (
     CASE_STUDY_PERTURBATION,
     Instance,
     MethodRuns,
@@ -31,7 +28,10 @@ from marlbc_mj.seeds import (
     run_seeds,
     seed_range,
 )
+from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
+from marlbc_mj.scenarios import Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError
 
 CLOCK = {"decision_ms_median", "decision_ms_p99"}
 CONFIG = {"versions": {"mujoco": "3.17"}, "git_revision": "abc", "command": "marlbc bench paper --seeds 4 <&>"}

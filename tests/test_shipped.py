@@ -6,12 +6,13 @@ import pytest
 
 from marlbc_mj import World, make_supervisor, measure, paper, run_episode
 from marlbc_mj.cli import main
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.actions import ACTIONS
+from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors import LEARNED
-from marlbc_mj.tasks.batch import ACTIONS
 from marlbc_mj.training.config import make_config
 from marlbc_mj.training.run import scores, train
-from marlbc_mj.training.shipped import CHOICE, ship, shipped
+from marlbc_mj.training.ship import CHOICE, ship
+from marlbc_mj.util.errors import ConfigurationError
 
 
 @pytest.mark.parametrize("name", LEARNED)

@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.statistics import bootstrap, iqm, mean, median, paired_improvement, probability_of_improvement, rate, wilson
+from marlbc_mj.results.statistics import (
+    bootstrap,
+    iqm,
+    mean,
+    median,
+    paired_improvement,
+    probability_of_improvement,
+    rate,
+    wilson,
+)
+from marlbc_mj.util.errors import ConfigurationError
 
 
 def test_median_and_iqm_by_hand() -> None:

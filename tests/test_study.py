@@ -12,12 +12,9 @@ import pytest
 
 from marlbc_mj.cli import main, study
 from marlbc_mj.cli.study import Job, plan, run_job, run_study
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.report.table import to_markdown
-from marlbc_mj.training import run
-from marlbc_mj.training.checkpoint import read_arrays, write_arrays
-from marlbc_mj.training.config import CARE, TrainConfig
-from marlbc_mj.training.study import (
+from marlbc_mj.studies.learners import (
     COLUMNS,
     DONE,
     FAILED,
@@ -30,8 +27,11 @@ from marlbc_mj.training.study import (
     scripted_return,
     write_csvs,
 )
-from marlbc_mj.training.study_report import WIDE, by_variant, rows_of_panels, study_table, write_report
+from marlbc_mj.studies.learners_report import WIDE, by_variant, rows_of_panels, study_table, write_report
+from marlbc_mj.training import run
+from marlbc_mj.training.config import CARE, TrainConfig
 from marlbc_mj.training.trainer import Trainer
+from marlbc_mj.util.errors import ConfigurationError
 
 TINY = {"worlds": 8, "hidden": (8,), "batch": 16, "updates": 1, "capacity": 400, "start_length": 1.0, "evaluate_every": 1_600}
 SETTINGS = [f"{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in TINY.items()]

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Window, paper
 from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Scripted, Situation, Supervisor, make_supervisor
+from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))

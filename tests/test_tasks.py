@@ -12,9 +12,9 @@ from marlbc_mj import tasks
 from marlbc_mj.controllers import SORLC
 from marlbc_mj.engine.assembly import assemble
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError, SimulationError
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors import make_supervisor, situation
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
 def test_whole_episode_equals_the_compiled_loop() -> None:
@@ -90,7 +90,7 @@ def test_plain_python_controller_runs() -> None:
 
 def test_divergence_stops_the_environment() -> None:
     """A drag that no actuator can hold raises an error that names agent and time."""
-    from marlbc_mj.disturbances import PaperDrag
+    from marlbc_mj.core.disturbances import PaperDrag
 
     environment = tasks.load("formation", "paper", disturbance=PaperDrag(20.0))
     environment.reset()

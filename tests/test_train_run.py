@@ -18,17 +18,18 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save_file
 
-from marlbc_mj import World, paper, provenance, run_episode
+from marlbc_mj import World, paper, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.cli.training import with_settings
-from marlbc_mj.errors import ConfigurationError, SimulationError
+from marlbc_mj.policies.checkpoint import read_arrays, read_policy, write_arrays
 from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.training.checkpoint import read_arrays, read_policy, write_arrays
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.run import RESUME, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
+from marlbc_mj.util import provenance
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 SMALL = {
     "worlds": 128, "interval": 2, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1,
@@ -388,7 +389,7 @@ DAMAGED_RUNS = {
 
 @pytest.mark.parametrize("kind", DAMAGED_RUNS)
 def test_saved_runs_that_cannot_go_on_are_one_line(kind, finished, tmp_path, monkeypatch):
-    monkeypatch.setattr("marlbc_mj.provenance.git_revision", lambda: "abc")
+    monkeypatch.setattr("marlbc_mj.util.provenance.git_revision", lambda: "abc")
     change, fragment = DAMAGED_RUNS[kind]
     arrays, description = read_arrays(finished / RESUME)
     arrays, description = change(arrays, {**description, "git_revision": "abc"})
@@ -414,14 +415,14 @@ def test_an_unknown_revision_is_no_obstacle(revisions, finished, tmp_path, monke
     arrays, description = read_arrays(finished / RESUME)
     write_arrays(tmp_path / RESUME, arrays, {**description, "git_revision": revisions[0]})
     shutil.copy(finished / "config.json", tmp_path)
-    monkeypatch.setattr("marlbc_mj.provenance.git_revision", lambda: revisions[1])
+    monkeypatch.setattr("marlbc_mj.util.provenance.git_revision", lambda: revisions[1])
     assert len(resume(tmp_path)) == len(description["evaluations"])
 
 
 def test_equal_revisions_mean_equal_files(tmp_path, monkeypatch):
     """In a repository of its own: every change of a tracked file changes the text, and undoing it brings the old one back."""
-    package = tmp_path / "marlbc_mj"
-    package.mkdir()
+    package = tmp_path / "marlbc_mj" / "util"
+    package.mkdir(parents=True)
     source = package / "provenance.py"
     source.write_text("one")
 

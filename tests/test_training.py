@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.greedy import SLACK, Policy, admissible, greedy
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import METHODS, PRESETS, Shaping, TrainConfig, from_json, make_config
@@ -17,10 +17,10 @@ from marlbc_mj.training.exploration import Exploration, shares
 from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
-from marlbc_mj.training.policy import SLACK, Policy, admissible, greedy
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import RLMS, VDN
 from marlbc_mj.training.trainer import WARM_UP, Trainer, lost, shaped_reward
+from marlbc_mj.util.errors import ConfigurationError
 
 N, S, A = 3, 5, 4
 
@@ -518,7 +518,7 @@ def test_presets_and_json():
     paper = make_config("paper")
     assert (paper.learning_rate, paper.capacity, paper.budget, paper.interval) == (1e-4, 50_000, 200_000_000, 1)
     assert (paper.state, paper.actions, paper.shaping) == ("printed", "orders", Shaping())
-    from marlbc_mj.provenance import plain_data
+    from marlbc_mj.util.provenance import plain_data
 
     config = make_config("fast", seed=4, hidden=(8, 9))
     assert from_json(plain_data(config)) == config

@@ -13,8 +13,6 @@ import pytest
 from conftest import Episode
 
 from marlbc_mj.controllers import SORLC
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.palette import AGENT_COLORS, BEHAVIOR_COLORS, agent_color, ink_on, rgba
 from marlbc_mj.recording.camera import make_camera, project
 from marlbc_mj.recording.caption import Caption
 from marlbc_mj.recording.gl import choose_gl
@@ -24,6 +22,8 @@ from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.video import frame_times, render_still, render_video
 from marlbc_mj.recording.view import HOME, LEFT, RIGHT, SPACE, Playback, view
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.palette import AGENT_COLORS, BEHAVIOR_COLORS, agent_color, ink_on, rgba
 
 SMALL = {"width": 320, "height": 180}
 
@@ -206,7 +206,7 @@ def test_top_camera_of_the_model_sees_the_mission(log: EpisodeLog) -> None:
 def _choose_in_a_new_process(**environment: str) -> str:
     """What choose_gl says there."""
     code = (
-        "import sys\nfrom marlbc_mj.errors import ConfigurationError\nfrom marlbc_mj.recording.gl import choose_gl\n"
+        "import sys\nfrom marlbc_mj.util.errors import ConfigurationError\nfrom marlbc_mj.recording.gl import choose_gl\n"
         "assert 'mujoco' not in sys.modules\n"
         "try: print(choose_gl())\nexcept ConfigurationError as error: print(error)"
     )

@@ -7,12 +7,12 @@ import numpy as np
 import torch
 
 from marlbc_mj.controllers import make_controller
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
 from marlbc_mj.training.config import Shaping, TrainConfig
 from marlbc_mj.training.networks import TeamNetwork
-from marlbc_mj.training.policy import Policy
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class BaseTrainer(ABC):

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.files import writing
+from marlbc_mj.util.files import writing
 
 EVALUATION = ("return", "violation_time", "clearance_min", "switches")
 

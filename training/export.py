@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import staged_file
+from marlbc_mj.policies.actions import order_of
+from marlbc_mj.policies.checkpoint import read_policy
+from marlbc_mj.policies.greedy import SLACK, Policy
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.tasks.batch import order_of
-from marlbc_mj.training.checkpoint import read_policy
-from marlbc_mj.training.policy import SLACK, Policy
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import staged_file
 
 OPSET = 17
 """Of the operators: ONNX 1.12 (2022) and everything since run it."""
@@ -146,7 +146,7 @@ def _values(graph: _Graph, policy: Policy) -> str:
 
 
 def _greedy(graph: _Graph, policy: Policy, values: str, agents: int) -> None:
-    """:func:`marlbc_mj.training.policy.greedy`: (batch, N) ``orders`` from ``values`` and ``last``."""
+    """:func:`marlbc_mj.policies.greedy.greedy`: (batch, N) ``orders`` from ``values`` and ``last``."""
     joint = policy.weights[-1].shape[0] != agents
     fresh = graph.add("Less", graph.add("ReduceMin", "last", axes=[-1], keepdims=1), graph.whole(0))
     kept = graph.add("Max", "last", graph.whole(0))

@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.policies.greedy import admissible
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved, with_moments
-from marlbc_mj.training.policy import admissible
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from marlbc_mj.laws import compiled
+from marlbc_mj.core.laws import compiled
 
 KAPPA = 2.0
 """Leniency moderation: L = 1 - exp(-KAPPA T)."""

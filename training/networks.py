@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class TeamNetwork(nn.Module):

@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.errors import unknown
-from marlbc_mj.tasks.states import TEAM_ENTRIES, PrintedState, State
+from marlbc_mj.policies.states import TEAM_ENTRIES, PrintedState, State
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.replay import Batch
+from marlbc_mj.util.errors import unknown
 
 EMBEDDING = 32
 """Units of QMIX's mixing network (Rashid et al. 2018)."""

@@ -14,19 +14,19 @@ from typing import Any
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import check_folder, remove_leftovers, staged_file, write_json, writing
-from marlbc_mj.metrics import Metrics, measure
-from marlbc_mj.provenance import provenance
+from marlbc_mj.policies.checkpoint import read_arrays, signature, write_arrays, write_policy
+from marlbc_mj.policies.greedy import Policy
+from marlbc_mj.results.metrics import Metrics, measure
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.base import BaseTrainer
-from marlbc_mj.training.checkpoint import read_arrays, signature, write_arrays, write_policy
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
-from marlbc_mj.training.policy import Policy
 from marlbc_mj.training.saved import CONFIG, check_origin, check_snapshot, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import check_folder, remove_leftovers, staged_file, write_json, writing
+from marlbc_mj.util.provenance import provenance
 
 RESUME = "resume.safetensors"
 TABLES = ("eval.csv", "progress.csv")

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.provenance import UNKNOWN, plain_data, provenance
 from marlbc_mj.training.config import TrainConfig, flat_settings, from_json
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.provenance import UNKNOWN, plain_data, provenance
 
 SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
 """A run continues bit for bit only under the same versions of these, and the same revision where there is one."""

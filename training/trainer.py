@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.base import BaseTrainer, lost, prefixed, shaped_reward, unprefixed
 from marlbc_mj.training.codes import StateHash
@@ -16,7 +17,6 @@ from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
 from marlbc_mj.training.leniency import Temperatures, leniency
 from marlbc_mj.training.networks import TeamNetwork
-from marlbc_mj.training.policy import greedy
 from marlbc_mj.training.prioritised import PrioritisedReplay
 from marlbc_mj.training.replay import Replay
 from marlbc_mj.training.rivals import learner_class, own_entries

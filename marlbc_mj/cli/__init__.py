@@ -17,9 +17,9 @@ from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import Ship
 from marlbc_mj.cli.studies import Ablation, Calibrate, ListAll, OracleSearch, Perf
 from marlbc_mj.cli.study import Study
+from marlbc_mj.cli.terminal import prepare_gl
 from marlbc_mj.cli.training import Train
-from marlbc_mj.errors import MarlbcError
-from marlbc_mj.terminal import prepare_gl
+from marlbc_mj.util.errors import MarlbcError
 
 Command = (
     Annotated[Bench, subcommand("bench")]

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.terminal import print_results, progress_bars
+from marlbc_mj.cli.terminal import print_results, progress_bars
+from marlbc_mj.util.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from marlbc_mj.scenarios import Scenario
@@ -37,7 +37,7 @@ class ScenarioOptions:
 
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
-        from marlbc_mj.disturbances import make_disturbance
+        from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
 
         keys = ("substep", "reference", "force_limit", "duration", "split")
@@ -85,8 +85,8 @@ class Bench:
 
     def run(self) -> None:
         """Run the matrix, then say where the results are and what they are."""
-        from marlbc_mj.bench import BenchConfig, run_bench, run_bench_seeds
-        from marlbc_mj.seeds import CASE_STUDY_PERTURBATION
+        from marlbc_mj.results.seeds import CASE_STUDY_PERTURBATION
+        from marlbc_mj.studies.bench import BenchConfig, run_bench, run_bench_seeds
 
         config = BenchConfig(
             supervisors=self.supervisors,
@@ -137,7 +137,7 @@ class Run:
 
     def run(self) -> None:
         """One episode, its log and its metrics."""
-        from marlbc_mj.bench import run_single
+        from marlbc_mj.studies.bench import run_single
 
         with progress_bars() as progress:
             result = run_single(

@@ -7,7 +7,7 @@ from pathlib import Path
 from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.benchmark import ScenarioOptions
-from marlbc_mj.terminal import progress_bars
+from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)
@@ -38,11 +38,11 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluate, and print the table of outcomes."""
-        from marlbc_mj.bench import BenchConfig, run_bench_seeds
-        from marlbc_mj.report.results import method_key
         from marlbc_mj.report.seed_tables import outcome_table
         from marlbc_mj.report.table import to_markdown
+        from marlbc_mj.results.summary import method_key
         from marlbc_mj.scenarios import held_out
+        from marlbc_mj.studies.bench import BenchConfig, run_bench_seeds
         from marlbc_mj.supervisors import UNLEARNED
 
         names = UNLEARNED if self.supervisors is None else self.supervisors
@@ -77,9 +77,9 @@ class Scale:
         """Measure, print the table, and write table and figure if asked."""
         from contextlib import nullcontext
 
-        from marlbc_mj.files import staged_folder
         from marlbc_mj.report.table import to_markdown
-        from marlbc_mj.scale import measure_scale, scale_table, write_scale
+        from marlbc_mj.studies.scale import measure_scale, scale_table, write_scale
+        from marlbc_mj.util.files import staged_folder
 
         with nullcontext() if self.out is None else staged_folder(self.out, overwrite=self.overwrite) as folder:
             figures = measure_scale(self.rounds, progress=lambda message: print(f"measuring {message}", file=sys.stderr))

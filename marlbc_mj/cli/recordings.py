@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.terminal import progress_bars
+from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)

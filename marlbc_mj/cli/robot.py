@@ -7,7 +7,7 @@ from typing import Annotated
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.terminal import progress_bars
+from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class RobotCheck:
 
     def run(self) -> None:
         """Print one line a check."""
-        from marlbc_mj.robots.checklist import checklist
+        from marlbc_mj.studies.robot_check import checklist
 
         failed = 0
         for item in checklist(self.file):
@@ -48,7 +48,7 @@ class RobotGate:
 
     def run(self) -> None:
         """Fly, write, and print the table."""
-        from marlbc_mj.robots.gate import SHOWN, gate_table, run_gates
+        from marlbc_mj.studies.robot_gate import SHOWN, gate_table, run_gates
 
         with progress_bars() as progress:
             rows = run_gates(

@@ -19,6 +19,6 @@ class Ship:
 
     def run(self) -> None:
         """Copy, write the card, say where."""
-        from marlbc_mj.training.shipped import ship
+        from marlbc_mj.training.ship import ship
 
         print(ship(self.run_folder, self.name, overwrite=self.overwrite))

@@ -4,7 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from marlbc_mj.terminal import progress_bars
+from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)
@@ -13,7 +13,7 @@ class ListAll:
 
     def run(self) -> None:
         """Print every registry."""
-        from marlbc_mj.listing import selectable
+        from marlbc_mj.cli.listing import selectable
 
         for kind, entries in selectable().items():
             print(f"{kind}:")
@@ -33,9 +33,9 @@ class Perf:
 
     def run(self) -> None:
         """Measure, print, and write if asked."""
-        from marlbc_mj.files import write_json
-        from marlbc_mj.perf import measure_perf, perf_lines
-        from marlbc_mj.provenance import provenance
+        from marlbc_mj.studies.perf import measure_perf, perf_lines
+        from marlbc_mj.util.files import write_json
+        from marlbc_mj.util.provenance import provenance
 
         figures = measure_perf(self.rounds, progress=lambda message: print(f"measuring {message}", file=sys.stderr))
         print("\n".join(perf_lines(figures)))
@@ -59,10 +59,10 @@ class Ablation:
         """Run the studies, print their tables, and write the page if asked."""
         from contextlib import nullcontext
 
-        from marlbc_mj.ablation import run_study, select_studies, study_table, write_page
-        from marlbc_mj.files import staged_folder
-        from marlbc_mj.provenance import git_revision, versions
         from marlbc_mj.report.table import to_markdown
+        from marlbc_mj.studies.ablation import run_study, select_studies, study_table, write_page
+        from marlbc_mj.util.files import staged_folder
+        from marlbc_mj.util.provenance import git_revision, versions
 
         studies = select_studies(self.study)
         with nullcontext() if self.out is None else staged_folder(self.out, overwrite=self.overwrite) as folder:
@@ -87,8 +87,8 @@ class Calibrate:
         """Search and print the table."""
         from functools import partial
 
-        from marlbc_mj.calibration import CALIBRATED, calibrate, calibration_lines
-        from marlbc_mj.errors import unknown
+        from marlbc_mj.studies.calibration import CALIBRATED, calibrate, calibration_lines
+        from marlbc_mj.util.errors import unknown
 
         for name in self.controllers:
             if name not in CALIBRATED:

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import tyro
 
 from marlbc_mj.cli.training import with_settings
-from marlbc_mj.errors import ConfigurationError, MarlbcError, SimulationError, unknown
-from marlbc_mj.files import write_json
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
+from marlbc_mj.util.files import write_json
 
 if TYPE_CHECKING:
     from marlbc_mj.training.config import TrainConfig
@@ -48,7 +48,8 @@ class Study:
     def run(self) -> None:
         """Train what is missing, then write and print the comparison; a stopped study compares what there is."""
         from marlbc_mj.report.table import to_markdown
-        from marlbc_mj.training import study, study_report
+        from marlbc_mj.studies import learners as study
+        from marlbc_mj.studies import learners_report as study_report
         from marlbc_mj.training.config import make_config
 
         if self.source is not None:
@@ -86,7 +87,7 @@ class Job(NamedTuple):
     @property
     def hash(self) -> str:
         """Of the configuration."""
-        from marlbc_mj.provenance import config_hash
+        from marlbc_mj.util.provenance import config_hash
 
         return config_hash({"train": self.config})
 
@@ -111,8 +112,8 @@ def plan(
         ConfigurationError: an unknown variant or one named twice, a number below 1, a setting that cannot be run, or a folder
             with a run of another configuration.
     """
-    from marlbc_mj.seeds import seed_range
-    from marlbc_mj.training.study import VARIANTS
+    from marlbc_mj.results.seeds import seed_range
+    from marlbc_mj.studies.learners import VARIANTS
 
     for name in variants:
         if name not in VARIANTS:
@@ -134,10 +135,10 @@ def plan(
 
 def _trained(folder: Path) -> str | None:
     """Hash of the configuration that the folder's run finished with, or goes on with."""
-    from marlbc_mj.provenance import config_hash
+    from marlbc_mj.studies.learners import DONE, read_json
     from marlbc_mj.training.config import from_json
     from marlbc_mj.training.run import RESUME
-    from marlbc_mj.training.study import DONE, read_json
+    from marlbc_mj.util.provenance import config_hash
 
     if (folder / DONE).is_file():
         return str(read_json(folder / DONE, "config_hash"))
@@ -166,9 +167,9 @@ def run_job(job: Job, say: Say, stopping: Callable[[], bool] = lambda: False) ->
     Raises:
         ConfigurationError: the outcome cannot be written.
     """
-    from marlbc_mj.report.formats import one_line
+    from marlbc_mj.studies.learners import DONE, FAILED
     from marlbc_mj.training import run
-    from marlbc_mj.training.study import DONE, FAILED
+    from marlbc_mj.util.text import one_line
 
     folder, begun = job.folder, run.resumable(job.folder)
     if (folder / DONE).is_file():
@@ -205,8 +206,8 @@ def run_job(job: Job, say: Say, stopping: Callable[[], bool] = lambda: False) ->
 
 def _prune(folder: Path) -> None:
     """Leave evaluations, progress, configuration and the best checkpoint of a finished run."""
+    from marlbc_mj.studies.learners import FAILED
     from marlbc_mj.training.run import RESUME
-    from marlbc_mj.training.study import FAILED
 
     for path in (folder / RESUME, folder / FAILED, *(folder / "checkpoint").glob("last.*")):
         path.unlink(missing_ok=True)

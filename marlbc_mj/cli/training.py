@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tyro.conf import Positional
 
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
     from marlbc_mj.training.config import TrainConfig
@@ -40,7 +40,7 @@ class Train:
 
     def run(self) -> None:
         """Train with a progress display; an interrupted run says how to continue it."""
-        from marlbc_mj.terminal import training_display
+        from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
 
         with training_display() as progress:

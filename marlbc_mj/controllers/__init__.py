@@ -12,7 +12,7 @@ from marlbc_mj.controllers.predefined_time import PredefinedTime
 from marlbc_mj.controllers.rlc import RLC
 from marlbc_mj.controllers.sorlc import SORLC
 from marlbc_mj.controllers.terminal_sliding import TerminalSliding
-from marlbc_mj.errors import unknown
+from marlbc_mj.util.errors import unknown
 
 _UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR | TerminalSliding | PredefinedTime], str]] = {
     "rlc": (RLC, "single-agent RL controller: SORLC's networks, next to no damping, no limit"),

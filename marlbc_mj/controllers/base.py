@@ -5,8 +5,8 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from marlbc_mj import laws
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
 @runtime_checkable

@@ -11,8 +11,8 @@ from typing import Literal
 
 import numpy as np
 
-from marlbc_mj import laws
 from marlbc_mj.controllers.base import model_weight, require_gains
+from marlbc_mj.core import laws
 
 
 @laws.inlined
@@ -61,7 +61,7 @@ class _Homogeneous:
 class FiniteTime(_Homogeneous):
     """u = -f^ - 8 e_v - 4 sig(e_p)^0.6 - phi_0.75(e_v), with the default gains.
 
-    Source: Huang et al. 2019 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.calibration`);
+    Source: Huang et al. 2019 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.studies.calibration`);
     ``position_gain`` and the powers are chosen here.
     """
 
@@ -77,8 +77,8 @@ class FiniteTime(_Homogeneous):
 class FixedTime(_Homogeneous):
     """u = -f^ - 20 e_v - 10 sig(e_p)^0.6 - sig(e_p)^1.4 - phi_0.75(e_v) - 0.02 sig(e_v)^(7/6), with the default gains.
 
-    Source: Zhou et al. 2022 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.calibration`); the other
-    gains and the powers are chosen here.
+    Source: Zhou et al. 2022 for the form; ``velocity_gain`` from Table 6's maxima (:mod:`marlbc_mj.studies.calibration`); the
+    other gains and the powers are chosen here.
     """
 
     velocity_gain: float = 20.0  # [1/s]

@@ -5,8 +5,8 @@ from typing import Literal
 
 import numpy as np
 
-from marlbc_mj import laws
 from marlbc_mj.controllers.base import model_weight, require_gains
+from marlbc_mj.core import laws
 
 
 @laws.controller

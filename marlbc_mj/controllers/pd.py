@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marlbc_mj import laws
 from marlbc_mj.controllers.base import require_gains
+from marlbc_mj.core import laws
 
 
 @laws.controller

@@ -10,9 +10,9 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj import laws
 from marlbc_mj.controllers.base import require_gains
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 NEURONS = 12
 _F, _A, _C, _PSI_F, _PSI_V, _SCALE = (row * NEURONS for row in (0, 2, 4, 6, 7, 8))  # offsets in the state; weights axis by axis

@@ -13,10 +13,10 @@ from typing import Literal
 
 import numpy as np
 
-from marlbc_mj import laws
 from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.controllers.homogeneous import sig
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError
 
 
 @laws.controller

@@ -6,10 +6,10 @@ The engine compiles this text, and the dm_control arena is made from the same te
 import mujoco
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.palette import agent_color
 from marlbc_mj.robots import MODELS, Robot, make_robot
 from marlbc_mj.scenarios import Obstacle, Scenario
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.palette import agent_color
 
 POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
 OBSTACLE_HEIGHT = 1.2  # [m]

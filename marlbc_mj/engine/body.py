@@ -1,7 +1,7 @@
 """Between planar forces and MuJoCo's controls, and back: directly, or by the robot's own laws."""
 
+from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.engine.native import as_drive, as_reading
-from marlbc_mj.laws import allocation_free, inlined
 
 DIVERGED = 1e9
 """A position, velocity or force beyond this (or NaN) stops the world before MuJoCo sees it."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from marlbc_mj.laws import allocation_free
+from marlbc_mj.core.laws import allocation_free
 
 
 @allocation_free

@@ -14,15 +14,15 @@ dm_control task call, so there is one definition of a mission step. Its order of
 import numba
 from numba.extending import register_jitable
 
-from marlbc_mj.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE, nearest_obstacle
-from marlbc_mj.cells import fill, nearest, room
+from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE, nearest_obstacle
+from marlbc_mj.core.cells import fill, nearest, room
+from marlbc_mj.core.imperfections import sense, weaken
+from marlbc_mj.core.laws import allocation_free, compiled, threaded
+from marlbc_mj.core.motion import move
+from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
-from marlbc_mj.imperfections import sense, weaken
-from marlbc_mj.laws import allocation_free, compiled, threaded
-from marlbc_mj.motion import move
-from marlbc_mj.nullspace import add_behavior
 
 SCRATCH = 9
 """Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""

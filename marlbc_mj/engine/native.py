@@ -15,7 +15,7 @@ from numba.core import cgutils
 from numba.extending import intrinsic, overload
 from numba.np.arrayobj import populate_array
 
-from marlbc_mj import laws
+from marlbc_mj.core import laws
 
 
 def step_address() -> int:

@@ -8,15 +8,15 @@ import mujoco
 import numba
 import numpy as np
 
-from marlbc_mj import laws
-from marlbc_mj.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
-from marlbc_mj.cells import WORTH, room
 from marlbc_mj.controllers import Controller, largest_stable_substep
+from marlbc_mj.core import laws
+from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
+from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.native import step_address
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
 
 _JOINT_SIZE = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
 """Numbers of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
@@ -34,7 +34,7 @@ class Plan:
     sizes: np.ndarray  # (3,) int64: nq, nv, nu
     behavior_laws: np.ndarray  # (M,) addresses; the laws themselves where numba is off
     behavior_params: np.ndarray  # (M, N, P)
-    sees: np.ndarray  # (M,) what each behavior's law looks at, see marlbc_mj.behaviors
+    sees: np.ndarray  # (M,) what each behavior's law looks at, see marlbc_mj.core.behaviors
     controller_params: np.ndarray  # (N, P)
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     disturbance_params: np.ndarray  # (P,)

@@ -4,13 +4,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.imperfections import sense
+from marlbc_mj.core.motion import MOVING, NUMBERS, move
 from marlbc_mj.engine import loop
 from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.plan import Plan
-from marlbc_mj.errors import ConfigurationError, SimulationError
-from marlbc_mj.imperfections import sense
-from marlbc_mj.motion import MOVING, NUMBERS, move
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 SCRAP = ("scratch", "grid", "composed")
 """Arrays that carry nothing from one mission step to the next."""

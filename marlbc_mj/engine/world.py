@@ -11,8 +11,8 @@ from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.engine import loop
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.engine.state import Observation, TeamState
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
 
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 """What of MuJoCo's data is a world's state."""
@@ -77,7 +77,7 @@ class World:
         self.threads = threads
         self.native = self.plan.native if native is None else native
         if self.native and not self.plan.native:
-            raise ConfigurationError("native=True needs compiled laws; decorate them with marlbc_mj.laws")
+            raise ConfigurationError("native=True needs compiled laws; decorate them with marlbc_mj.core.laws")
         self.state = TeamState(self.plan, worlds)
         self.data = [mujoco.MjData(self.plan.model) for _ in range(worlds)]
         self._handles = [(d, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, d.actuator_force) for d in self.data]

@@ -5,8 +5,8 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from marlbc_mj.errors import unknown
 from marlbc_mj.recording.stage import Stage
+from marlbc_mj.util.errors import unknown
 
 TRACK_AZIMUTH = 38.0  # from the direction of travel; the team moves into the picture [deg]
 TRACK_ELEVATION = -33.0  # [deg]

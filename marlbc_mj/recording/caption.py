@@ -9,8 +9,8 @@ import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from marlbc_mj.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, command_color, ink_on
 from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.util.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, command_color, ink_on
 
 FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
 HEADER, FOOTER = 48, 80  # heights of the bars

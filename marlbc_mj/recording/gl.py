@@ -6,7 +6,7 @@ import subprocess
 import sys
 from functools import cache
 
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 ENABLED = ("", "enable", "enabled", "on", "true", "1")
 DISABLED = ("disable", "disabled", "off", "false", "0")

@@ -5,10 +5,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from marlbc_mj.controllers import Controller
+from marlbc_mj.core.motion import nearest_places, obstacles_at
 from marlbc_mj.engine.loop import judge
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import NO_POSE, Trajectory
-from marlbc_mj.motion import nearest_places, obstacles_at
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class EpisodeLog:
     force_limit: float  # [N]; infinite for an unlimited law
     commands: tuple[str, ...]  # names that ``command`` indexes, "FM" or "OA>FM" for example
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
-    motions: np.ndarray  # (K, 6) as marlbc_mj.motion has them, or (0, 6): all at rest
+    motions: np.ndarray  # (K, 6) as marlbc_mj.core.motion has them, or (0, 6): all at rest
     mjcf: str  # the assembled model
     time: np.ndarray  # (M,) start of each mission step [s]
     position: np.ndarray  # (M, N, 2) [m]

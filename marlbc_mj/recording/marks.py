@@ -7,7 +7,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from marlbc_mj.palette import agent_color
+from marlbc_mj.util.palette import agent_color
 
 TRAIL_WIDTH = 0.26  # [m]
 TRAIL_TOLERANCE = 0.01  # a trail's corners are left out while it stays this close to the path [m]

@@ -6,10 +6,10 @@ from types import TracebackType
 import mujoco
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.recording.camera import Camera
 from marlbc_mj.recording.gl import choose_gl
 from marlbc_mj.recording.stage import Stage
+from marlbc_mj.util.errors import ConfigurationError
 
 MAX_SHAPES = 20_000  # in one picture: model and marks
 SLICES, STACKS, QUADS = 32, 12, 1  # facets of circles, of spheres and cylinders along their axis, of a box's edge

@@ -23,12 +23,12 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC, Writer
 
-from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.files import staged_file
-from marlbc_mj.motion import NUMBERS
+from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.writer import METADATA, MODEL
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.files import staged_file
 
 _END = struct.Struct("<BQQQI8s")
 """How an MCAP ends: footer record (opcode, length, start of the summary, of its offsets, checksum of the summary), magic."""

@@ -15,11 +15,11 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.SpherePrimitive_pb2 import SpherePrimitive
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
+from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.engine.assembly import OBSTACLE_HEIGHT, POINT_RADIUS
-from marlbc_mj.motion import NUMBERS, obstacles_at
-from marlbc_mj.palette import BEHAVIOR_COLORS, agent_color, rgba
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.palette import BEHAVIOR_COLORS, agent_color, rgba
 
 SCENE_TOPIC = "/scene"
 TRANSFORMS_TOPIC = "/tf"
@@ -38,7 +38,7 @@ class Scene:
     Args:
         scenario: the team.
         obstacles: (K, 3) this episode's x, y, radius [m]; of one that moves, its place without motion.
-        motions: (K, 6) as :mod:`marlbc_mj.motion` has them; none: all at rest.
+        motions: (K, 6) as :mod:`marlbc_mj.core.motion` has them; none: all at rest.
     """
 
     def __init__(self, scenario: Scenario, obstacles: np.ndarray, motions: np.ndarray | None = None) -> None:

@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.engine.assembly import LEAST_SOLID, POINT_RADIUS, agent_prefix
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, disc, make_trail, ribbon
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
 
 BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
 BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of

@@ -8,13 +8,13 @@ from pathlib import Path
 import imageio_ffmpeg
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError, SimulationError
-from marlbc_mj.files import staged_file
 from marlbc_mj.recording.camera import make_camera, project
 from marlbc_mj.recording.caption import Caption
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.files import staged_file
 
 LEAST, MOST = 64, 4096  # pixels, either side
 MOST_SAMPLES = 16  # per pixel

@@ -10,10 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.recording.camera import make_camera
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.stage import Stage, make_stage
+from marlbc_mj.util.errors import ConfigurationError
 
 REFRESH = 1.0 / 60.0  # [s]
 JUMP = 5.0  # of an arrow key [s]

@@ -20,17 +20,16 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
-from marlbc_mj import __version__
 from marlbc_mj.controllers import Controller, sorlc
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import Frame
-from marlbc_mj.errors import ConfigurationError, SimulationError
-from marlbc_mj.files import check_target
-from marlbc_mj.provenance import config_hash, git_revision, plain_data, versions
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Draw, Scenario
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.files import check_target
+from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
 
 METADATA = "marlbc"
 """Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
@@ -158,7 +157,7 @@ class LogWriter:
         # Chunks are zstd by default. When one is closed is decided here: between two messages of a mission step it would tear
         # that step apart.
         self._mcap = Writer(self._stream, chunk_size=sys.maxsize, enable_data_crcs=True)
-        self._mcap.start(library=f"marlbc_mj {__version__}")
+        self._mcap.start(library=f"marlbc_mj {versions()['marlbc-mj']}")
         self._mcap.add_metadata(METADATA, metadata)
         self._mcap.add_metadata(VERSIONS, _versions())
         for name, media_type, data in attachments:

@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from marlbc_mj.core.motion import moved, nearest_places
+from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
-from marlbc_mj.motion import moved, nearest_places
-from marlbc_mj.orders import SEPARATOR
-from marlbc_mj.palette import command_color
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.util.palette import command_color
 
 _MARGIN = (0.16, 0.06)  # left and right, above and below everything that happens: room for the agents' numbers [in]
 _POINT = 0.35  # radius at which a point obstacle is drawn [m]

@@ -4,12 +4,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.files import write_json
 from marlbc_mj.report.figures import write_figures
 from marlbc_mj.report.findings import same_actuator
 from marlbc_mj.report.page import write_page
-from marlbc_mj.report.results import Result, summary, write_csv
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
+from marlbc_mj.results.summary import Result, summary, write_csv
+from marlbc_mj.util.files import write_json
 
 
 def write_report(

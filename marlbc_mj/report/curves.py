@@ -8,10 +8,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from marlbc_mj.controllers.sorlc import STATE_SIZE, Weights, weights
+from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
-from marlbc_mj.orders import SEPARATOR
-from marlbc_mj.palette import command_color
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.util.palette import command_color
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]

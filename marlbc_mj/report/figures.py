@@ -22,7 +22,7 @@ from marlbc_mj.report.curves import (
 from marlbc_mj.report.formats import listed
 from marlbc_mj.report.pareto import coincident, pareto
 from marlbc_mj.report.printed import by_controller, by_supervisor
-from marlbc_mj.report.results import Result
+from marlbc_mj.results.summary import Result
 
 FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
 """Of Figures 8 and 9."""

@@ -4,12 +4,12 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
-from marlbc_mj.metrics import Metrics, convergence_time
 from marlbc_mj.report import paper_values, printed
 from marlbc_mj.report.formats import DASH, fixed, grouped, listed, significant, spans
 from marlbc_mj.report.printed import LIMITED, Quantity, agent_values
-from marlbc_mj.report.results import Result
 from marlbc_mj.report.table import Column, Table
+from marlbc_mj.results.metrics import Metrics, convergence_time
+from marlbc_mj.results.summary import Result
 
 WHY = {
     3: "the supervisors are reconstructed and learned ones depend on their training; in the gate the clearance equals the "

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 
-from marlbc_mj.statistics import Estimate
+from marlbc_mj.results.statistics import Estimate
 
 DASH = "–"
 FAILED = "failed"
@@ -48,11 +48,6 @@ def loose_interval(estimate: Estimate) -> str:
 def percent(estimate: Estimate) -> Estimate:
     """A share as per cent."""
     return Estimate(*(100.0 * value for value in estimate))
-
-
-def one_line(text: str | None) -> str:
-    """Text without line breaks."""
-    return " ".join(str(text).split())
 
 
 def spans(numbers: Sequence[int]) -> str:

@@ -14,8 +14,8 @@ from PIL import Image
 
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.figures import Plot, plots
-from marlbc_mj.report.results import Result
 from marlbc_mj.report.table import Table, to_html
+from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
 
 LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]

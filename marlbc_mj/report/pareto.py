@@ -8,11 +8,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from marlbc_mj.metrics import Metrics
-from marlbc_mj.palette import AGENT_COLORS
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.printed import LIMITED, by_controller, by_supervisor
-from marlbc_mj.report.results import Result
+from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.summary import Result
+from marlbc_mj.util.palette import AGENT_COLORS
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
 COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from marlbc_mj.orders import SEPARATOR
-from marlbc_mj.palette import AGENT_COLORS, command_color
+from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.util.palette import AGENT_COLORS, command_color
 
 SINGLE = 3.5  # width of a column [in]
 DOUBLE = 7.16  # width of two columns and the gap between them [in]

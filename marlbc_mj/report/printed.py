@@ -3,12 +3,13 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple
 
-from marlbc_mj.metrics import AgentMetrics
 from marlbc_mj.report import paper_values
-from marlbc_mj.report.formats import COST_SCALE, DASH, FAILED, fixed, one_line, significant
+from marlbc_mj.report.formats import COST_SCALE, DASH, FAILED, fixed, significant
 from marlbc_mj.report.paper_values import Printed, order_mark
-from marlbc_mj.report.results import Result
 from marlbc_mj.report.table import Column, Table
+from marlbc_mj.results.metrics import AgentMetrics
+from marlbc_mj.results.summary import Result
+from marlbc_mj.util.text import one_line
 
 SAME_ORDER = "same order"
 LIMITED = "-limited"

@@ -5,10 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.outcomes import outcome
-from marlbc_mj.report.formats import one_line
-from marlbc_mj.report.results import AGENT_KEYS, SCHEMA, TEAM_KEYS, plain
-from marlbc_mj.report.seed_statistics import (
+from marlbc_mj.results.outcomes import outcome
+from marlbc_mj.results.seed_statistics import (
     SCORES,
     GroupStatistics,
     MethodStatistics,
@@ -16,9 +14,11 @@ from marlbc_mj.report.seed_statistics import (
     by_supervisor,
     group,
 )
+from marlbc_mj.results.seeds import SeedResults, SeedRun
+from marlbc_mj.results.statistics import Estimate, rate
+from marlbc_mj.results.summary import AGENT_KEYS, SCHEMA, TEAM_KEYS, plain
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.seeds import SeedResults, SeedRun
-from marlbc_mj.statistics import Estimate, rate
+from marlbc_mj.util.text import one_line
 
 
 def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:

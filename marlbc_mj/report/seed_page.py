@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from marlbc_mj.files import write_json
-from marlbc_mj.palette import AGENT_COLORS
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.bundle import files_beside
 from marlbc_mj.report.formats import interval, loose_interval, spans
 from marlbc_mj.report.page import fill_page, plot
-from marlbc_mj.report.results import AGENT_KEYS
 from marlbc_mj.report.seed_files import summary, write_csv
-from marlbc_mj.report.seed_statistics import SCORES, MethodStatistics, analyse
 from marlbc_mj.report.seed_tables import caution, make_tables
 from marlbc_mj.report.table import Column, Table, to_html
 from marlbc_mj.report.tables import latex_document, markdown
-from marlbc_mj.seeds import Progress, SeedResults
+from marlbc_mj.results.seed_statistics import SCORES, MethodStatistics, analyse
+from marlbc_mj.results.seeds import Progress, SeedResults
+from marlbc_mj.results.summary import AGENT_KEYS
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.palette import AGENT_COLORS
 
 FIGURE = "intervals"
 

@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from marlbc_mj.outcomes import outcome
-from marlbc_mj.report.formats import DASH, FAILED, interval, one_line, percent, spans
-from marlbc_mj.report.seed_statistics import (
+from marlbc_mj.report.formats import DASH, FAILED, interval, percent, spans
+from marlbc_mj.report.table import Column, Table
+from marlbc_mj.results.outcomes import outcome
+from marlbc_mj.results.seed_statistics import (
     SCORES,
     GroupStatistics,
     MethodStatistics,
@@ -13,10 +14,10 @@ from marlbc_mj.report.seed_statistics import (
     by_supervisor,
     group,
 )
-from marlbc_mj.report.table import Column, Table
+from marlbc_mj.results.seeds import MethodRuns, SeedResults
+from marlbc_mj.results.statistics import rate
 from marlbc_mj.robots import make_robot
-from marlbc_mj.seeds import MethodRuns, SeedResults
-from marlbc_mj.statistics import rate
+from marlbc_mj.util.text import one_line
 
 ENOUGH = 10
 """Draws from which a bootstrap interval is taken at its word."""

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from marlbc_mj.metrics import Metrics
 from marlbc_mj.report import findings, paper_values, printed
 from marlbc_mj.report.formats import COST_SCALE, DASH, FAILED, fixed
-from marlbc_mj.report.results import Result
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
+from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.summary import Result
 
 
 def make_tables(results: Sequence[Result], scenario_name: str) -> list[Table]:

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from functools import cache
 
-from marlbc_mj.errors import ConfigurationError, unknown
 from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.crazyflie import CRAZYFLIE, crazyflie
 from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
@@ -11,6 +10,7 @@ from marlbc_mj.robots.disc import DISC, disc
 from marlbc_mj.robots.omni import OMNI, omni
 from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
 from marlbc_mj.robots.user import is_file, load
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
     "point_mass": (point_mass, POINT_MASS),

@@ -9,8 +9,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from marlbc_mj import laws
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError
 
 MODELS = Path(str(files("marlbc_mj") / "models"))
 """Folder of the MJCF files; in the repository a link to ``models/``."""

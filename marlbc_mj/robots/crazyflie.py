@@ -12,9 +12,9 @@ from typing import Any
 
 import mujoco
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
+from marlbc_mj.util.errors import ConfigurationError
 
 CRAZYFLIE = "Crazyflie 2.x at a held height, measured parameters and thrust limits (extra `robots`)"
 PACKAGE, DRONE = "drone_models", "cf2x_L250"

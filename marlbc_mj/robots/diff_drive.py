@@ -8,7 +8,7 @@ centre of mass d ahead of the axle, m u' = F + m d w^2 and I w' = M - m d u w.
 import mujoco
 import numpy as np
 
-from marlbc_mj import laws
+from marlbc_mj.core import laws
 from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.wheels import heading, inertia
 

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from marlbc_mj import laws
-from marlbc_mj.errors import ConfigurationError
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError
 
 FIXED, EACH = 15, 7  # numbers in front, and for each rotor
 MOST_TILT = np.radians(32.0)  # that is asked for

@@ -3,7 +3,7 @@
 import mujoco
 import numpy as np
 
-from marlbc_mj import laws
+from marlbc_mj.core import laws
 from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.wheels import heading, inertia
 

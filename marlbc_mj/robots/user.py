@@ -14,10 +14,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError, MarlbcError
 from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.base import Robot
 from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")

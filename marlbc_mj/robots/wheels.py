@@ -5,7 +5,7 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from marlbc_mj.laws import allocation_free
+from marlbc_mj.core.laws import allocation_free
 
 
 @allocation_free

@@ -3,13 +3,13 @@
 from collections.abc import Callable
 from typing import Any
 
-from marlbc_mj.errors import unknown
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.case_study import cruise, paper
 from marlbc_mj.scenarios.families import FAMILIES, held_out
 from marlbc_mj.scenarios.files import SUFFIX, load_scenario
 from marlbc_mj.scenarios.layout import Layout, Motion
 from marlbc_mj.scenarios.robot_gate import robot_gate
+from marlbc_mj.util.errors import unknown
 
 SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "paper": paper,

@@ -7,13 +7,13 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import AgentAvoidance, Behavior, Formation, ObstacleAvoidance
-from marlbc_mj.disturbances import Disturbance, PaperDrag
-from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
-from marlbc_mj.motion import NUMBERS, obstacles_at
-from marlbc_mj.orders import Orders
+from marlbc_mj.core.behaviors import AgentAvoidance, Behavior, Formation, ObstacleAvoidance
+from marlbc_mj.core.disturbances import Disturbance, PaperDrag
+from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
+from marlbc_mj.core.motion import NUMBERS, obstacles_at
+from marlbc_mj.core.orders import Orders
 from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step

@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios.base import Perturbation, Scenario, Window
 from marlbc_mj.scenarios.family import Family
 from marlbc_mj.scenarios.layout import Layout
 from marlbc_mj.scenarios.obstacles import Range, Scatter, Traffic, Walls
+from marlbc_mj.util.errors import ConfigurationError
 
 START_SPREAD = Perturbation(start_spread=0.5)
 

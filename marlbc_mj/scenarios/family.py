@@ -11,14 +11,14 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from marlbc_mj.behaviors import Behavior
-from marlbc_mj.disturbances import Disturbance, PaperDrag
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.imperfections import NO_IMPERFECTIONS, Imperfections
+from marlbc_mj.core.behaviors import Behavior
+from marlbc_mj.core.disturbances import Disturbance, PaperDrag
+from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.scenarios.base import Obstacle, Perturbation, Point, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.formations import column, make_formation
 from marlbc_mj.scenarios.layout import Layout, motions_of
 from marlbc_mj.scenarios.obstacles import Range
+from marlbc_mj.util.errors import ConfigurationError
 
 NOMINAL = 0
 """Number of the layout that a scenario shows before a seed is drawn: a training one."""

@@ -20,13 +20,13 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from marlbc_mj.disturbances import DISTURBANCES, Disturbance
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.core.disturbances import DISTURBANCES, Disturbance
 from marlbc_mj.scenarios.base import Obstacle, Point, Scenario, Window
 from marlbc_mj.scenarios.case_study import cruise, paper
 from marlbc_mj.scenarios.families import FAMILIES
 from marlbc_mj.scenarios.family import Mission
 from marlbc_mj.scenarios.layout import Motion
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 SUFFIX = ".toml"
 MOST_BYTES = 1_000_000

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 LEAST, MOST = 2, 256  # agents
 

@@ -4,8 +4,8 @@ from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError, unknown
-from marlbc_mj.motion import NUMBERS
+from marlbc_mj.core.motion import NUMBERS
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 SPLITS = ("train", "test")
 """Whose layouts a scenario draws. A layout has a number: even ones are for training, odd ones are held out."""
@@ -23,7 +23,7 @@ class Motion(NamedTuple):
 
     @property
     def numbers(self) -> tuple[float, ...]:
-        """One row of the motions that :func:`marlbc_mj.motion.move` takes."""
+        """One row of the motions that :func:`marlbc_mj.core.motion.move` takes."""
         return (self.vx, self.vy, self.ax, self.ay, 2.0 * np.pi / self.period, self.phase)
 
 
@@ -31,7 +31,7 @@ class Sample(NamedTuple):
     """One layout."""
 
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
-    motions: np.ndarray  # (K, 6) as marlbc_mj.motion has them, or (0, 6): all at rest
+    motions: np.ndarray  # (K, 6) as marlbc_mj.core.motion has them, or (0, 6): all at rest
 
 
 @runtime_checkable
@@ -59,7 +59,7 @@ def layout_number(rng: np.random.Generator, split: str) -> int:
 
 
 def motion_array(motions: tuple[Motion, ...]) -> np.ndarray:
-    """(K, 6) rows of :func:`marlbc_mj.motion.move`."""
+    """(K, 6) rows of :func:`marlbc_mj.core.motion.move`."""
     return np.array([motion.numbers for motion in motions], dtype=np.float64).reshape(-1, NUMBERS)
 
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.motion import NUMBERS, moved
+from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.scenarios.layout import Sample
+from marlbc_mj.util.errors import ConfigurationError
 
 TRIES = 400  # places tried for one obstacle
 RESTARTS = 20  # layouts begun before a family says that it found none

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj.disturbances import LinearDrag
+from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS

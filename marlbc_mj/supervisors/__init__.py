@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
-from marlbc_mj.errors import unknown
+from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, situation
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
@@ -12,7 +12,7 @@ from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.supervisors.mpcms import MPCMS
 from marlbc_mj.supervisors.oracle import Oracle
 from marlbc_mj.supervisors.scripted import Scripted
-from marlbc_mj.training.shipped import shipped
+from marlbc_mj.util.errors import unknown
 
 SUPERVISORS: dict[str, tuple[Callable[..., Supervisor], str]] = {
     "scripted": (Scripted, "the scenario's schedule: the fewest switches its geometry allows"),

@@ -13,14 +13,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.engine.loop import path_at, set_references
 from marlbc_mj.engine.plan import behavior_arrays, grid_room, sees_array
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend, Situation
 from marlbc_mj.supervisors.fms import memberships
 from marlbc_mj.supervisors.neighbors import GiveWay, crowded, give_way
+from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA, _AA = 0, 1, 2, 3
 _ALONE = np.array([[_FM], [_FR], [_OA], [_AA]])  # (4, 1): a table of orders that hold one behavior each

@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
+from marlbc_mj.util.errors import ConfigurationError
 
 _FAR, _MIDDLE, _NEAR = 0, 1, 2
 

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.engine.state import Observation
+from marlbc_mj.policies.actions import order_of
+from marlbc_mj.policies.checkpoint import check_policy, check_signature, read_policy
+from marlbc_mj.policies.greedy import Policy, greedy
+from marlbc_mj.policies.states import OLD, State, make_state
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
-from marlbc_mj.tasks.batch import order_of
-from marlbc_mj.tasks.states import OLD, State, make_state
-from marlbc_mj.training.checkpoint import check_policy, check_signature, read_policy
-from marlbc_mj.training.policy import Policy, greedy
 
 
 class LearnedMemory(NamedTuple):
@@ -59,7 +59,7 @@ class Learned:
 
         Raises:
             ConfigurationError: another team, other behaviors, slots, mission step or path, see
-                :func:`~marlbc_mj.training.checkpoint.signature`; or networks that do not fit them.
+                :func:`~marlbc_mj.policies.checkpoint.signature`; or networks that do not fit them.
         """
         check_signature(self.path, self.signature, scenario)
         read = make_state(self.signature["state"], scenario)

@@ -33,11 +33,11 @@ import numpy as np
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.engine.plan import Plan, make_plan
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError, SimulationError, unknown
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.supervisors.prediction import follow, judge, simulate
+from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
 MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision
 PREDICTIONS = ("kinematic", "mujoco")

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import NEAREST_NEIGHBOR
-from marlbc_mj.cells import spacing
+from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR
+from marlbc_mj.core.cells import spacing
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Situation
 

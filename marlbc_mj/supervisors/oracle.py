@@ -18,16 +18,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.behaviors import clearances
 from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.engine.world import World
-from marlbc_mj.errors import ConfigurationError
-from marlbc_mj.files import write_json
-from marlbc_mj.provenance import config_hash, plain_data, versions
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
 from marlbc_mj.scenarios.base import YOUNG
 from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.scripted import Scripted
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.provenance import config_hash, plain_data, versions
 
 POPULATION = 64  # candidates simulated at a time
 APART = 4.0  # [s] changes of command further apart than this are in different segments

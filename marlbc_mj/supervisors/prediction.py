@@ -8,13 +8,13 @@ that move are predicted to keep the velocity they have.
 import numba
 import numpy as np
 
-from marlbc_mj.behaviors import nearest_obstacle
+from marlbc_mj.core.behaviors import nearest_obstacle
+from marlbc_mj.core.laws import allocation_free, compiled
+from marlbc_mj.core.motion import drift
 from marlbc_mj.engine.limits import keep, limit
 from marlbc_mj.engine.loop import path_at, set_references
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.world import World
-from marlbc_mj.laws import allocation_free, compiled
-from marlbc_mj.motion import drift
 from marlbc_mj.supervisors.base import Situation
 
 SCRATCH = 11

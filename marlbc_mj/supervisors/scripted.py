@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from marlbc_mj.errors import ConfigurationError
 from marlbc_mj.scenarios import Scenario, Window
 from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.util.errors import ConfigurationError
 
 
 @dataclass(frozen=True)

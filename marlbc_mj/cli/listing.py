@@ -1,0 +1,30 @@
+"""Everything that can be selected by name, with one line each."""
+
+from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.controllers.sorlc import BASES
+from marlbc_mj.core.disturbances import DISTURBANCES
+from marlbc_mj.robots import ROBOTS
+from marlbc_mj.scenarios import SCENARIOS
+from marlbc_mj.scenarios.base import REFERENCE_MODES
+from marlbc_mj.scenarios.formations import FORMATIONS
+from marlbc_mj.supervisors import SUPERVISORS
+from marlbc_mj.training.config import METHODS, PRESETS
+
+_BASES = ("inputs as in the paper", "inputs relative to the reference", "no networks")
+_REFERENCES = ("behaviors at the reference's own position", "behaviors at the measured position")
+
+
+def selectable() -> dict[str, dict[str, str]]:
+    """Descriptions by kind and name."""
+    return {
+        "scenarios": {name: make().description for name, make in SCENARIOS.items()},
+        "formations": {name: line for name, (_, line) in FORMATIONS.items()},
+        "supervisors": {name: line for name, (_, line) in SUPERVISORS.items()},
+        "controllers": {name: line for name, (_, line) in CONTROLLERS.items()},
+        "SORLC bases": dict(zip(BASES, _BASES, strict=True)),
+        "reference modes": dict(zip(REFERENCE_MODES, _REFERENCES, strict=True)),
+        "disturbances": {name: line for name, (_, line) in DISTURBANCES.items()},
+        "training methods": {name: line for name, (_, line) in METHODS.items()},
+        "training presets": {name: line for name, (_, line) in PRESETS.items()},
+        "robots": {name: line for name, (_, line) in ROBOTS.items()},
+    }

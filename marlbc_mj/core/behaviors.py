@@ -1,0 +1,218 @@
+"""Elementary behaviors: obstacle avoidance (9), formation maintenance (10), formation reconstruction (11), agent avoidance.
+
+Each is closed-loop inverse kinematics (8): v = J^+ (rho_d' + Lambda rho~). The desired centroid path enters as feed-forward
+(erratum 3: p_c cancels in the error, so the feed-forward is the velocity of p_cd). Avoidance of other agents, AA, is the
+project's: the paper has none, so its agents are free to collide.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from marlbc_mj.core import laws
+from marlbc_mj.util.errors import ConfigurationError
+
+EVERYTHING, NEAREST_OBSTACLE, NEAREST_NEIGHBOR = 0, 1, 2
+"""What a behavior's law looks at: all obstacles and agents, or only the nearest of one kind. Of large teams, a law that says so
+(by an attribute ``sees``) is handed that one alone, found in a grid; what it computes is the same."""
+
+
+@laws.allocation_free
+def nearest_obstacle(p: np.ndarray, obstacles: np.ndarray, normal: np.ndarray) -> float:
+    """Clearance d = min_k (|p - o_k| - radius_k) [m], negative inside (errata 7), and the outward unit normal.
+
+    Args:
+        p: (2,) [m].
+        obstacles: (K, 3 or more), rows x, y, radius [m]; K = 0 gives an infinite clearance and a zero normal.
+        normal: (2,), written in place; (1, 0) at the very centre of an obstacle, where no direction is defined.
+    """
+    return _nearest(p, obstacles, normal)[0]  # type: ignore[no-any-return]
+
+
+@laws.allocation_free
+def _nearest(p, obstacles, normal):  # type: ignore[no-untyped-def]
+    """:func:`nearest_obstacle`, and which one it is (-1: there is none)."""
+    clearance, nearest = np.inf, -1
+    normal[0] = 0.0
+    normal[1] = 0.0
+    for k in range(obstacles.shape[0]):
+        x = p[0] - obstacles[k, 0]
+        y = p[1] - obstacles[k, 1]
+        distance = np.sqrt(x * x + y * y)
+        if distance - obstacles[k, 2] < clearance:
+            clearance, nearest = distance - obstacles[k, 2], k
+            normal[0] = x / distance if distance > 0.0 else 1.0
+            normal[1] = y / distance if distance > 0.0 else 0.0
+    return clearance, nearest
+
+
+@laws.compiled
+def _fill_clearances(positions, obstacles, out):  # type: ignore[no-untyped-def]
+    normal = np.empty(2)
+    for k in range(positions.shape[0]):
+        out[k] = nearest_obstacle(positions[k], obstacles, normal)
+
+
+def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+    """:func:`nearest_obstacle`'s clearance [m] at every one of ``positions`` (..., 2) [m], (...,)."""
+    flat = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, 2)
+    out = np.empty(len(flat))
+    _fill_clearances(flat, np.ascontiguousarray(obstacles, dtype=np.float64), out)
+    return out.reshape(np.shape(positions)[:-1])
+
+
+@laws.compiled
+def _fill_clearances_among(positions, obstacles, out):  # type: ignore[no-untyped-def]
+    normal = np.empty(2)
+    for t in range(positions.shape[0]):
+        for i in range(positions.shape[1]):
+            out[t, i] = nearest_obstacle(positions[t, i], obstacles[t], normal)
+
+
+def clearances_among(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+    """The same at ``positions`` (T, N, 2) [m] among obstacles (T, K, 3 or more) of the same times, (T, N)."""
+    out = np.empty(positions.shape[:2])
+    arrays = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, obstacles))
+    _fill_clearances_among(*arrays, out)
+    return out
+
+
+@laws.behavior
+def obstacle_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
+    """OA (9): v = n Lambda max(0, d_OA - d), J = n^T; ``params`` = Lambda [1/s], d_OA [m], two-sided (0 or 1).
+
+    One-sided by default: the equality task as printed attracts agents from beyond d_OA (erratum 6). Where obstacles move,
+    d' = n^T (v - o'), so that n n^T o' is fed forward; ``obstacles`` then is (K, 5), with o' in its last columns.
+    """
+    clearance, k = _nearest(p, obstacles, jacobian_out[0])
+    error = params[1] - clearance
+    if clearance == np.inf or (params[2] == 0.0 and error < 0.0):
+        error = 0.0
+    velocity_out[0] = jacobian_out[0, 0] * params[0] * error
+    velocity_out[1] = jacobian_out[0, 1] * params[0] * error
+    if k >= 0 and obstacles.shape[1] > 3:
+        along = jacobian_out[0, 0] * obstacles[k, 3] + jacobian_out[0, 1] * obstacles[k, 4]
+        velocity_out[0] += jacobian_out[0, 0] * along
+        velocity_out[1] += jacobian_out[0, 1] * along
+    return 1
+
+
+@laws.behavior
+def agent_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
+    """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T; ``params`` = Lambda [1/s], d_AA [m]. The project's own.
+
+    d = |p - p_j| to the nearest other agent j and n = (p - p_j) / d. The rate d' = n^T (v - p_j') has the neighbor's velocity in
+    it, which an agent does not know; the path's, which the team has in common, stands in for it. One-sided, and more so than OA:
+    from d_AA on it has no row, so that on top it shuts no direction, and an agent that may leave does. Two agents in one place
+    part along x.
+    """
+    nearest, distance = -1, np.inf
+    for other in range(team.shape[0]):
+        x, y = p[0] - team[other, 0], p[1] - team[other, 1]
+        between = np.sqrt(x * x + y * y)
+        if other != agent and between < distance:
+            nearest, distance = other, between
+    if nearest < 0 or distance >= params[1]:
+        velocity_out[0] = velocity_out[1] = 0.0
+        return 0
+    normal = jacobian_out[0]
+    if distance > 0.0:
+        normal[0], normal[1] = (p[0] - team[nearest, 0]) / distance, (p[1] - team[nearest, 1]) / distance
+    else:
+        normal[0], normal[1] = (1.0 if agent > nearest else -1.0), 0.0
+    along = normal[0] * path[1, 0] + normal[1] * path[1, 1] + params[0] * (params[1] - distance)
+    velocity_out[0] = normal[0] * along
+    velocity_out[1] = normal[1] * along
+    return 1
+
+
+@laws.behavior
+def formation(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
+    """FM (10) and FR (11): v = p_cd' + Lambda (p_cd + offset - p), J = I; ``params`` = Lambda [1/s], offset x, y [m]."""
+    velocity_out[0] = path[1, 0] + params[0] * (path[0, 0] + params[1] - p[0])
+    velocity_out[1] = path[1, 1] + params[0] * (path[0, 1] + params[2] - p[1])
+    jacobian_out[0, 0] = 1.0
+    jacobian_out[0, 1] = 0.0
+    jacobian_out[1, 0] = 0.0
+    jacobian_out[1, 1] = 1.0
+    return 2
+
+
+@runtime_checkable
+class Behavior(Protocol):
+    """What the engine asks of a behavior: a name, its law, whether J has full rank, and its numbers per agent."""
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def law(self) -> laws.Law: ...
+    @property
+    def complete(self) -> bool: ...
+    def params(self, agent: int) -> Sequence[float]:
+        """Numbers handed to the law as ``params`` for this agent."""
+        ...
+
+
+@dataclass(frozen=True)
+class ObstacleAvoidance:
+    """Keep ``safe_distance`` from the nearest obstacle (9)."""
+
+    gain: float = 20.0  # Lambda_OA [1/s]
+    safe_distance: float = 2.0  # d_OA [m]
+    two_sided: bool = False  # the printed equality task (erratum 6)
+    name: str = "OA"
+    complete = False
+    sees = NEAREST_OBSTACLE
+    law = staticmethod(obstacle_avoidance)
+
+    def __post_init__(self) -> None:
+        _require_positive(f"{self.name} gain", self.gain)
+        _require_positive(f"{self.name} safe_distance", self.safe_distance)
+
+    def params(self, agent: int) -> tuple[float, ...]:
+        return (self.gain, self.safe_distance, float(self.two_sided))
+
+
+@dataclass(frozen=True)
+class AgentAvoidance:
+    """Keep ``distance`` from the nearest other agent."""
+
+    gain: float = 20.0  # Lambda_AA [1/s]
+    distance: float = 1.5  # d_AA, between middles [m]
+    name: str = "AA"
+    complete = False
+    sees = NEAREST_NEIGHBOR
+    law = staticmethod(agent_avoidance)
+
+    def __post_init__(self) -> None:
+        _require_positive(f"{self.name} gain", self.gain)
+        _require_positive(f"{self.name} distance", self.distance)
+
+    def params(self, agent: int) -> tuple[float, ...]:
+        return (self.gain, self.distance)
+
+
+@dataclass(frozen=True)
+class Formation:
+    """Hold one's slot around the moving desired centroid: FM (10), and with the column's offsets FR (11)."""
+
+    name: str
+    offsets: tuple[tuple[float, float], ...]  # one (x, y) per agent [m]
+    gain: float = 8.0  # Lambda_FM, Lambda_FR [1/s]
+    complete = True
+    law = staticmethod(formation)
+
+    def __post_init__(self) -> None:
+        _require_positive(f"{self.name} gain", self.gain)
+        if not np.isfinite(self.offsets).all():
+            raise ConfigurationError(f"{self.name} offsets must be finite, got {self.offsets}")
+
+    def params(self, agent: int) -> tuple[float, ...]:
+        return (self.gain, *self.offsets[agent])
+
+
+def _require_positive(what: str, value: float) -> None:
+    if not (np.isfinite(value) and value > 0):
+        raise ConfigurationError(f"{what} must be a positive finite number, got {value}")

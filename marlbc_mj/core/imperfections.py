@@ -1,0 +1,107 @@
+"""What a plant does worse than its model: noise and age of measurements, lost actuation. Off by default, and free when off."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marlbc_mj.core.laws import allocation_free
+from marlbc_mj.util.errors import ConfigurationError
+
+_WORD = 0xFFFFFFFF
+
+
+@dataclass(frozen=True)
+class Imperfections:
+    """Sensor noise, sensor delay and actuator loss of one scenario.
+
+    What controllers and supervisors are shown, p and v, is ``delay`` old and has white Gaussian noise, drawn per world, agent,
+    axis and substep from the world's seed: the same for any batch size and number of threads. Clearances and the formation
+    identifier stay exact, as do trajectories and metrics: they judge where the robots are. The loss takes a share of the planar
+    force between the law and the robot's drive.
+
+    Raises:
+        ConfigurationError: naming the value that cannot be.
+    """
+
+    position_noise: float = 0.0  # standard deviation per axis [m]
+    velocity_noise: float = 0.0  # standard deviation per axis [m/s]
+    delay: float = 0.0  # age of what is measured; a whole number of substeps [s]
+    loss: float = 0.0  # share of the force that is lost, from 0 to 1
+    loss_agent: int = -1  # whose; -1: everybody's
+    loss_start: float = 0.0  # from then on [s]
+
+    def __post_init__(self) -> None:
+        for name in ("position_noise", "velocity_noise", "delay", "loss_start"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                raise ConfigurationError(f"Imperfections.{name} must be non-negative and finite, got {value}")
+        if not 0 <= self.loss <= 1:
+            raise ConfigurationError(f"Imperfections.loss must be from 0 to 1, got {self.loss}")
+
+    def check(self, agents: int, substep: float) -> None:
+        """Raise ConfigurationError for an agent that is not there or a delay that is no whole number of substeps."""
+        if not -1 <= self.loss_agent < agents:
+            raise ConfigurationError(f"Imperfections.loss_agent must be -1 (all) or 0 to {agents - 1}, got {self.loss_agent}")
+        ratio = self.delay / substep
+        if abs(ratio - round(ratio)) > 1e-9 * max(1.0, ratio):
+            raise ConfigurationError(f"Imperfections.delay {self.delay} s must be a whole multiple of the substep {substep} s")
+
+    @property
+    def sensing(self) -> bool:
+        """Whether what is measured differs from what is."""
+        return self.position_noise > 0 or self.velocity_noise > 0 or self.delay > 0
+
+    def depth(self, substep: float) -> int:
+        """Rows of history that a delay needs; none without sensing errors."""
+        return round(self.delay / substep) + 1 if self.sensing else 0
+
+    def params(self) -> tuple[float, ...]:
+        """Numbers for :func:`sense` and :func:`weaken`."""
+        return self.position_noise, self.velocity_noise, self.loss, float(self.loss_agent), self.loss_start
+
+
+NO_IMPERFECTIONS = Imperfections()
+
+
+@allocation_free
+def _mixed(word):  # type: ignore[no-untyped-def]
+    """A 32-bit integer hash (constants of the hash-prospector project): every input bit moves every output bit."""
+    word = ((word ^ (word >> 16)) * 0x21F0AAAD) & _WORD
+    word = ((word ^ (word >> 15)) * 0x735A2D97) & _WORD
+    return word ^ (word >> 15)
+
+
+@allocation_free
+def normal(seed, count, stream):  # type: ignore[no-untyped-def]
+    """A standard normal number that is a function of three integers: Box and Muller on two hashes. No state, so no order."""
+    base = _mixed(_mixed(_mixed(seed & _WORD) ^ (count & _WORD)) ^ (2 * stream + 1))
+    angle = _mixed(base ^ 0x9E3779B9)
+    return np.sqrt(-2.0 * np.log((base + 1.0) / 4294967296.0)) * np.cos(2.0 * np.pi * angle / 4294967296.0)
+
+
+@allocation_free
+def sense(params, seed, count, history, p, v, sensed):  # type: ignore[no-untyped-def]
+    """What is measured at substep ``count``: the true p, v (N, 2) of D - 1 substeps ago, with noise, in ``sensed`` (2, N, 2).
+
+    ``history`` (D, 2, N, 2) is a ring that this call adds the present to.
+    """
+    depth = history.shape[0]
+    for i in range(p.shape[0]):
+        for axis in range(2):
+            history[count % depth, 0, i, axis] = p[i, axis]
+            history[count % depth, 1, i, axis] = v[i, axis]
+            for which in range(2):
+                value = history[(count + 1) % depth, which, i, axis]
+                if params[which] > 0.0:
+                    value += params[which] * normal(seed, count, 4 * i + 2 * which + axis)
+                sensed[which, i, axis] = value
+
+
+@allocation_free
+def weaken(params, t, force):  # type: ignore[no-untyped-def]
+    """Take the lost share off the forces (N, 2) at ``t`` [s]."""
+    if params[2] > 0.0 and t >= params[4] - 1e-9:
+        for i in range(force.shape[0]):
+            if params[3] < 0.0 or params[3] == i:
+                for axis in range(2):
+                    force[i, axis] *= 1.0 - params[2]

@@ -1,0 +1,75 @@
+"""Obstacles that move with the mission clock: straight on, or to and fro. Beyond the paper, whose Assumption 2 has them at rest.
+
+One law, evaluated by the engine, by metrics and by whatever draws an episode, so an obstacle is at one place at one time.
+"""
+
+import numpy as np
+
+from marlbc_mj.core.laws import allocation_free, compiled
+
+NUMBERS = 6
+"""Columns of a motion: velocity x, y [m/s], amplitude x, y [m], angular frequency [rad/s], phase [rad]."""
+MOVING = 5
+"""Columns of an obstacle that moves: x, y, radius [m], velocity x, y [m/s]."""
+
+
+@allocation_free
+def move(t, anchors, motions, out):  # type: ignore[no-untyped-def]
+    """o(t) = anchor + v t + a sin(w t + phase), and its velocity.
+
+    Args:
+        t: mission time [s].
+        anchors: (K, 3) x, y, radius [m].
+        motions: (K, 6), columns as in :data:`NUMBERS`.
+        out: (K, 5) x, y, radius [m], velocity x, y [m/s], written in place.
+    """
+    for k in range(anchors.shape[0]):
+        sine = np.sin(motions[k, 4] * t + motions[k, 5])
+        rate = motions[k, 4] * np.cos(motions[k, 4] * t + motions[k, 5])
+        for axis in range(2):
+            out[k, axis] = anchors[k, axis] + motions[k, axis] * t + motions[k, 2 + axis] * sine
+            out[k, 3 + axis] = motions[k, axis] + motions[k, 2 + axis] * rate
+        out[k, 2] = anchors[k, 2]
+
+
+@allocation_free
+def drift(t, obstacles, out):  # type: ignore[no-untyped-def]
+    """Where obstacles (K, 5) are after ``t`` [s] if each keeps the velocity it has, (K, 5) in ``out``: a tracker's prediction."""
+    for k in range(obstacles.shape[0]):
+        for axis in range(2):
+            out[k, axis] = obstacles[k, axis] + obstacles[k, 3 + axis] * t
+            out[k, 3 + axis] = obstacles[k, 3 + axis]
+        out[k, 2] = obstacles[k, 2]
+
+
+@compiled
+def _fill_moved(times, anchors, motions, out):  # type: ignore[no-untyped-def]
+    for m in range(times.shape[0]):
+        move(times[m], anchors, motions, out[m])
+
+
+def moved(times: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
+    """:func:`move` at every one of ``times`` (M,) [s]: (M, K, 5)."""
+    times = np.ascontiguousarray(times, dtype=np.float64)
+    out = np.empty((len(times), len(anchors), MOVING))
+    _fill_moved(times, np.ascontiguousarray(anchors, dtype=np.float64), np.ascontiguousarray(motions, dtype=np.float64), out)
+    return out
+
+
+def obstacles_at(time: float, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
+    """(K, 3) x, y, radius [m] at ``time`` [s]; ``motions`` (0, 6) leaves the anchors (K, 3) where they are."""
+    if len(motions) == 0:
+        return anchors
+    return np.asarray(moved(np.array([time]), anchors, motions)[0, :, :3])
+
+
+def nearest_places(times: np.ndarray, positions: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
+    """(K, 3) obstacles, each where it is nearest to an agent in an episode: the one place to draw where time cannot be shown.
+
+    ``positions`` (M, N, 2) [m] at ``times`` (M,) [s].
+    """
+    if len(motions) == 0:
+        return anchors
+    tracks = moved(times, anchors, motions)[..., :3]  # (M, K, 3)
+    gaps = [np.linalg.norm(positions - tracks[:, None, k, :2], axis=-1).min(axis=1).argmin() for k in range(len(anchors))]
+    return np.asarray(tracks[gaps, np.arange(len(anchors))])

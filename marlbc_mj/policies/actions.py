@@ -1,0 +1,32 @@
+"""Action sets: which priority orders a policy chooses from."""
+
+import numpy as np
+
+from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import unknown
+
+ACTIONS = ("commands", "orders", "avoidance")
+
+
+def order_of(scenario: Scenario, actions: str) -> np.ndarray:
+    """(A,) index into ``scenario.orders`` of every action of a set.
+
+    Args:
+        scenario: whose orders they are.
+        actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, those
+            commands that end in the first formation, the shortest first: FM and OA>FM in the case study.
+
+    Raises:
+        ConfigurationError: there is no such set.
+    """
+    orders = scenario.orders
+    if actions == "commands":
+        return orders.representative
+    if actions == "orders":
+        return np.arange(len(orders))
+    if actions != "avoidance":
+        raise unknown("action set", actions, ACTIONS)
+    parts = [name.split(SEPARATOR) for name in orders.commands]
+    kept = [c for c, names in enumerate(parts) if names[-1] == scenario.formation_names[0]]
+    return orders.representative[sorted(kept, key=lambda c: len(parts[c]))]

@@ -1,0 +1,11 @@
+"""Checkpoints that come with the package; each has a model card beside it."""
+
+from importlib.resources import files
+from pathlib import Path
+
+FOLDER = Path(str(files("marlbc_mj") / "training" / "checkpoints"))
+
+
+def shipped(name: str) -> Path:
+    """Path of a shipped checkpoint, whether there is one or not."""
+    return FOLDER / f"{name}.safetensors"

@@ -1,0 +1,1 @@
+"""What an episode or a study came to: metrics, outcomes, statistics, summaries."""

@@ -1,0 +1,1 @@
+"""Studies: many independent episodes or trainings, and the report that is made from their results."""

@@ -1,0 +1,133 @@
+"""Where the velocity gains of the finite- and fixed-time rivals come from: Table 6's printed maxima, inverted by a search.
+
+Their largest force occurs in the first substep of the column (FR), and again in the first one after it, when v_r jumps; it is
+nearly proportional to the velocity gain. So one gain cannot fit four printed maxima: the search fits the largest of them, and
+the other agents' tell how well the law's shape explains the table.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from marlbc_mj.controllers import FiniteTime, FixedTime
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.report.paper_values import INPUT_MAX
+from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.supervisors import Scripted
+from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
+
+CALIBRATED: dict[str, FiniteTime | FixedTime] = {"finite-time": FiniteTime(), "fixed-time": FixedTime()}
+"""Controllers whose ``velocity_gain`` is tied to Table 6, with the gains they are shipped with."""
+TOLERANCE = 1e-6  # relative, of the maximum
+MOST_EPISODES = 40
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the search found for one controller."""
+
+    controller: str
+    printed: tuple[float, ...]  # Table 6, per agent [N]
+    found: float  # velocity gain whose largest maximum is the largest printed one [1/s]
+    shipped: float  # the dataclass's default [1/s]
+    at_found: tuple[float, ...]  # max |u|_inf per agent with the gain found [N]
+    at_shipped: tuple[float, ...]  # the same with the default [N]
+    episodes: int  # simulated by the search
+
+    @property
+    def errors(self) -> tuple[float, ...]:
+        """Relative error of the maxima per agent, with the gain found."""
+        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_found, self.printed, strict=True))
+
+    @property
+    def shipped_errors(self) -> tuple[float, ...]:
+        """Relative error of the maxima per agent, with the default gain."""
+        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_shipped, self.printed, strict=True))
+
+
+def calibrate(
+    name: str,
+    scenario: Scenario | None = None,
+    *,
+    tolerance: float = TOLERANCE,
+    progress: Callable[[int, int], None] | None = None,
+) -> Calibration:
+    """Find the velocity gain that gives Table 6's largest maximum, with whole episodes under the scripted supervisor.
+
+    Args:
+        name: a key of :data:`CALIBRATED`.
+        scenario: the case study by default; a shorter one must keep a switch between FM and FR.
+        tolerance: relative error of the maximum at which the search ends.
+        progress: called after every episode of the search with their number and the most there may be.
+
+    Raises:
+        ConfigurationError: unknown name, a tolerance that is not positive, or a scenario with another number of agents.
+        SimulationError: no gain from a quarter of to four times the default gives the maximum, or a run diverged.
+    """
+    if name not in CALIBRATED:
+        raise unknown("calibrated controller", name, CALIBRATED)
+    if not tolerance > 0.0:
+        raise ConfigurationError(f"tolerance must be positive, got {tolerance}")
+    scenario = scenario or paper()
+    law, printed = CALIBRATED[name], INPUT_MAX.values[name]
+    if scenario.agents != len(printed):
+        raise ConfigurationError(f"Table 6 has {len(printed)} agents, the scenario {scenario.agents}")
+    target = max(printed)
+    tried: dict[float, tuple[float, ...]] = {}
+
+    def excess(gain: float) -> float:
+        tried[gain] = maxima(replace(law, velocity_gain=gain), scenario)
+        if progress is not None:
+            progress(len(tried), MOST_EPISODES)
+        return max(tried[gain]) / target - 1.0
+
+    found = _root(excess, law.velocity_gain / 4.0, law.velocity_gain * 4.0, tolerance)
+    shipped = maxima(law, scenario)
+    return Calibration(name, tuple(map(float, printed)), found, law.velocity_gain, tried[found], shipped, len(tried))
+
+
+def maxima(controller: FiniteTime | FixedTime, scenario: Scenario) -> tuple[float, ...]:
+    """(N,) largest |u|_inf of each agent over one episode [N]."""
+    trajectory = run_episode(World(scenario, controller, record=True), Scripted())
+    return tuple(float(force) for force in np.abs(trajectory.force).max(axis=(0, 2)))
+
+
+def calibration_lines(results: Sequence[Calibration]) -> list[str]:
+    """A Markdown table with two rows a controller, the gain found and the gain shipped, below the printed maxima."""
+    lines = [
+        "| controller | velocity gain, 1/s | max ‖u‖∞ per agent, N | relative error per agent |",
+        "|---|---:|---:|---:|",
+    ]
+    for result in results:
+        lines.append(f"| {result.controller}, printed | – | {_slashed(result.printed, 'g')} | – |")
+        rows = (
+            ("found", result.found, result.at_found, result.errors),
+            ("shipped", result.shipped, result.at_shipped, result.shipped_errors),
+        )
+        for kind, gain, reached, errors in rows:
+            cells = f"{gain:.4f} | {_slashed(reached, '.2f')} | {_slashed(errors, '+.2%')}"
+            lines.append(f"| {result.controller}, {kind} | {cells} |")
+    return lines
+
+
+def _slashed(numbers: Sequence[float], form: str) -> str:
+    return " / ".join(format(round(number, 4) + 0.0, form) for number in numbers)  # + 0.0: no negative zero
+
+
+def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
+    """Where an increasing function is within ``tolerance`` of zero: false position, halving the weight of an end that stays."""
+    at_low, at_high = function(low), function(high)
+    if at_low > 0.0 or at_high < 0.0:
+        raise SimulationError(f"no gain from {low:g} to {high:g} /s gives the printed maximum")
+    for _ in range(MOST_EPISODES - 2):
+        middle = (low * at_high - high * at_low) / (at_high - at_low)
+        value = function(middle)
+        if abs(value) <= tolerance:
+            return middle
+        if value < 0.0:
+            low, at_low, at_high = middle, value, 0.5 * at_high
+        else:
+            high, at_high, at_low = middle, value, 0.5 * at_low
+    raise SimulationError(f"no gain found to a relative error of {tolerance:g} within {MOST_EPISODES} episodes")

@@ -1,0 +1,203 @@
+"""A study of learners: its variants, and what their runs came to as CSV files, a table and a figure."""
+
+import csv
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.training.config import CARE, METHODS, PRESETS, TrainConfig, from_json, make_config
+from marlbc_mj.training.run import rank
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.files import staged_file
+
+DONE, FAILED = "DONE", "FAILED"
+GOAL_SWITCHES = (4, 2, 2, 4)
+"""Switches per agent that meet the goal on the case study; with no violation and at least the scripted supervisor's return."""
+UNFINISHED = "unfinished"
+"""The failure of a run that was interrupted and can go on."""
+
+Record = dict[str, str]
+"""A line of a CSV file: what is shown of a run is exactly what its file says."""
+COLUMNS = (
+    *("variant", "seed", "budget", "goal_return", "best_mission_steps"),
+    *("best_return", "best_switches", "best_violation_time", "best_clearance_min", "goal_mission_steps", "goal_wall_s"),
+    *(
+        "final_mission_steps",
+        "final_return",
+        "final_switches",
+        "final_violation_time",
+        "final_clearance_min",
+        "wall_s",
+        "failure",
+    ),
+)
+"""Of study.csv. Switches per agent, clearances in m, times in s; ``goal_*`` is empty for a run that never met the goal."""
+CURVE_COLUMNS = ("variant", "seed", "mission_steps", "return", "violation_time", "switches")
+"""Of curves.csv: violation of the worst agent [s], switches of the whole team."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to learn: a method and a preset with changes. A group has at most ``WIDE`` variants, a row of the figure."""
+
+    line: str
+    group: str
+    """What it is compared for: learner, preset or rival."""
+    method: str = "marlms"
+    preset: str = "fast"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def config(self, seed: int, budget: int) -> TrainConfig:
+        """The run's configuration, on one thread, so that runs do not compete for cores."""
+        changes = {**METHODS[self.method][0], **self.changes, "method": self.method, "seed": seed, "budget": budget}
+        return make_config(self.preset, **changes, threads=1)
+
+
+_UNCENTRED = {"shaping": replace(PRESETS["fast"][0].shaping, centre=0.0)}
+VARIANTS: dict[str, Variant] = {
+    "marlms": Variant("MARLMS with the fast preset", "learner"),
+    "no-leniency": Variant("every negative TD error counts", "learner", "iql"),
+    "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
+    "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
+    "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
+    "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
+    "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
+    "uniform-starts": Variant(
+        "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
+    ),
+    "no-joint-exploration": Variant(
+        "a random order lasts one decision, of one agent",
+        "preset",
+        changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
+    ),
+    "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
+    "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
+    "paper": Variant("the printed hyper-parameters, state, reward and orders", "preset", preset="paper"),
+    "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
+    "vdn": Variant("value decomposition", "rival", "vdn"),
+    "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
+    "central": Variant("one network over joint orders", "rival", "central"),
+    "rlms": Variant("single agents side by side", "rival", "rlms"),
+    "mappo": Variant("multi-agent PPO", "rival", "mappo"),
+}
+"""Method, preset and changes by name."""
+
+
+def read_json(path: Path, key: str) -> Any:
+    """An entry of a JSON object; ConfigurationError where the file holds none."""
+    try:
+        return json.loads(path.read_text())[key]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ConfigurationError(f"cannot read {key} from {path}: {error}") from error
+
+
+@cache
+def scripted_return(scenario: str, controller: str) -> float:
+    """Return of the scripted supervisor on the scenario, to the six digits of eval.csv; the goal for learned ones."""
+    world = World(make_scenario(scenario), make_controller(controller), record=True)
+    return float(f"{measure(run_episode(world, make_supervisor('scripted', controller)))['team']['return']:.6g}")
+
+
+def collect(out: Path) -> tuple[list[Record], list[Record]]:
+    """Lines of study.csv and curves.csv from all runs in the study's folder, also those of earlier calls.
+
+    Raises:
+        ConfigurationError: a file of a run that cannot be read.
+    """
+    rows: list[Record] = []
+    curves: list[Record] = []
+    for name in VARIANTS:
+        for folder in sorted((p for p in (out / name).glob("*") if p.name.isdigit()), key=lambda p: int(p.name)):
+            failed = (folder / FAILED).is_file()
+            if not failed and not (folder / "config.json").is_file():
+                continue
+            config = from_json(read_json(folder / (FAILED if failed else "config.json"), "train"))
+            ended = read_json(folder / FAILED, "failure") if failed else "" if (folder / DONE).is_file() else UNFINISHED
+            evaluations = read_csv(folder / "eval.csv", ("return",)) if (folder / "eval.csv").is_file() else []
+            rows.append(_row(name, config, evaluations, ended))
+            for e in evaluations:
+                team = f"{sum(float(s) for s in _switches(e)):.0f}"
+                line = (name, str(config.seed), e["mission_steps"], e["return"], e["violation_time"], team)
+                curves.append(dict(zip(CURVE_COLUMNS, line, strict=True)))
+    return rows, curves
+
+
+def _row(name: str, config: TrainConfig, evaluations: Sequence[Record], failure: str) -> Record:
+    goal = scripted_return(config.scenario, config.controller)
+    row = dict.fromkeys(COLUMNS, "")
+    row |= {"variant": name, "seed": str(config.seed), "budget": str(config.budget), "goal_return": f"{goal:.6g}"}
+    row["failure"] = failure
+    if evaluations:
+        best = max(evaluations, key=lambda e: rank({key: float(value) for key, value in e.items()}))
+        for which, e in (("best", best), ("final", evaluations[-1])):
+            row |= {f"{which}_{key}": e[key] for key in ("mission_steps", "return", "violation_time", "clearance_min")}
+            row[f"{which}_switches"] = "/".join(_switches(e))
+        row["wall_s"] = evaluations[-1]["wall_s"]
+        met = next((e for e in evaluations if meets_goal(e, goal)), None)
+        row |= {f"goal_{key}": met[key] for key in ("mission_steps", "wall_s")} if met else {}
+    return row
+
+
+def meets_goal(evaluation: Record, least_return: float) -> bool:
+    """Whether no agent violates, none switches more than GOAL_SWITCHES says, and the return is not below the goal's."""
+    few = [float(s) <= limit for s, limit in zip(_switches(evaluation), GOAL_SWITCHES, strict=False)]
+    return all(few) and float(evaluation["violation_time"]) == 0.0 and float(evaluation["return"]) >= least_return
+
+
+def _switches(evaluation: Record) -> list[str]:
+    return [value for key, value in evaluation.items() if key.startswith("switches_")]
+
+
+def read_csv(path: Path, columns: Sequence[str]) -> list[Record]:
+    """Lines of a CSV file that has at least these columns; ConfigurationError where it does not."""
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            lines = [dict(line) for line in csv.DictReader(file)]
+    except OSError as error:
+        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+    if not lines or any(line.get(column) is None for line in lines for column in columns):
+        raise ConfigurationError(f"{path} is no file of a study: it needs lines with columns {', '.join(columns)}")
+    return lines
+
+
+def read_study(folder: Path) -> tuple[list[Record], list[Record]]:
+    """What :func:`write_csvs` wrote.
+
+    Raises:
+        ConfigurationError: study.csv or curves.csv is missing, torn, or names an unknown variant.
+    """
+    rows = read_csv(folder / "study.csv", COLUMNS)
+    curves = read_csv(folder / "curves.csv", CURVE_COLUMNS) if any(row["wall_s"] for row in rows) else []
+    for line in (*rows, *curves):
+        if line["variant"] not in VARIANTS:
+            raise unknown("variant", line["variant"], VARIANTS)
+        texts = [text for key, text in line.items() if key not in ("variant", "failure")]
+        if not all(_is_number(part) for text in texts for part in text.split("/") if part):
+            raise ConfigurationError(f"a line of {folder} is no record of a study: {', '.join(line.values())}")
+    return rows, curves
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def write_csvs(folder: Path, rows: Sequence[Record], curves: Sequence[Record]) -> None:
+    """study.csv, a line a run, and curves.csv, a line an evaluation."""
+    for name, columns, lines in (("study.csv", COLUMNS, rows), ("curves.csv", CURVE_COLUMNS, curves)):
+        with staged_file(folder / name, overwrite=True) as staging, staging.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(lines)

@@ -1,0 +1,235 @@
+"""How fast learning is on this machine: the environment alone, a training run, where its time goes, and a learned decision."""
+
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from statistics import median
+from threading import get_ident
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.policies.checkpoint import signature
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.studies.perf import interleaved, ratio
+from marlbc_mj.supervisors import situation
+from marlbc_mj.supervisors.learned import Learned
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.training.base import BaseTrainer, make_starts
+from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.training.run import make_trainer
+
+WORLDS = 256  # of the environment alone
+DECISIONS = 10  # of all worlds, in one measurement
+PROFILED = 40  # decisions that the profile is taken over
+REST = "rest"
+
+
+def training_config(threads: int) -> TrainConfig:
+    """What is measured: the fast preset."""
+    return make_config("fast", threads=threads)
+
+
+def measure_training(
+    threads: tuple[int, ...], rounds: int, say: Callable[[str], None]
+) -> tuple[dict[str, Any], dict[str, float]]:
+    """Figures and ratios of learning, each for every number of ``threads``.
+
+    The environment has the preset's interval, actions and starts, and random actions; a training run is measured past its
+    warm-up. The ends of exploring starts are spread, so that every measurement has its share of new episodes.
+    """
+    configs = {n: training_config(n) for n in threads}
+    environments = {n: _environment(config) for n, config in configs.items()}
+    trainers = {n: make_trainer(config) for n, config in configs.items()}
+    rng = np.random.default_rng(0)
+    for batch in (*environments.values(), *(trainer.batch for trainer in trainers.values())):
+        spread(batch, rng)
+    say("learned decisions")
+    decision = _measure_decisions(trainers[threads[0]], rounds)
+    say("warm-up of training")
+    for trainer in trainers.values():
+        warm_up(trainer)
+    say("mission steps of the environment and of training")
+    variants: dict[Any, Callable[[], None]] = {}
+    for n in threads:
+        variants["environment", n] = partial(_play, environments[n], rng)
+        variants["training", n] = partial(_learn, trainers[n], DECISIONS)
+    taken = interleaved(variants, rounds)
+    made = {("environment", n): WORLDS * DECISIONS * configs[n].interval for n in threads}
+    made |= {("training", n): configs[n].worlds * DECISIONS * configs[n].interval for n in threads}
+    each = {key: [s / made[key] for s in seconds] for key, seconds in taken.items()}
+    say("where the time of training goes")
+    figures = {
+        f"{what}_mission_steps_per_s": {str(n): 1.0 / median(each[what, n]) for n in threads}
+        for what in ("environment", "training")
+    }
+    profiles, aside = {}, {}
+    for n in threads:
+        profiles[str(n)], aside[str(n)] = profile(trainers[n], PROFILED)
+    ratios = {f"training_over_environment_{n}": ratio(each["environment", n], each["training", n]) for n in threads}
+    return {**figures, "training_profile": profiles, "training_profile_aside": aside, "decision_us": decision}, ratios
+
+
+def _environment(config: TrainConfig) -> FormationBatch:
+    batch = FormationBatch(
+        make_scenario(config.scenario),
+        make_controller(config.controller),
+        worlds=WORLDS,
+        threads=config.threads,
+        interval=config.interval,
+        state="extended",
+        actions=config.actions,
+        starts=make_starts(config),
+    )
+    batch.reset(config.seed)
+    return batch
+
+
+def spread(batch: FormationBatch, rng: np.random.Generator) -> None:
+    """Cut the exploring starts that all worlds begin with at different times; those that follow stay apart by themselves."""
+    exploring = batch.cut < batch.scenario.mission_steps
+    left = batch.cut - batch.world.state.steps
+    batch.cut = batch.cut - np.where(exploring, rng.integers(np.maximum(left, 1)), 0)
+
+
+def warm_up(trainer: BaseTrainer) -> None:
+    """Advance until there have been updates."""
+    while not trainer.updates:
+        trainer.advance()
+
+
+def _play(batch: FormationBatch, rng: np.random.Generator) -> None:
+    for _ in range(DECISIONS):
+        batch.step(rng.integers(batch.actions, size=batch.last.shape))
+
+
+def _learn(trainer: BaseTrainer, decisions: int) -> None:
+    for _ in range(decisions):
+        trainer.advance()
+
+
+class Clock:
+    """Seconds by part of a program. Parts may call each other: only the innermost one's time runs.
+
+    ``seconds`` are those of the thread that made the clock; ``aside``, of one other thread, whose parts must not call each other.
+    """
+
+    def __init__(self) -> None:
+        self.thread = get_ident()
+        self.aside: dict[str, float] = {}
+        self.seconds: dict[str, float] = {REST: 0.0}
+        self.part = REST
+        self.since = perf_counter()
+
+    def turn_to(self, part: str) -> str:
+        """Count for ``part`` from now on; returns what was counted for before."""
+        now, before = perf_counter(), self.part
+        self.seconds[before] += now - self.since
+        self.part, self.since = part, now
+        return before
+
+    @contextmanager
+    def timing(self, owner: Any, names: tuple[str, ...], part: str) -> Iterator[None]:
+        """Count the methods ``names`` of one object for ``part`` within the block; ``__call__`` works as well."""
+        self.seconds.setdefault(part, 0.0)
+        kind = type(owner)
+        owner.__class__ = type(kind.__name__, (kind,), {name: self._timed(getattr(kind, name), part) for name in names})
+        try:
+            yield
+        finally:
+            owner.__class__ = kind
+
+    def _timed(self, method: Callable[..., Any], part: str) -> Callable[..., Any]:
+        def run(*arguments: Any, **keywords: Any) -> Any:
+            if get_ident() != self.thread:
+                began = perf_counter()
+                try:
+                    return method(*arguments, **keywords)
+                finally:
+                    self.aside[part] = self.aside.get(part, 0.0) + perf_counter() - began
+            before = self.turn_to(part)
+            try:
+                return method(*arguments, **keywords)
+            finally:
+                self.turn_to(before)
+
+        return run
+
+
+def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, float]]:
+    """Shares of the wall time of training with a replay buffer: of the thread that simulates, and of the one that learns
+    meanwhile, if there is one.
+
+    Simulation is the worlds' steps and resets; state the state vectors; exploration the hash codes, temperatures and random
+    orders; replay what is stored and drawn; waiting is for updates that take longer than the worlds; the rest the greedy choice,
+    rewards and leniency.
+    """
+    parts = (
+        (trainer.batch.world, ("advance", "reset", "place"), "simulation"),
+        (trainer.batch, ("states",), "state"),
+        (trainer.learner, ("values",), "action_values"),
+        (trainer.learner, ("update",), "updates"),
+        (trainer.exploration, ("__call__", "forget"), "exploration"),
+        (trainer.hash, ("__call__",), "exploration"),
+        (trainer.temperatures, ("read", "cool"), "exploration"),
+        (trainer.replay, ("store", "sample", "learnt"), "replay"),
+        (trainer, ("_await",), "waiting"),
+    )
+    clock = Clock()
+    with ExitStack() as stack:
+        for owner, names, part in parts:
+            stack.enter_context(clock.timing(owner, names, part))
+        clock.since = perf_counter()
+        _learn(trainer, decisions)
+        clock.turn_to(REST)
+    total = sum(clock.seconds.values())
+    own, aside = (
+        {part: seconds / total for part, seconds in taken.items() if seconds > 0} for taken in (clock.seconds, clock.aside)
+    )
+    return own, aside
+
+
+def _measure_decisions(trainer: BaseTrainer, episodes: int) -> dict[str, dict[str, float]]:
+    """Microseconds of ``Learned.decide``, median and 99th percentile: of the mission steps at which it decides, and of all.
+
+    The networks are untrained; what they decide does not change what a decision takes.
+    """
+    scenario, config = trainer.scenario, trainer.config
+    tied = signature(scenario, config.state, config.actions, config.interval)
+    supervisor = Learned(trainer.policy(), tied, Path("untrained"))
+    world = World(scenario, make_controller(config.controller))
+    every: list[float] = []
+    deciding: list[float] = []
+    for _ in range(episodes):
+        memory, observation = supervisor.start(scenario), world.reset()
+        supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
+        for step in range(scenario.mission_steps):
+            seen = situation(observation, world.state.obstacles[0], scenario.mission_step)
+            began = perf_counter()
+            orders, memory = supervisor.decide(seen, memory)
+            every.append(1e6 * (perf_counter() - began))
+            if step % config.interval == 0:
+                deciding.append(every[-1])
+            observation = world.step(orders[None]).observation
+    samples = {"decision_step": deciding, "all_mission_steps": every}
+    return {name: {"median": float(np.median(us)), "p99": float(np.percentile(us, 99))} for name, us in samples.items()}
+
+
+def training_lines(figures: dict[str, Any]) -> list[str]:
+    """The figures of learning as text, one line each."""
+    lines = [
+        f"{what}, {threads} thread(s): {rate:,.0f} mission steps/s"
+        for what, key in ((f"FormationBatch, B = {WORLDS}", "environment"), ("training, preset fast", "training"))
+        for threads, rate in figures[f"{key}_mission_steps_per_s"].items()
+    ]
+    for key, which in (("training_profile", ""), ("training_profile_aside", ", meanwhile in the one that learns")):
+        for threads, shares in figures[key].items():
+            named = ", ".join(f"{part.replace('_', ' ')} {share:.1%}" for part, share in shares.items())
+            lines += [f"time of training, {threads} thread(s){which}: {named}"] if shares else []
+    for name, taken in figures["decision_us"].items():
+        lines.append(f"learned, {name.replace('_', ' ')}: median {taken['median']:.0f} us, p99 {taken['p99']:.0f} us")
+    return lines

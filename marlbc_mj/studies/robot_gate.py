@@ -1,0 +1,186 @@
+"""Every robot on the gate mission scaled to it, under three supervisors: one table, and stills and clips for a gallery."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+
+from marlbc_mj.controllers import PD, SORLC, Controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Frame, Trajectory, run_episode
+from marlbc_mj.recording.log import from_trajectory
+from marlbc_mj.recording.video import render_still, render_video
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.robots import ROBOTS, Robot, make_robot
+from marlbc_mj.scenarios.robot_gate import robot_gate
+from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
+from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.files import staged_folder, write_json
+
+SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
+    "scripted": lambda robot: Scripted(),
+    "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
+    "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
+}
+"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
+
+CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
+    "pd": lambda robot: PD(*robot.gains),
+    "sorlc-scaled": lambda robot: SORLC.scaled(
+        position_error_gain=robot.gains[0], velocity_error_gain=robot.gains[1], identifier_rate=10.0 * robot.gains[1] / 16.0
+    ),
+}
+"""With the robot's gains per unit mass."""
+
+STILL_AT = (0.17, 0.58)  # of the mission: round the point, in the gate
+CLIP = (0.10, 0.66)  # of the mission
+SHOWN = [name for name in ROBOTS if name != "point_mass"]
+
+
+class Row(NamedTuple):
+    """One robot under one supervisor."""
+
+    robot: str
+    supervisor: str
+    clearance: float  # least, of the point that is led, from an obstacle's surface [m]
+    safe_distance: float  # [m]
+    violation: float  # worst agent [s]
+    collisions: int  # mission steps at which robots touched each other or an obstacle
+    distance: float  # least between two agents [m]
+    error: float  # RMS of the position error, worst agent [m]
+    saturation: float  # share of substeps, worst agent
+    switches: tuple[int, ...]
+    returned: float
+    height_error: float | None  # [m]
+    tilt: float | None  # [deg]
+
+
+def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[Row, Trajectory]:
+    """One episode of a robot's gate mission.
+
+    Raises:
+        ConfigurationError: an unknown name.
+        SimulationError: the world diverged.
+    """
+    for kind, name, valid in (("supervisor", supervisor, SUPERVISORS), ("controller", controller, CONTROLLERS)):
+        if name not in valid:
+            raise unknown(kind, name, valid)
+    body, scenario = make_robot(robot), robot_gate(robot)
+    world = World(scenario, CONTROLLERS[controller](body), record=True)
+    touches: list[bool] = []
+
+    def watch(_: Frame) -> None:
+        touches.append(touching(world))
+
+    names = (supervisor, controller)
+    trajectory = run_episode(world, SUPERVISORS[supervisor](body), names=names, on_frame=watch)
+    return _row(robot, supervisor, trajectory, world, sum(touches)), trajectory
+
+
+def touching(world: World) -> bool:
+    """Whether a robot of world 0 touches another body than its own and the ground."""
+    model, data = world.plan.model, world.data[0]
+    roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
+    return bool(((roots[:, 0] != roots[:, 1]) & (roots > 0).all(axis=1)).any())
+
+
+def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, collisions: int) -> Row:
+    measured, body, scenario = measure(trajectory), world.plan.robot, trajectory.scenario
+    agents = measured["agents"]
+    found = {name: world.state.robot[0, :, k] for name, k in body.diagnostics.items()}
+    saturated = [a["saturation_duty"] for a in agents]
+    if "saturated" in found:
+        saturated = np.maximum(saturated, found["saturated"] / len(trajectory.time)).tolist()
+    return Row(
+        robot=robot,
+        supervisor=supervisor,
+        clearance=min(a["clearance_min"] for a in agents),
+        safe_distance=scenario.safe_distance,
+        violation=max(a["violation_time"] for a in agents),
+        collisions=collisions,
+        distance=measured["team"]["agent_distance_min"],
+        error=max(a["rms_position_error"] for a in agents),
+        saturation=max(saturated),
+        switches=tuple(a["switches"] for a in agents),
+        returned=measured["team"]["return"],
+        height_error=float(found["height_error"].max()) if "height_error" in found else None,
+        tilt=float(np.degrees(found["tilt"].max())) if "tilt" in found else None,
+    )
+
+
+def gate_table(rows: Sequence[Row]) -> str:
+    """Markdown, one line a robot and supervisor."""
+    head = ("robot", "supervisor", "least clearance / safe", "violation", "contacts", "between agents", "tracking, RMS")
+    lines = [
+        "| " + " | ".join((*head, "saturated", "switches", "height, tilt")) + " |",
+        "|---|---|" + "---:|" * 5 + "---:|---|---|",
+    ]
+    for r in rows:
+        flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
+        cells = (
+            r.robot,
+            r.supervisor,
+            f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
+            f"{r.violation:.2f} s",
+            str(r.collisions),
+            f"{r.distance:.2f} m",
+            f"{1e3 * r.error:.0f} mm",
+            f"{100 * r.saturation:.1f} %",
+            "/".join(map(str, r.switches)),
+            flight,
+        )
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def run_gates(
+    robots: Sequence[str],
+    supervisors: Sequence[str],
+    out: Path,
+    *,
+    controller: str = "pd",
+    clips: bool = True,
+    overwrite: bool = False,
+    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
+) -> list[Row]:
+    """Fly every robot under every supervisor, and leave gate.md, gate.json, and stills and clips of the first supervisor.
+
+    Raises:
+        ConfigurationError: an unknown name, a missing package, or a folder that cannot be written.
+        SimulationError: a world diverged.
+    """
+    rows: list[Row] = []
+    total = len(robots) * len(supervisors)
+    with staged_folder(out, overwrite=overwrite) as folder:
+        for robot in robots:
+            for supervisor in supervisors:
+                row, trajectory = fly_gate(robot, supervisor, controller)
+                rows.append(row)
+                progress("gate", len(rows), total)
+                if clips and supervisor == supervisors[0]:
+                    show(trajectory, CONTROLLERS[controller](make_robot(robot)), folder, Path(robot).stem)
+        (folder / "gate.md").write_text(gate_table(rows) + "\n")
+        write_json(folder / "gate.json", {"schema": 1, "controller": controller, "rows": [row._asdict() for row in rows]})
+    return rows
+
+
+def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str) -> None:
+    """Two stills and a short clip of an episode, seen close."""
+    log = from_trajectory(trajectory, controller)
+    duration = trajectory.scenario.duration
+    for k, share in enumerate(STILL_AT, 1):
+        Image.fromarray(render_still(log, share * duration, camera="close")).save(folder / f"{name}-{k}.png")
+    start, end = (share * duration for share in CLIP)
+    render_video(
+        log,
+        folder / f"{name}.mp4",
+        camera="close",
+        start=start,
+        end=end,
+        speed=float(max(1, round((end - start) / 10.0))),
+        width=960,
+        height=540,
+        samples=4,
+    )

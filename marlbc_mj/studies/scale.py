@@ -1,0 +1,187 @@
+"""What teams of any size cost: time per agent and mission step, and memory of a world, from 4 to 256 agents.
+
+Every size runs the same mission: a grid formation among discs, as many per agent at every size, each agent under OA>AA>FM, so
+that every mission step asks for the nearest obstacle and the nearest neighbor of everybody. Sizes take turns within one process,
+so ratios hold on a machine that is not quiet. Small teams are batched until a burst holds as many agents as the largest, so that
+a figure is that of the loop, not of its call.
+"""
+
+import gc
+import subprocess
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.engine.world import World
+from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.families import Field
+from marlbc_mj.studies.perf import interleaved, ratio
+from marlbc_mj.supervisors import make_supervisor, situation
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.provenance import provenance
+
+SIZES = (4, 8, 16, 32, 64, 128, 256)
+SUPERVISORS = ("fsams", "fms", "layered")
+OBSTACLES = 1  # per agent
+AGENT_STEPS = 2560  # agents x mission steps in one burst
+MEMORY_AGENTS = 2048  # agents in all worlds together whose memory is measured
+LEAST_WORLDS = 64  # so that what a plan leaves behind is small beside them
+
+
+def mission(agents: int) -> Scenario:
+    """A grid of agents on a way with one disc per agent, dense enough that queries matter at every size."""
+    length = float(30.0 + 12.0 * np.ceil(np.sqrt(agents)))
+    discs = Field(obstacles=OBSTACLES * agents, radius=(0.3, 0.6), gap=2.5)
+    return discs.build(name=f"scale-{agents}", agents=agents, formation="grid", length=length)
+
+
+class Team:
+    """Worlds of one size, all agents under OA>AA>FM."""
+
+    def __init__(self, agents: int) -> None:
+        self.scenario = mission(agents)
+        self.world = World(self.scenario, worlds=max(1, max(SIZES) // agents))
+        self.orders = np.full((self.world.worlds, agents), self.scenario.orders.index("OA>AA>FM"))
+        self.steps = max(1, AGENT_STEPS // (self.world.worlds * agents))
+        self.agent_steps = self.world.worlds * agents * self.steps
+        self.supervisors = {name: make_supervisor(name) for name in SUPERVISORS}
+        self.memories = {name: supervisor.start(self.scenario) for name, supervisor in self.supervisors.items()}
+
+    def advance(self) -> None:
+        """One burst; a finished mission starts again."""
+        for _ in range(self.steps):
+            if self.world.state.steps[0] >= self.scenario.mission_steps:
+                self.world.reset()
+            self.world.advance(self.orders)
+
+    def decide(self, name: str) -> None:
+        """One decision of a supervisor, in the state where the team is."""
+        seen = situation(self.world.observe(), self.world.state.obstacles[0], self.scenario.mission_step)
+        _, self.memories[name] = self.supervisors[name].decide(seen, self.memories[name])
+
+
+def measure_scale(rounds: int = 7, progress: Callable[[str], None] | None = None) -> dict[str, Any]:
+    """All figures of ``marlbc scale``: medians over ``rounds``, growth as the median of per-round ratios.
+
+    Raises:
+        ConfigurationError: fewer than 5 rounds.
+    """
+    if rounds < 5:
+        raise ConfigurationError(f"rounds must be at least 5 for a median to mean something, got {rounds}")
+    say = progress or (lambda message: None)
+    say("missions from 4 to 256 agents")
+    teams = {agents: Team(agents) for agents in SIZES}
+    taken = interleaved({agents: team.advance for agents, team in teams.items()}, rounds)
+    each = {agents: [s / teams[agents].agent_steps for s in seconds] for agents, seconds in taken.items()}
+    say("decisions of supervisors that decide per agent")
+    variants: dict[Any, Callable[[], None]] = {
+        (name, agents): partial(team.decide, name) for name in SUPERVISORS for agents, team in teams.items()
+    }
+    decisions = interleaved(variants, rounds)
+    say("memory")
+    memory = {agents: _memory(agents) for agents in SIZES}
+    return {
+        "us_per_agent_and_mission_step": {str(n): 1e6 * median(each[n]) for n in SIZES},
+        "growth": {str(n): ratio(each[n], each[SIZES[0]]) for n in SIZES},
+        "decision_us_per_agent": {name: {str(n): 1e6 * median(decisions[name, n]) / n for n in SIZES} for name in SUPERVISORS},
+        "kib_per_world": {str(n): memory[n] / 1024.0 for n in SIZES},
+        "kib_per_agent": {str(n): memory[n] / 1024.0 / n for n in SIZES},
+        "rounds": rounds,
+    }
+
+
+_MEMORY = """
+import sys
+import numpy as np
+from marlbc_mj.engine.world import World
+from marlbc_mj.studies.scale import mission, resident
+agents, worlds = int(sys.argv[1]), int(sys.argv[2])
+scenario = mission(agents)
+def use(count):
+    world = World(scenario, worlds=count)
+    world.advance(np.full((count, agents), scenario.orders.index("OA>AA>FM")))
+    return world
+warm = use(1), use(1)
+before = resident()
+one = use(1)
+middle = resident()
+many = use(1 + worlds)
+print((resident() - middle - (middle - before)) / worlds)
+"""
+
+
+def _memory(agents: int) -> float:
+    """Resident memory [bytes] of one more world of so many agents, its plan not counted, in a process of its own."""
+    worlds = max(LEAST_WORLDS, MEMORY_AGENTS // agents)
+    run = subprocess.run([sys.executable, "-c", _MEMORY, str(agents), str(worlds)], capture_output=True, text=True, check=True)
+    return float(run.stdout)
+
+
+def resident() -> int:
+    """Resident memory of this process [bytes]."""
+    gc.collect()
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * 4096
+
+
+def scale_table(figures: dict[str, Any]) -> Table:
+    """One row a size."""
+    columns = (
+        Column("", "agents"),
+        Column("mission step", "µs per agent"),
+        Column("mission step", f"of {SIZES[0]} agents'"),
+        *(Column("decision", f"{name}, µs per agent") for name in SUPERVISORS),
+        Column("memory", "KiB per world"),
+        Column("memory", "KiB per agent"),
+    )
+    rows = []
+    for n in map(str, SIZES):
+        decisions = (f"{figures['decision_us_per_agent'][name][n]:.1f}" for name in SUPERVISORS)
+        cost = (f"{figures['us_per_agent_and_mission_step'][n]:.2f}", f"{figures['growth'][n]:.2f} ×")
+        rows.append((n, *cost, *decisions, f"{figures['kib_per_world'][n]:.0f}", f"{figures['kib_per_agent'][n]:.1f}"))
+    notes = (
+        f"Medians of {figures['rounds']} rounds in which all sizes take turns; the ratio is the median of each round's.",
+        f"A grid among {OBSTACLES} disc(s) per agent, everyone under OA>AA>FM, SORLC, 10 substeps a mission step, one thread.",
+        "Memory: what one more World copy adds to the resident memory of a process.",
+    )
+    return Table("scale", "What a mission step costs, by team size", columns, tuple(rows), notes)
+
+
+def write_scale(figures: dict[str, Any], folder: Path) -> None:
+    """scale.md, scale.json and figures/scale.{pdf,png}."""
+    (folder / "scale.md").write_text(to_markdown(scale_table(figures)), encoding="utf-8")
+    write_json(folder / "scale.json", {**figures, **provenance()})
+    (folder / "figures").mkdir()
+    with pl.style():
+        figure = _figure(figures)
+        for kind in ("pdf", "png"):
+            figure.savefig(folder / "figures" / f"scale.{kind}")
+
+
+def _figure(figures: dict[str, Any]) -> Any:
+    """Time and memory per agent over team size."""
+    figure, panels = pl.panels(pl.DOUBLE, 2.2, 1, 2, pl.Margins(across=0.75))
+    times, memory = panels[0]
+    sizes = list(SIZES)
+    cost = [figures["us_per_agent_and_mission_step"][str(n)] for n in sizes]
+    times.plot(sizes, cost, "o-", color="#0072B2", markersize=3.5)
+    times.axhline(1.5 * cost[0], color=pl.GREY, linewidth=0.7, linestyle=(0, (3, 2)))
+    times.annotate("1.5 times the cost at 4 agents", (sizes[-1], 1.5 * cost[0]), (0, 3), textcoords="offset points", ha="right")
+    times.set(ylim=(0, 1.75 * cost[0]), ylabel="mission step [µs per agent]")
+    memory.plot(sizes, [figures["kib_per_world"][str(n)] for n in sizes], "o-", color="#D55E00", markersize=3.5)
+    memory.set(ylim=0, xlim=0, ylabel="memory of a world [KiB]", xlabel="agents")  # linear axes: a straight line is linear growth
+    times.set_xscale("log", base=2)
+    times.set_xticks(sizes, [str(n) for n in sizes])
+    times.set_xlabel("agents")
+    for axes in (times, memory):
+        axes.grid(color="#E4E4E4", linewidth=0.4)
+        axes.set_axisbelow(True)
+    return figure

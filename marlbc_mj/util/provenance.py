@@ -1,0 +1,90 @@
+"""Where a result comes from: versions, machine, revision, configuration."""
+
+import dataclasses
+import hashlib
+import json
+import platform
+import subprocess
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gymnasium", "mcap", "matplotlib")
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that results depend on, by distribution name."""
+    found = {"python": platform.python_version()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+UNKNOWN = "unknown"
+"""The revision where the package was not installed from a repository."""
+
+
+def git_revision() -> str:
+    """Revision of the source tree; with changes ``-dirty`` and a digest of them, so that equal texts mean equal tracked files.
+
+    ``unknown`` when installed from a wheel.
+    """
+    root = Path(__file__).resolve().parents[2]
+    if not (root / ".git").exists():
+        return UNKNOWN
+
+    def git(*arguments: str) -> bytes:
+        return subprocess.run(["git", "-C", str(root), *arguments], capture_output=True, check=True, timeout=10).stdout
+
+    try:
+        revision = git("describe", "--always", "--dirty", "--abbrev=12", "--exclude=*").decode().strip()
+        if not revision.endswith("-dirty"):
+            return revision
+        return f"{revision}-{hashlib.sha256(git('diff', '--binary', '--no-ext-diff', 'HEAD')).hexdigest()[:8]}"
+    except (OSError, subprocess.SubprocessError):
+        return UNKNOWN
+
+
+def cpu() -> str:
+    """The processor's model name."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def provenance() -> dict[str, Any]:
+    """What every run directory's config.json and every log carry beside their configuration."""
+    return {"versions": versions(), "git_revision": git_revision(), "cpu": cpu(), "platform": platform.platform()}
+
+
+def plain_data(value: Any) -> Any:
+    """Dataclasses, tuples and arrays as JSON data; a dataclass keeps its type's name. Infinity becomes ``"inf"``."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: plain_data(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        return {"type": type(value).__name__, **fields}
+    if isinstance(value, dict):
+        return {str(key): plain_data(entry) for key, entry in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain_data(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain_data(entry) for entry in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        return str(value)
+    if isinstance(value, (str, int, float, bool)) or value is None:
+        return value
+    return str(value)
+
+
+def config_hash(config: dict[str, Any]) -> str:
+    """SHA-256 of a configuration in canonical JSON."""
+    text = json.dumps(plain_data(config), sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()

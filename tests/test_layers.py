@@ -1,0 +1,72 @@
+"""The order of packages: each imports only those before it, so that a reader can start at the front and never look back."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+ORDER = (
+    *("util", "core", "controllers", "robots", "scenarios", "engine", "policies", "supervisors", "episode"),
+    *("recording", "results", "report", "tasks", "training", "studies", "cli"),
+)
+"""Front to back. The package itself, ``marlbc_mj``, only passes names on, and ``__main__`` starts ``cli``."""
+
+
+def sources(root: Path) -> Iterator[Path]:
+    """Every source file of the library, each once: what links point to is found where it is."""
+    for top in ("marlbc_mj", "tasks", "training"):
+        yield from (path for path in sorted((root / top).rglob("*.py")) if not any(p.is_symlink() for p in path.parents))
+
+
+def layer(module: str) -> str:
+    """``"engine"`` for ``marlbc_mj.engine.world``; empty for the package itself."""
+    return module.split(".")[1] if "." in module else ""
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Names of the project's modules that a file imports, also inside functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "marlbc_mj")
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "marlbc_mj":
+            whole = node.module == "marlbc_mj"
+            yield from (f"{node.module}.{alias.name}" if whole else str(node.module) for alias in node.names)
+
+
+def back_imports(root: Path) -> list[str]:
+    """``file imports module`` for every import of a package that comes later, or of a name of the package itself."""
+    found = []
+    for path in sources(root):
+        own = path.relative_to(root).parts
+        name = own[0] if own[0] != "marlbc_mj" else own[1].removesuffix(".py")
+        if name in ("__init__", "__main__"):
+            continue
+        for module in dict.fromkeys(imported(path)):
+            if layer(module) not in ORDER or ORDER.index(layer(module)) > ORDER.index(name):
+                found.append(f"{path.relative_to(root)} imports {module}")
+    return found
+
+
+def test_every_package_imports_only_those_before_it() -> None:
+    assert back_imports(ROOT) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from marlbc_mj.engine.world import World",
+        "import marlbc_mj.cli",
+        "from marlbc_mj import World",
+        "def f():\n    import marlbc_mj.tasks",
+    ],
+)
+def test_a_planted_back_import_is_found(tmp_path: Path, line: str) -> None:
+    (tmp_path / "marlbc_mj" / "core").mkdir(parents=True)
+    (tmp_path / "marlbc_mj" / "core" / "laws.py").write_text(line + "\n")
+    assert [text.split(" imports ")[0] for text in back_imports(tmp_path)] == ["marlbc_mj/core/laws.py"]
+
+
+def test_the_package_root_holds_few_files() -> None:
+    assert len([path for path in (ROOT / "marlbc_mj").iterdir() if path.suffix == ".py"]) <= 8

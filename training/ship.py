@@ -1,0 +1,92 @@
+"""How a training run becomes a shipped checkpoint with a model card."""
+
+import csv
+import shutil
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.policies.checkpoint import read_policy
+from marlbc_mj.policies.shipped import FOLDER
+from marlbc_mj.training.config import METHODS, flat_settings, make_config
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import check_target, staged_file, write_json
+from marlbc_mj.util.provenance import plain_data
+
+CHOICE = {"commands": "one of the commands", "orders": "one of all orders", "avoidance": "formation with or without avoidance"}
+"""What is chosen from an action set."""
+
+
+def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
+    """Copy the best checkpoint of a run and write its model card, ``<name>.md``; returns the checkpoint's path.
+
+    Raises:
+        ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
+    """
+    source = run / "checkpoint" / "best.safetensors"
+    _, description = read_policy(source)
+    try:
+        with (run / "eval.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        text = card(name, description, rows)
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigurationError(f"{run} is not a finished training run: {error!r}") from error
+    target = folder / source.with_stem(name).name
+    check_target(target, overwrite=overwrite)
+    with staged_file(target, overwrite=True) as staging:
+        shutil.copyfile(source, staging)
+    write_json(target.with_suffix(".json"), description)
+    with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
+        staging.write_text(text)
+    return target
+
+
+def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
+    """The model card, Markdown: what it is, how it was made, what it does on the case study, its learning curve.
+
+    Args:
+        name: of the shipped checkpoint.
+        description: of the checkpoint, from its header.
+        rows: of the run's evaluations.
+    """
+    train, versions, evaluation = description["train"], description["versions"], description["evaluation"]
+    command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
+    command += f" --threads {train['threads']}" + "".join(f" {setting}" for setting in _settings(train))
+    switches = "/".join(f"{value:.0f}" for key, value in evaluation.items() if key.startswith("switches_"))
+    lines = [
+        f"# {name}",
+        "",
+        f"Greedy policy of a team on scenario `{train['scenario']}` with controller `{train['controller']}`: every "
+        f"{train['interval']} mission steps {CHOICE[train['actions']]} for each agent, from the {train['state']} state. "
+        "Trained on the unperturbed scenario alone; it knows no other team, slots or mission step, and refuses them.",
+        "",
+        f"- Command: `{command}`",
+        f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
+        f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {description['cpu']}.",
+        f"- On the case study: return {evaluation['return']:.0f}, switches {switches}, "
+        f"violation {evaluation['violation_time']:.3f} s, least clearance {evaluation['clearance_min']:.3f} m.",
+        f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
+        "",
+        "| mission steps | return | switches | violation [s] | least clearance [m] |",
+        "|---:|---:|---|---:|---:|",
+    ]
+    for row in rows:
+        counts = "/".join(f"{float(value):.0f}" for key, value in row.items() if key.startswith("switches_"))
+        lines.append(
+            f"| {float(row['mission_steps']):.0f} | {float(row['return']):.0f} | {counts} | {float(row['violation_time']):.3f} "
+            f"| {float(row['clearance_min']):.3f} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _settings(train: dict[str, object]) -> list[str]:
+    """``--set`` and what differs from the method's preset, nothing where nothing does."""
+    preset = flat_settings(plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0])))
+    said = {"method", "preset", "seed", "budget", "threads"}
+    changed = [
+        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if preset.get(name) != value and name not in said
+    ]
+    return ["--set", *changed] if changed else []
+
+
+def _text(value: object) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
