@@ -17,6 +17,7 @@ from marlbc_mj.core.disturbances import PaperDrag, constant_wind, linear_drag
 from marlbc_mj.engine.assembly import assemble
 from marlbc_mj.engine.loop import judge
 from marlbc_mj.engine.native import call_step, step_address
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -295,7 +296,8 @@ def test_a_world_depends_on_neither_batch_size_nor_threads(controller):
     orders = np.repeat(np.random.default_rng(0).integers(0, 6, (20, 5, 4)), 3, axis=0)
     make = partial(World, scenario, make_controller(controller), record=True)
     largest = trace(make(worlds=5), orders)
-    assert len({p.tobytes() for p in largest[1][0]}) == 5  # draws differ
+    first = largest[Observation._fields.index("position")][0]
+    assert len({p.tobytes() for p in first}) == 5  # draws differ
     for worlds, threads in ((1, 1), (2, 1), (3, 2), (5, 2), (1, 2)):
         smaller = trace(make(worlds=worlds, threads=threads), orders[:, :worlds])
         assert_same_bits(smaller[:-1], [np.ascontiguousarray(field[:, :worlds]) for field in largest[:-1]])
@@ -626,3 +628,17 @@ def test_a_rollout_that_diverges_or_is_no_order_says_so():
         World(paper(disturbance=PaperDrag(20.0))).rollout(np.full((60, 1, 4), 2))
     with pytest.raises(ConfigurationError, match="from 0 to 5"):
         World(paper()).rollout(np.full((2, 1, 4), 6))
+
+
+def test_the_age_of_an_order_is_the_time_since_the_last_switch_to_it():
+    """Infinite until a first switch; the first mission step switches nothing; an aliased order is the same command."""
+    world = World(paper(duration=2.0), worlds=2)
+    fm, fr, alias = (world.scenario.orders.index(name) for name in ("FM", "FR", "FR>OA>FM"))
+    steps = [fr, fm, fm, fr, alias, fr]
+    for order in steps:
+        orders = np.full((2, 4), order)
+        orders[1] = fm
+        world.step(orders)
+    observation = world.observe()
+    assert observation.age[0] == pytest.approx([3 * 0.05] * 4) and np.isinf(observation.age[1]).all()
+    assert observation.step.tolist() == [6, 6] and observation.team(0).age.shape == (4,)

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marlbc_mj import paper
-from marlbc_mj.engine.state import Observation
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.policies.actions import ACTIONS, order_of
 from marlbc_mj.policies.checkpoint import read_arrays
 from marlbc_mj.policies.greedy import greedy
@@ -248,10 +248,9 @@ def test_the_own_entries_of_a_state_are_the_agents_own(name):
 
     def read(velocity, command, age):
         position = np.arange(8.0).reshape(1, 4, 2)
-        observation = Observation(
-            np.zeros(1), position, velocity, np.ones((1, 4)), np.zeros(1, dtype=np.int64), command, position
-        )
-        return state(observation, np.zeros((1, 1, 3)), age)[0]
+        obstacles, none = np.zeros((1, 1, 3)), np.zeros(1, dtype=np.int64)
+        observation = Observation(none, np.zeros(1), position, velocity, np.ones((1, 4)), none, command, age, position, obstacles)
+        return state(observation, obstacles, age)[0]
 
     velocity, command, age = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64), np.ones((1, 4))
     seen = 3 if name == "printed" else 5  # the printed state has no age

@@ -97,12 +97,14 @@ def valid_orders(orders, count):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def count_switches(orders, command_of, commands, step):  # type: ignore[no-untyped-def]
+def count_switches(orders, command_of, commands, since, step):  # type: ignore[no-untyped-def]
     """Turn orders (N,) into commands, in place, and return r2 (15); the first mission step switches nothing."""
     switched = False
     for i in range(orders.shape[0]):
         command = command_of[orders[i]]
-        switched |= step > 0 and command != commands[i]
+        if step > 0 and command != commands[i]:
+            switched = True
+            since[i] = step
         commands[i] = command
     return SWITCH_REWARD if switched else 0.0
 
@@ -237,7 +239,7 @@ _run_substeps_compiled = allocation_free(run_substeps)
 @allocation_free
 def begin_step(  # type: ignore[no-untyped-def]
     t, step, virtual, behavior_laws, behavior_params, sees, table, command_of, path, orders, given, obstacles, p, p_r, v_r,
-    commands, scratch, grid,
+    commands, since, scratch, grid,
 ):  # fmt: skip
     """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15).
 
@@ -252,7 +254,7 @@ def begin_step(  # type: ignore[no-untyped-def]
         path_at(t, path, now)
         at = p_r if virtual else p
         set_references(behavior_laws, behavior_params, sees, table, orders, at, now, obstacles, grid, scratch[2:SCRATCH], v_r)
-    return count_switches(orders, command_of, commands, step)
+    return count_switches(orders, command_of, commands, since, step)
 
 
 @allocation_free
@@ -262,7 +264,7 @@ def mission_step(  # type: ignore[no-untyped-def]
     step_function, model, indices, sizes, drive, reading, spans, robot_params, senses, limits, controller_law, controller_params,
     disturbance_law, behavior_laws, behavior_params, sees, table, command_of, path, formations, settings,
     # one row a world
-    data, disturbance_params, obstacles, orders, given, commands, p, v, p_r, v_r, state, clearance, formation, reward,
+    data, disturbance_params, obstacles, orders, given, commands, since, p, v, p_r, v_r, state, clearance, formation, reward,
     steps, robot_state, history, sensed, seeds, anchors, motions, grid, status, record, scratch,
 ):  # fmt: skip
     """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
@@ -277,7 +279,7 @@ def mission_step(  # type: ignore[no-untyped-def]
     keep(limits, v_r[b], drag)
     r2 = begin_step(
         t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, sees, table, command_of, path, orders[b], given[b],
-        obstacles[b], seen, p_r[b], v_r[b], commands[b], scratch[b], grid[b],
+        obstacles[b], seen, p_r[b], v_r[b], commands[b], since[b], scratch[b], grid[b],
     )  # fmt: skip
     limit(limits, settings[0], drag, v_r[b])
     substeps = round(settings[0] / settings[1])

@@ -1,6 +1,6 @@
 """The state of B teams between mission steps, apart from the physics: what World and the dm_control task both keep."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -9,28 +9,12 @@ from marlbc_mj.core.motion import MOVING, NUMBERS, move
 from marlbc_mj.engine import loop
 from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.limits import keep, limit
+from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 SCRAP = ("scratch", "grid", "composed")
 """Arrays that carry nothing from one mission step to the next."""
-
-
-class Observation(NamedTuple):
-    """What a supervisor may see at the start of a mission step; B worlds, N agents."""
-
-    time: np.ndarray  # (B,) [s]
-    position: np.ndarray  # (B, N, 2) measured [m]
-    velocity: np.ndarray  # (B, N, 2) measured [m/s]
-    clearance: np.ndarray  # (B, N) to the nearest obstacle's surface [m]
-    formation: np.ndarray  # (B,) int64, G: 2 in formation, 1 in column, 0 neither
-    command: np.ndarray  # (B, N) int64, index into scenario.orders.commands of the last order; 0 before the first
-    reference: np.ndarray  # (B, N, 2) p_r [m], where a ``virtual`` reference has its behaviors evaluated
-
-    def state(self) -> np.ndarray:
-        """The printed state s = (X, Pr, G), (B, (2n+1)N+1): positions and velocities agent by agent, priorities, G."""
-        joint = np.concatenate([self.position, self.velocity], axis=-1).reshape(len(self.time), -1)
-        return np.concatenate([joint, self.command, self.formation[:, None]], axis=1)
 
 
 class TeamState:
@@ -57,6 +41,7 @@ class TeamState:
         self.clearance = np.zeros((worlds, agents))  # [m]
         self.formation = np.zeros(worlds, dtype=np.int64)  # G
         self.command = np.zeros((worlds, agents), dtype=np.int64)
+        self.since = np.zeros((worlds, agents), dtype=np.int64)  # mission step at which each command came into force, or NEVER
         self.reward = np.zeros(worlds)
         self.steps = np.zeros(worlds, dtype=np.int64)  # mission steps made since reset
         self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
@@ -83,6 +68,7 @@ class TeamState:
         self.robot[b] = self.plan.robot.state
         self.noise_seed[b] = rng.integers(2**32)
         self.steps[b] = self.command[b] = self.reward[b] = 0
+        self.since[b] = NEVER
         self._judge(b)
         return draw.starts
 
@@ -138,7 +124,7 @@ class TeamState:
         self.velocity[b] = self.reference_velocity[b] = velocity
         self.controller[b] = self.plan.initial_state
         self.robot[b] = self.plan.robot.state
-        self.steps[b], self.command[b], self.reward[b] = step, command, 0.0
+        self.steps[b], self.command[b], self.since[b], self.reward[b] = step, command, NEVER, 0.0
         self._judge(b)
 
     def arrays(self, *, copy: bool = False) -> dict[str, np.ndarray]:
@@ -181,6 +167,7 @@ class TeamState:
             self.reference[b],
             self.reference_velocity[b],
             self.command[b],
+            self.since[b],
             self.scratch[b],
             self.grid[b],
         )
@@ -205,14 +192,18 @@ class TeamState:
         """What a supervisor decides on, as copies."""
         sensing = self.sensed.shape[1] > 0
         position, velocity = (self.sensed[:, 0], self.sensed[:, 1]) if sensing else (self.position, self.velocity)
+        duration = self.plan.scenario.mission_step
         return Observation(
-            self.steps * self.plan.scenario.mission_step,
+            self.steps.copy(),
+            self.steps * duration,
             position.copy(),
             velocity.copy(),
             self.clearance.copy(),
             self.formation.copy(),
             self.command.copy(),
+            np.where(self.since == NEVER, np.inf, (self.steps[:, None] - self.since) * duration),
             self.reference.copy(),
+            self.obstacles.copy(),
         )
 
     def rows(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[np.ndarray, ...]:
@@ -223,6 +214,7 @@ class TeamState:
             orders,
             self.composed if velocity is None else velocity,
             self.command,
+            self.since,
             self.position,
             self.velocity,
             self.reference,

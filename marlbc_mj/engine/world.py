@@ -9,8 +9,9 @@ import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.engine import loop
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
-from marlbc_mj.engine.state import Observation, TeamState
+from marlbc_mj.engine.state import TeamState
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import nearest_obstacle
-from marlbc_mj.engine.state import Observation
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import unknown
 

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from marlbc_mj.engine.state import Observation
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.engine.state import Observation
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import check_policy, check_signature, read_policy
 from marlbc_mj.policies.greedy import Policy, greedy
@@ -85,11 +85,14 @@ class Learned:
 def _batch(situation: Situation) -> Observation:
     """A batch observation of one world."""
     return Observation(
+        np.array([situation.step]),
         np.array([situation.time]),
         situation.position[None],
         situation.velocity[None],
         situation.clearance[None],
         np.array([situation.formation]),
         situation.command[None],
+        np.full(situation.command[None].shape, np.inf),
         situation.reference[None],
+        situation.obstacles[None],
     )
