@@ -150,4 +150,4 @@ def _pose(world: World) -> np.ndarray:
     """(N, 7) of the bodies of world 0, (0, 7) where they have no free joint."""
     if len(world.plan.robot.joints) > 1:
         return NO_POSE
-    return np.stack([world.data[0].qpos[first : first + 7] for first in world.plan.indices[0, :, 0]])
+    return np.stack([world.data[0].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])

@@ -1,11 +1,8 @@
 """The benchmark's scenarios as dm_control composer tasks: the action is one priority order per agent.
 
-The arena is made from the very MJCF that the engine compiles, and ``before_substep`` calls the very same laws, so a
-composer episode equals
-a :class:`~marlbc_mj.engine.world.World` episode.
+The arena is made from the very MJCF that the engine compiles, and composer's hooks call the parts of the very mission step that
+the compiled loop runs, so a composer episode equals a :class:`~marlbc_mj.engine.world.World` episode.
 """
-
-from typing import Any
 
 import dm_env
 import numpy as np
@@ -14,11 +11,9 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
-from marlbc_mj.core.imperfections import weaken
-from marlbc_mj.engine.body import actuate, measure
-from marlbc_mj.engine.loop import team_forces, team_forces_compiled
+from marlbc_mj.core.laws import Law
+from marlbc_mj.engine import loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
-from marlbc_mj.engine.state import TeamState
 from marlbc_mj.scenarios import Scenario
 
 
@@ -40,14 +35,15 @@ class FormationTask(composer.Task):
     def __init__(self, scenario: Scenario, controller: Controller | None = None) -> None:
         self.scenario = scenario
         self.plan: Plan = make_plan(scenario, controller or SORLC())
-        self.state = TeamState(self.plan, worlds=1)
+        self.state = team.make_team(self.plan, worlds=1)
         self._arena = FormationArena(self.plan.xml)
-        self._drag = np.zeros((scenario.agents, 2))
-        self._force = np.zeros((scenario.agents, 2))
-        self._forces, self._laws = _team_law(self.plan)
-        self._body = self.plan.python_body()
+        self._record = team.make_record(self.plan, worlds=1, recording=False)
+        self._orders_alone = np.zeros((1, 0, 2))  # the orders make v_r
+        self._plant = self.plan.plant
+        self._native: loop.Native | None = None  # the physics of the present episode
+        self._apply: Law = loop.apply_compiled if self.plan.native else loop.apply
+        self._settle: Law = loop.settle_compiled if self.plan.native else loop.settle
         self._substep = 0
-        self._indices = self.plan.indices
         self.set_timesteps(control_timestep=scenario.mission_step, physics_timestep=scenario.substep)
         self._observables = self._make_observables()
 
@@ -66,7 +62,7 @@ class FormationTask(composer.Task):
             "clearance": lambda physics: self.state.clearance[0].copy(),  # (N,) [m]
             "formation": lambda physics: self.state.formation[:1].astype(np.float64),  # (1,) G
             "command": lambda physics: self.state.command[0].astype(np.float64),  # (N,)
-            "state": lambda physics: self.state.observe().state()[0],  # ((2n+1)N+1,) the printed s
+            "state": lambda physics: team.observe(self.plan, self.state).state()[0],  # ((2n+1)N+1,) the published s
         }
         made = {name: observable.Generic(read) for name, read in readers.items()}
         for one in made.values():
@@ -80,59 +76,34 @@ class FormationTask(composer.Task):
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Draw the episode: from the seed that makes world 0 of ``World.reset(seed)``, for a seed taken from ``random_state``."""
-        self._indices = find_indices(physics.model.ptr, self.scenario)
+        qpos_index, qvel_index, ctrl_index = find_indices(physics.model.ptr, self.scenario)
+        self._plant = self.plan.plant._replace(qpos_index=qpos_index, qvel_index=qvel_index, ctrl_index=ctrl_index)
+        side = self.plan.compiled_side if self.plan.native else self.plan.python_side
+        self._native = side([physics.data.ptr])
         seed = int(random_state.randint(2**31))
-        starts = self.state.reset(0, np.random.default_rng(np.random.SeedSequence([seed, 0])))
-        self.state.put(0, physics.data, starts, np.zeros_like(starts))
+        starts = team.reset(self.plan, self.state, 0, np.random.default_rng(np.random.SeedSequence([seed, 0])))
+        team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
 
     def before_step(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Orders become reference velocities for this mission step."""
-        self.state.begin(0, np.ascontiguousarray(action, dtype=np.int64))
+        orders = np.ascontiguousarray(action, dtype=np.int64)[None]
+        loop.begin(0, orders, self._orders_alone, self.plan.mission, self.plan.behaviors, self.state)
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
-        state, scenario, data = self.state, self.scenario, physics.data
-        now = state.time(0) + self._substep * scenario.substep
-        failed = self._forces(
-            self._laws[0],
-            self.plan.controller_params,
-            self._laws[1],
-            state.disturbance_params[0],
-            now,
-            scenario.substep,
-            state.position[0],
-            state.velocity[0],
-            *state.measured(0),
-            state.reference[0],
-            state.reference_velocity[0],
-            state.controller[0],
-            self.plan.limits[2],
-            self._drag,
-            self._force,
-        )
-        weaken(self.plan.senses, now, self._force)
-        failed = failed or actuate(
-            self._body, state.robot[0], self._indices, data.qpos, data.qvel, self._force, scenario.substep, data.ctrl
-        )
+        failed = self._apply(0, self._substep, self.plan.mission, self._native, self._plant, self.state)
         if failed:
-            raise state.diverged(0, failed + scenario.agents * self._substep)
-        data.qfrc_applied[self._indices[1]] = self._drag
+            raise team.diverged(self.plan, self.state, 0, failed, int(self.state.steps[0]))
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Measure, and advance the reference position."""
-        state, data = self.state, physics.data
-        measure(
-            self._body, state.robot[0], self._indices, data.qpos, data.qvel, data.actuator_force, state.position[0],
-            state.velocity[0], self._force,
-        )  # fmt: skip
-        state.after_substep(0, self._substep)
-        state.reference[0] += self.scenario.substep * state.reference_velocity[0]
+        self._settle(0, self._substep, self.plan.mission, self._native, self._plant, self.state, self._record)
         self._substep += 1
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Clearances, formation identifier and reward."""
-        self.state.finish(0)
+        loop.finish(0, self.plan.mission, self.state)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         """r1 + r2 of (13)."""
@@ -145,13 +116,6 @@ class FormationTask(composer.Task):
     def get_discount(self, physics: mjcf.Physics) -> float:
         """1: a mission ends by the clock, not by a terminal state."""
         return 1.0
-
-
-def _team_law(plan: Plan) -> tuple[Any, tuple[Any, Any]]:
-    """``team_forces`` with its laws: compiled where they are, in Python otherwise."""
-    if plan.native:
-        return team_forces_compiled, plan.compiled_laws()
-    return team_forces, plan.python_laws()
 
 
 def make_environment(

@@ -15,10 +15,10 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation, ObstacleAvoidance
 from marlbc_mj.core.disturbances import PaperDrag, constant_wind, linear_drag
 from marlbc_mj.engine.assembly import assemble
-from marlbc_mj.engine.loop import judge
+from marlbc_mj.engine.loop import fill_clearance, verdict
 from marlbc_mj.engine.native import call_step, step_address
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.plan import make_mission, make_plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.scenarios import Obstacle, Perturbation, Scenario, paper
@@ -365,7 +365,7 @@ def test_record_is_what_mujoco_applied_within_the_limit(episode):
     world = World(paper(), record=True)
     for _ in range(10):
         record = world.step(orders_of(world.scenario, "FM")).record
-        applied = world.data[0].actuator_force[world.plan.indices[2]]
+        applied = world.data[0].actuator_force[world.plan.plant.ctrl_index]
         assert (record.force[0, -1] == applied).all()
     assert np.abs(episode("scripted", "sorlc").force).max() == 200.0
 
@@ -431,7 +431,9 @@ def test_the_formation_identifier_is_relative_to_the_centroid():
         for displacement, held in ((0.0, True), (0.66, True), (0.67, False), (-0.66, True), (-0.67, False)):
             p = scenario.formations[which] + (40.0, -3.0)
             p[2, 1] += displacement
-            formation, r1 = judge(p, scenario.obstacle_array(), scenario.formations, 0.5, 2.0, np.empty(4), np.empty((1, 2)))
+            clearance = np.empty(4)
+            fill_clearance(p, scenario.obstacle_array(), np.empty(0), clearance, np.empty(2))
+            formation, r1 = verdict(p, clearance, make_mission(scenario))
             assert formation == (expected if held else 0) and r1 == 5.0 * formation
 
 
@@ -453,7 +455,7 @@ def test_a_force_that_is_nan_or_huge_stops_the_run_and_spares_the_other_worlds(v
     for b, data in enumerate(world.data):
         assert data.time == pytest.approx(0.115 if b == bad else 0.15)
         assert np.isfinite(data.qpos).all() and np.isfinite(data.qvel).all()
-        assert (data.qpos[world.plan.indices[0]] == world.state.position[b]).all()
+        assert (data.qpos[world.plan.plant.qpos_index] == world.state.position[b]).all()
         assert not any(w.number for w in data.warning)
 
 
@@ -566,9 +568,11 @@ def test_addresses_are_those_of_mujocos_own_arrays():
     world = World(paper(), worlds=3)
     advance(world, 2)
     world.reset(1)
-    for row, data in zip(world._addresses, world.data, strict=True):
+    side = world.side
+    for b, data in enumerate(world.data):
+        found = (side.data, side.qpos, side.qvel, side.ctrl, side.applied, side.actuator_force)
         arrays = (data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force)
-        assert row.tolist() == [data._address, *(a.ctypes.data for a in arrays)]
+        assert [column[b] for column in found] == [data._address, *(a.ctypes.data for a in arrays)]
 
 
 @numba.njit
@@ -599,7 +603,7 @@ def test_the_model_keeps_the_scenarios_numbers_and_never_resets_itself():
     assert model.body_mass[1:].tolist() == [1.5] * 4
     assert (model.actuator_ctrlrange == [-120.0, 120.0]).all() and (model.actuator_forcerange == [-120.0, 120.0]).all()
     assert not model.geom_contype.any() and not model.geom_conaffinity.any()
-    assert sorted(plan.indices[0].ravel().tolist()) == list(range(8))
+    assert sorted(plan.plant.qpos_index.ravel().tolist()) == list(range(8))
 
 
 def test_a_scenario_without_avoidance_runs():

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 from marlbc_mj.controllers import PD
 from marlbc_mj.core.imperfections import Imperfections, normal
-from marlbc_mj.engine.limits import keep, limit
+from marlbc_mj.engine.composition import keep, limit
+from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.scenarios import Perturbation, paper
@@ -137,7 +138,7 @@ vectors = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=3
 @given(vectors, vectors, st.floats(0.1, 100), st.floats(0.1, 100))
 def test_limited_references_keep_speed_and_acceleration(before, wanted, speed, acceleration):
     """|v_r| and |dv_r| / dt are within the limits wherever the last v_r was; what is within them already stays as it is."""
-    limits = np.array([speed, acceleration])
+    limits = make_behaviors(paper(speed_limit=speed, acceleration_limit=acceleration))
     old, new, kept = np.array(before), np.array(wanted), np.zeros((3, 2))
     old *= np.minimum(1.0, speed / np.maximum(np.linalg.norm(old, axis=1), 1e-12))[:, None]
     keep(limits, old, kept)
@@ -148,5 +149,5 @@ def test_limited_references_keep_speed_and_acceleration(before, wanted, speed, a
     inside = (np.linalg.norm(new, axis=1) <= speed) & (np.linalg.norm(new - old, axis=1) <= 0.05 * acceleration)
     np.testing.assert_array_equal(result[inside], new[inside])
     untouched = new.copy()
-    limit(np.array([np.inf, np.inf]), 0.05, kept, untouched)
+    limit(make_behaviors(paper()), 0.05, kept, untouched)
     np.testing.assert_array_equal(untouched, new)

@@ -28,7 +28,7 @@ def test_whole_episode_equals_the_compiled_loop() -> None:
         orders, memory = supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
         step = world.step(orders[None])
         observation, timestep = step.observation, environment.step(orders)
-        qpos = environment.physics.data.qpos[world.plan.indices[0]]
+        qpos = environment.physics.data.qpos[world.plan.plant.qpos_index]
         worst = max(worst, np.abs(qpos - observation.position[0]).max(), abs(timestep.reward - step.reward[0]))
         worst = max(worst, np.abs(timestep.observation["state"] - observation.state()[0]).max())
         total += timestep.reward

@@ -1,57 +1,123 @@
-"""One mission step of one agent team: references, then substeps of force law, drag and ``mj_step``, then the verdict.
+"""One mission step of one team. There is one definition of it, :func:`mission_step`, and of its parts.
 
-The pieces (:func:`begin_step`, :func:`team_forces`, :func:`run_substeps`, :func:`judge`) are also what the Python path and the
-dm_control task call, so there is one definition of a mission step. Its order of operations:
+The compiled loop runs it for every world; the Python path runs the same source as plain Python, with laws and ``mj_step`` as
+objects; the dm_control task calls its parts from composer's hooks. Its order:
 
-1. at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p (``actual``), and held;
-   a v_r that is given takes the place of the one that the orders make; limits of speed and acceleration bound it;
-2. every substep h: force from the current errors and weights, weights by explicit Euler, drag at the current (p, v), the robot's
-   controls, MuJoCo's semi-implicit Euler step, then p_r += h v_r;
-3. at the end: obstacles that move are put where they are then; clearances, formation identifier and reward from the measured
+1. :func:`begin`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
+   (``actual``), limited, and held;
+2. for every substep h, :func:`apply`: force from the current errors and weights, weights by explicit Euler, drag at the current
+   (p, v), the robot's controls; MuJoCo's step; :func:`settle`: what was reached is measured, p_r += h v_r;
+3. :func:`finish`: obstacles that move are put where they are then; clearances, formation identifier and reward follow from the
    positions. So behaviors and supervisors see obstacles where they are at the start of a mission step.
 """
 
+from typing import Any, NamedTuple
+
 import numba
+import numpy as np
+from numba import types
+from numba.experimental import structref
 from numba.extending import register_jitable
 
-from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE, nearest_obstacle
+from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.imperfections import sense, weaken
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import move
-from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
-from marlbc_mj.engine.limits import keep, limit
-from marlbc_mj.engine.native import as_behavior, as_controller, as_disturbance, call_step, doubles
-
-SCRATCH = 9
-"""Rows of ``scratch`` (SCRATCH + 2N, 2) that a mission step needs besides drag and force of N agents."""
+from marlbc_mj.engine.composition import compose_team, keep, limit
+from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
 FORMATION_REWARD = 5.0  # (14), times G
 SWITCH_REWARD = -3.0  # (15), once per team (erratum 11)
 
 
-@allocation_free
-def path_at(t, path, out):  # type: ignore[no-untyped-def]
-    """Desired centroid and its velocity at ``t`` [s]: ``out`` (2, 2) from ``path`` (2, 2) = origin [m], velocity [m/s]."""
-    for axis in range(2):
-        out[0, axis] = path[0, axis] + t * path[1, axis]
-        out[1, axis] = path[1, axis]
+class Mission(NamedTuple):
+    """The mission's clocks and what it is judged by."""
+
+    mission_step: float  # between decisions [s]
+    substep: float  # h, of control and physics [s]
+    substeps: int  # per mission step
+    formations: np.ndarray  # (2, N, 2) slots around the centroid: of G = 2, then of G = 1 [m]
+    tolerance: float  # of a slot [m]
+    safe_distance: float  # d_OA [m]
+
+
+class Plant(NamedTuple):
+    """The numbers of robots, controllers and sensors that are the same for all worlds."""
+
+    qpos_index: np.ndarray  # (N, 2) where each agent's axes are in qpos
+    qvel_index: np.ndarray  # (N, 2) in qvel
+    ctrl_index: np.ndarray  # (N, 2) in ctrl; zeros for robots that are not direct
+    nq: int
+    nv: int
+    nu: int
+    spans: np.ndarray  # (3, N, 2) first and last + 1 of each robot in qpos, qvel, ctrl; (3, 0, 2) for a direct robot
+    robot_params: np.ndarray  # (N, P) of drive and reading
+    controller_params: np.ndarray  # (N, P)
+    unit_force: float  # in which controllers count [N]
+    senses: np.ndarray  # (5,) Imperfections.params()
+
+
+class Native(NamedTuple):
+    """What is reached by address: addresses for compiled code, the objects themselves for the Python path."""
+
+    step: Any  # mj_step
+    model: Any  # MjModel
+    controller: Any  # law of the whole team
+    disturbance: Any  # law of the whole team
+    drive: Any  # law of the whole team; 0 for a direct robot
+    reading: Any  # law of the whole team; 0 for a direct robot
+    data: Any  # (B,) MjData
+    qpos: Any  # (B,) its arrays
+    qvel: Any
+    ctrl: Any
+    applied: Any  # qfrc_applied, which takes the drag
+    actuator_force: Any
+
+
+class Team(NamedTuple):
+    """All that changes while B teams of N agents run: one row per world, changed in place by the loop."""
+
+    steps: np.ndarray  # (B,) int64, mission steps made
+    position: np.ndarray  # (B, N, 2) [m]
+    velocity: np.ndarray  # (B, N, 2) [m/s]
+    reference: np.ndarray  # (B, N, 2) p_r [m]
+    reference_velocity: np.ndarray  # (B, N, 2) v_r [m/s]
+    controller: np.ndarray  # (B, N, S) the controllers' own state
+    command: np.ndarray  # (B, N) int64, index into scenario.orders.commands
+    since: np.ndarray  # (B, N) int64, mission step at which each command came into force, or NEVER
+    clearance: np.ndarray  # (B, N) [m]
+    formation: np.ndarray  # (B,) int64, G
+    reward: np.ndarray  # (B,) r1 + r2 of the last mission step
+    obstacles: np.ndarray  # (B, K, 3) x, y, radius [m]; (B, K, 5) with their velocity [m/s] where they move
+    anchors: np.ndarray  # (B, K, 3) where moving obstacles come from; (B, 0, 3) where they are at rest
+    motions: np.ndarray  # (B, K, 6) how they move, or (B, 0, 6)
+    disturbance_params: np.ndarray  # (B, P)
+    robot: np.ndarray  # (B, N, S) the robots' own state
+    history: np.ndarray  # (B, D, 2, N, 2) p and v, for delayed sensors
+    sensed: np.ndarray  # (B, 2, N, 2) measured p and v; (B, 0, N, 2) where they are the true ones
+    noise_seed: np.ndarray  # (B,) int64
+    status: np.ndarray  # (B,) int64, 0, or 1 + agent + N * substep that diverged in the last mission step
+    drag: np.ndarray  # (B, N, 2) of the last substep [N]; before the first one, v_r of the last mission step
+    force: np.ndarray  # (B, N, 2) of the last substep: the law's, then what the actuators gave [N]
+    workspace: np.ndarray  # (B, WORKSPACE, 2) scratch
+    grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 where none pays
+
+
+class Record(NamedTuple):
+    """Every substep of one mission step: where the team was, and the planar force that its actuators gave."""
+
+    position: np.ndarray  # (B, substeps, N, 2) [m]
+    velocity: np.ndarray  # (B, substeps, N, 2) [m/s]
+    reference: np.ndarray  # (B, substeps, N, 2) p_r [m]
+    reference_velocity: np.ndarray  # (B, substeps, N, 2) v_r [m/s]
+    force: np.ndarray  # (B, substeps, N, 2) actuator_force of a direct robot, or as its reading has it [N]
 
 
 @allocation_free
-def judge(p, obstacles, formations, tolerance, safe_distance, clearance, scratch):  # type: ignore[no-untyped-def]
-    """Clearances, formation identifier G and r1 (14) of a team at positions ``p`` (N, 2).
-
-    ``formations`` (2, N, 2): slots of G = 2, then of G = 1. ``clearance`` (N,) is written in place. Returns (G, r1).
-    """
-    fill_clearance(p, obstacles, scratch[0, :0], clearance, scratch[0])
-    return verdict(p, clearance, formations, tolerance, safe_distance)
-
-
-@allocation_free
-def fill_clearance(p, obstacles, grid, clearance, normal):  # type: ignore[no-untyped-def]
+def fill_clearance(p, obstacles, grid, clearance, normal):
     """Clearance (N,) [m] of every agent at ``p`` (N, 2), by a grid if ``grid`` has room for one; ``normal`` (2,) is scratch."""
     count = obstacles.shape[0]
     near = grid.shape[0] > 0 and count > 0
@@ -63,12 +129,12 @@ def fill_clearance(p, obstacles, grid, clearance, normal):  # type: ignore[no-un
 
 
 @allocation_free
-def verdict(p, clearance, formations, tolerance, safe_distance):  # type: ignore[no-untyped-def]
+def verdict(p, clearance, mission):
     """Formation identifier G and r1 (14) of a team at positions ``p`` (N, 2) with ``clearance`` (N,) [m]."""
     agents = p.shape[0]
     violated = False
     for i in range(agents):
-        violated |= clearance[i] <= safe_distance
+        violated |= clearance[i] <= mission.safe_distance
     mean_x, mean_y = 0.0, 0.0
     for i in range(agents):
         mean_x += p[i, 0] / agents
@@ -77,9 +143,9 @@ def verdict(p, clearance, formations, tolerance, safe_distance):  # type: ignore
     for which in range(2):
         held = True
         for i in range(agents):
-            x = p[i, 0] - mean_x - formations[which, i, 0]
-            y = p[i, 1] - mean_y - formations[which, i, 1]
-            held &= x * x + y * y <= tolerance * tolerance
+            x = p[i, 0] - mean_x - mission.formations[which, i, 0]
+            y = p[i, 1] - mean_y - mission.formations[which, i, 1]
+            held &= x * x + y * y <= mission.tolerance * mission.tolerance
         if held:
             formation = 2 - which
             break
@@ -87,7 +153,7 @@ def verdict(p, clearance, formations, tolerance, safe_distance):  # type: ignore
 
 
 @allocation_free
-def valid_orders(orders, count):  # type: ignore[no-untyped-def]
+def valid_orders(orders, count):
     """Whether every one of ``orders`` (B, N) is an index below ``count``."""
     valid = True
     for b in range(orders.shape[0]):
@@ -97,78 +163,59 @@ def valid_orders(orders, count):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def count_switches(orders, command_of, commands, since, step):  # type: ignore[no-untyped-def]
-    """Turn orders (N,) into commands, in place, and return r2 (15); the first mission step switches nothing."""
+def count_switches(b, orders, behaviors, team):
+    """Turn the orders (B, N) of world ``b`` into commands and return r2 (15); the first mission step switches nothing."""
     switched = False
-    for i in range(orders.shape[0]):
-        command = command_of[orders[i]]
-        if step > 0 and command != commands[i]:
+    for i in range(orders.shape[1]):
+        command = behaviors.command_of[orders[b, i]]
+        if team.steps[b] > 0 and command != team.command[b, i]:
             switched = True
-            since[i] = step
-        commands[i] = command
+            team.since[b, i] = team.steps[b]
+        team.command[b, i] = command
     return SWITCH_REWARD if switched else 0.0
 
 
 @allocation_free
-def set_references(  # type: ignore[no-untyped-def]
-    behavior_laws, behavior_params, sees, table, orders, at, path, obstacles, grid, scratch, v_r
-):
-    """Reference velocity of every agent at positions ``at`` (N, 2): its behaviors composed in its order (12).
+def begin(b, orders, given, mission, behaviors, team):
+    """Orders (B, N) of world ``b`` become commands and reference velocities, held for the mission step; r2 (15) is in the reward.
 
-    A behavior is evaluated only if those above it leave a direction free. ``sees`` (M,) says what each looks at; ``grid`` has
-    room for one of the obstacles and one of the team, or is empty, which hands everything to every law. ``scratch``: (3 + 2n, n).
+    ``given`` (B, N, 2) [m/s] is taken as v_r in the place of what the orders make; (B, 0, 2) has the orders composed (12).
     """
-    n, count = at.shape[1], obstacles.shape[0]
-    velocity, jacobian, basis, pair = scratch[0], scratch[1 : 1 + n], scratch[1 + n : 1 + 2 * n], scratch[1 + 2 * n : 3 + 2 * n]
-    things, others = grid[: room(count)], grid[room(count) :]
-    near = grid.shape[0] > 0
-    if near:
-        fill(obstacles, things)
-        fill(at, others)
-    for i in range(at.shape[0]):
-        for axis in range(n):
-            v_r[i, axis] = 0.0
-        rank = 0
-        for j in table[orders[i]]:
-            if rank == n:
-                break
-            seen, team, own = obstacles, at, i
-            if near and sees[j] == NEAREST_OBSTACLE:
-                k = nearest(at[i], obstacles, things, -1)
-                if k >= 0:
-                    seen = obstacles[k : k + 1]
-            elif near and sees[j] == NEAREST_NEIGHBOR:
-                k = nearest(at[i], at, others, i)
-                if k >= 0:
-                    own = 1 if i > k else 0
-                    for axis in range(n):
-                        pair[own, axis], pair[1 - own, axis] = at[i, axis], at[k, axis]
-                    team = pair
-            law = as_behavior(behavior_laws[j])
-            rows = law(behavior_params[j, i], at[i], path, seen, team, own, velocity, jacobian)
-            rank = add_behavior(velocity, jacobian, rows, basis, rank, v_r[i])
+    v_r, previous = team.reference_velocity[b], team.drag[b]
+    keep(behaviors, v_r, previous)
+    if given.shape[1] > 0:
+        for i in range(v_r.shape[0]):
+            for axis in range(2):
+                v_r[i, axis] = given[b, i, axis]
+    else:
+        measured = team.sensed[b, 0] if team.sensed.shape[1] > 0 else team.position[b]
+        at = team.reference[b] if behaviors.virtual else measured
+        t = team.steps[b] * mission.mission_step
+        compose_team(t, orders[b], behaviors, at, team.obstacles[b], team.grid[b], team.workspace[b], v_r)
+    team.reward[b] = count_switches(b, orders, behaviors, team)
+    limit(behaviors, mission.mission_step, previous, v_r)
 
 
 @register_jitable
-def team_forces(  # type: ignore[no-untyped-def]
-    controller_law, controller_params, disturbance_law, disturbance_params, t, h, p, v, seen_p, seen_v, p_r, v_r, state, unit,
-    drag, force,
-):  # fmt: skip
-    """Drag and controller force of every agent for one substep, written to ``drag`` and ``force`` (N, 2) [N].
+def set_forces(b, t, h, native, plant, team):
+    """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
 
-    The law sees ``seen_p`` and ``seen_v``, which are p and v where sensors are perfect; its force counts in ``unit`` [N].
-    Returns 0, or 1 + agent where a position, velocity, force or drag left the physical range; then nothing may be stepped.
+    Laws see the measured p and v; their forces count in ``plant.unit_force``. Returns 0, or 1 + agent where a position,
+    velocity, force or drag left the physical range; then nothing may be stepped.
     """
-    disturbance = as_disturbance(disturbance_law)
-    controller = as_controller(controller_law)
-    disturbance(disturbance_params, t, p, v, drag)
-    if unit == 1.0:
-        controller(controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
+    p, v, drag, force = team.position[b], team.velocity[b], team.drag[b], team.force[b]
+    seen_p, seen_v = (team.sensed[b, 0], team.sensed[b, 1]) if team.sensed.shape[1] > 0 else (p, v)
+    p_r, v_r, state = team.reference[b], team.reference_velocity[b], team.controller[b]
+    disturbance = as_disturbance(native.disturbance)
+    controller = as_controller(native.controller)
+    disturbance(team.disturbance_params[b], t, p, v, drag)
+    if plant.unit_force == 1.0:
+        controller(plant.controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
     else:
-        scale_rows(drag, 1.0 / unit)
-        controller(controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
-        scale_rows(drag, unit)
-        scale_rows(force, unit)
+        scale_rows(drag, 1.0 / plant.unit_force)
+        controller(plant.controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
+        scale_rows(drag, plant.unit_force)
+        scale_rows(force, plant.unit_force)
     for i in range(p.shape[0]):
         size = 0.0
         for axis in range(2):
@@ -179,169 +226,164 @@ def team_forces(  # type: ignore[no-untyped-def]
 
 
 @register_jitable
-def run_substeps(  # type: ignore[no-untyped-def]
-    step_function, model, data, qpos, qvel, ctrl, applied, actuator_force, indices, body, senses, unit, controller_law,
-    controller_params, disturbance_law, disturbance_params, t, h, substeps, p, v, p_r, v_r, state, robot_state, history, sensed,
-    seed, count, drag, force, record,
-):  # fmt: skip
-    """All substeps of one mission step of one world, with v_r held. Returns 0, or 1 + agent + N * substep that diverged.
+def apply(b, k, mission, native, plant, team):
+    """Substep ``k`` of world ``b`` before MuJoCo's step: force law, drag and robot of every agent, into ctrl and qfrc_applied.
 
-    Args:
-        data, qpos, qvel, ctrl, applied, actuator_force: MjData and its arrays; ``applied`` is qfrc_applied, which takes the drag.
-        indices: (3, N, 2), where in qpos, in qvel and in ctrl an agent's two axes are.
-        body: drive, reading, spans, params of the robots; senses: the numbers of :class:`Imperfections`; unit: of forces [N].
-        p, v, p_r, v_r: (N, 2) [m, m/s], changed in place; state: (N, S), the controllers' own, changed in place.
-        robot_state: (N, S), the robots' own; history, sensed, seed: of :func:`sense`; count: substeps made since reset.
-        drag, force: (N, 2) [N], scratch.
-        record: (substeps, N, 10): p, v, p_r, v_r as the law saw them and the force MuJoCo applied; (0, N, 10) records nothing.
+    Returns 0, or 1 + agent + N k where a number left the physical range.
     """
-    agents = p.shape[0]
-    direct = body[2].shape[1] == 0
-    seen_p, seen_v = (sensed[0], sensed[1]) if sensed.shape[0] > 0 else (p, v)
-    for k in range(substeps):
-        failed = team_forces(
-            controller_law, controller_params, disturbance_law, disturbance_params, t + k * h, h, p, v, seen_p, seen_v, p_r,
-            v_r, state, unit, drag, force,
-        )  # fmt: skip
-        if failed:
-            return failed + agents * k
-        if senses[2] > 0.0:
-            weaken(senses, t + k * h, force)
-        failed = actuate(body, robot_state, indices, qpos, qvel, force, h, ctrl)
-        if failed:
-            return failed + agents * k
-        for i in range(agents):
-            for axis in range(2):
-                applied[indices[1, i, axis]] = drag[i, axis]
-        call_step(step_function, model, data)
-        if record.shape[0] > 0:
-            for i in range(agents):
-                for axis in range(2):
-                    record[k, i, axis] = p[i, axis]
-                    record[k, i, 2 + axis] = v[i, axis]
-                    record[k, i, 4 + axis] = p_r[i, axis]
-                    record[k, i, 6 + axis] = v_r[i, axis]
-        measure(body, robot_state, indices, qpos, qvel, actuator_force, p, v, force)
-        for i in range(agents):
-            for axis in range(2):
-                if record.shape[0] > 0:
-                    record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]] if direct else force[i, axis]
-                p_r[i, axis] += h * v_r[i, axis]
-        if sensed.shape[0] > 0:
-            sense(senses, seed, count + k + 1, history, p, v, sensed)
+    h = mission.substep
+    t = team.steps[b] * mission.mission_step + k * h
+    failed = set_forces(b, t, h, native, plant, team)
+    if not failed:
+        force = team.force[b]
+        weaken(plant.senses, t, force)
+        qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
+        failed = actuate(native.drive, plant, team.robot[b], qpos, qvel, force, h, doubles(native.ctrl[b], plant.nu))
+    if failed:
+        return failed + team.position.shape[1] * k
+    applied = doubles(native.applied[b], plant.nv)
+    for i in range(team.position.shape[1]):
+        for axis in range(2):
+            applied[plant.qvel_index[i, axis]] = team.drag[b, i, axis]
     return 0
 
 
-team_forces_compiled = allocation_free(team_forces)
-_run_substeps_compiled = allocation_free(run_substeps)
-
-
-@allocation_free
-def begin_step(  # type: ignore[no-untyped-def]
-    t, step, virtual, behavior_laws, behavior_params, sees, table, command_of, path, orders, given, obstacles, p, p_r, v_r,
-    commands, since, scratch, grid,
-):  # fmt: skip
-    """Orders (N,) become commands and reference velocities for the mission step that starts at t. Returns r2 (15).
-
-    ``given`` (N, 2) [m/s] is taken as v_r as it is; (0, 2) has the orders composed.
-    """
-    if given.shape[0] > 0:
-        for i in range(v_r.shape[0]):
+@register_jitable
+def settle(b, k, mission, native, plant, team, record):
+    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, measure what was reached, p_r += h v_r."""
+    p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
+    recording = record.force.shape[1] > 0
+    if recording:
+        for i in range(p.shape[0]):
             for axis in range(2):
-                v_r[i, axis] = given[i, axis]
-    else:
-        now = scratch[:2]
-        path_at(t, path, now)
-        at = p_r if virtual else p
-        set_references(behavior_laws, behavior_params, sees, table, orders, at, now, obstacles, grid, scratch[2:SCRATCH], v_r)
-    return count_switches(orders, command_of, commands, since, step)
+                record.position[b, k, i, axis] = p[i, axis]
+                record.velocity[b, k, i, axis] = v[i, axis]
+                record.reference[b, k, i, axis] = p_r[i, axis]
+                record.reference_velocity[b, k, i, axis] = v_r[i, axis]
+    qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
+    actuator_force = doubles(native.actuator_force[b], plant.nu)
+    measure(native.reading, plant, team.robot[b], qpos, qvel, actuator_force, p, v, force)
+    for i in range(p.shape[0]):
+        for axis in range(2):
+            if recording:
+                record.force[b, k, i, axis] = force[i, axis]
+            p_r[i, axis] += mission.substep * v_r[i, axis]
+    if team.sensed.shape[1] > 0:
+        count = team.steps[b] * mission.substeps + k + 1
+        sense(plant.senses, team.noise_seed[b], count, team.history[b], p, v, team.sensed[b])
 
 
 @allocation_free
-def mission_step(  # type: ignore[no-untyped-def]
-    b,
-    # fixed for all worlds
-    step_function, model, indices, sizes, drive, reading, spans, robot_params, senses, limits, controller_law, controller_params,
-    disturbance_law, behavior_laws, behavior_params, sees, table, command_of, path, formations, settings,
-    # one row a world
-    data, disturbance_params, obstacles, orders, given, commands, since, p, v, p_r, v_r, state, clearance, formation, reward,
-    steps, robot_state, history, sensed, seeds, anchors, motions, grid, status, record, scratch,
-):  # fmt: skip
-    """One mission step of world ``b``. ``sizes`` = nq, nv, nu; ``settings`` = mission step [s], substep [s], tolerance
-    [m], safe distance [m], virtual (0/1);
-    ``limits`` = speed [m/s], acceleration [m/s^2], force unit [N]; ``given`` = v_r (B, N, 2) [m/s], or (B, 0, 2) where the orders
-    make it; ``motions`` (B, K, 6), or (B, 0, 6) where ``obstacles`` stay.
-    """
-    t = steps[b] * settings[0]
-    agents = p.shape[1]
-    drag, force = scratch[b, SCRATCH : SCRATCH + agents], scratch[b, SCRATCH + agents :]
-    seen = sensed[b, 0] if sensed.shape[1] > 0 else p[b]
-    keep(limits, v_r[b], drag)
-    r2 = begin_step(
-        t, steps[b], settings[4] != 0.0, behavior_laws, behavior_params, sees, table, command_of, path, orders[b], given[b],
-        obstacles[b], seen, p_r[b], v_r[b], commands[b], since[b], scratch[b], grid[b],
-    )  # fmt: skip
-    limit(limits, settings[0], drag, v_r[b])
-    substeps = round(settings[0] / settings[1])
-    body = (drive, reading, spans, robot_params)  # numba shares no tuples out over threads
-    status[b] = _run_substeps_compiled(
-        step_function, model, data[b, 0], doubles(data[b, 1], sizes[0]), doubles(data[b, 2], sizes[1]),
-        doubles(data[b, 3], sizes[2]), doubles(data[b, 4], sizes[1]), doubles(data[b, 5], sizes[2]), indices, body, senses,
-        limits[2], controller_law, controller_params, disturbance_law, disturbance_params[b], t, settings[1], substeps, p[b],
-        v[b], p_r[b], v_r[b], state[b], robot_state[b], history[b], sensed[b], seeds[b], steps[b] * substeps, drag, force,
-        record[b],
-    )  # fmt: skip
-    if motions.shape[1] > 0:
-        move((steps[b] + 1) * settings[0], anchors[b], motions[b], obstacles[b])
-    fill_clearance(p[b], obstacles[b], grid[b], clearance[b], scratch[b, 0])
-    formation[b], r1 = verdict(p[b], clearance[b], formations, settings[2], settings[3])
-    reward[b] = r1 + r2
-    steps[b] += 1
-    return 1 if status[b] else 0
+def judge(b, mission, team):
+    """Put obstacles of world ``b`` where they are now; clearances and G follow. Returns r1 (14)."""
+    if team.motions.shape[1] > 0:
+        move(team.steps[b] * mission.mission_step, team.anchors[b], team.motions[b], team.obstacles[b])
+    p, clearance = team.position[b], team.clearance[b]
+    fill_clearance(p, team.obstacles[b], team.grid[b], clearance, team.workspace[b, 0])
+    team.formation[b], reward = verdict(p, clearance, mission)
+    return reward
+
+
+@allocation_free
+def finish(b, mission, team):
+    """End the mission step of world ``b``: the clock goes on, and r1 (14) joins the reward."""
+    team.steps[b] += 1
+    team.reward[b] += judge(b, mission, team)
+
+
+@allocation_free
+def mission_step(b, orders, given, mission, behaviors, native, plant, team, record):
+    """One mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
+    begin(b, orders, given, mission, behaviors, team)
+    team.status[b] = 0
+    for k in range(mission.substeps):
+        failed = apply(b, k, mission, native, plant, team)
+        if failed:
+            team.status[b] = failed
+            break
+        call_step(native.step, native.model, native.data[b])
+        settle(b, k, mission, native, plant, team, record)
+    finish(b, mission, team)
+    return 1 if team.status[b] else 0
+
+
+# What is compiled around it ---------------------------------------------------------------------------------------------------
+
+apply_compiled = allocation_free(apply)
+settle_compiled = allocation_free(settle)
+
+
+@structref.register
+class _ArgumentsType(types.StructRef):
+    """numba's type of :class:`Arguments`."""
+
+
+class Arguments(structref.StructRefProxy):
+    """What a World hands to the compiled loop at every mission step, bundled: passing it costs 1 us, its seventy parts 25 us."""
+
+
+structref.define_proxy(Arguments, _ArgumentsType, ["mission", "behaviors", "native", "plant", "team", "record"])
 
 
 @compiled
-def step_serial(worlds, *args):  # type: ignore[no-untyped-def]
-    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
-    failed = 0
-    for b in range(worlds):
-        failed += mission_step(b, *args)
-    return failed
+def bundle(mission, behaviors, native, plant, team, record):
+    """The :class:`Arguments` of one World."""
+    return Arguments(mission, behaviors, native, plant, team, record)
 
 
 @threaded
-def step_parallel(worlds, *args):  # type: ignore[no-untyped-def]
-    """:func:`mission_step` of every world, worlds shared out over numba's threads; the same numbers as in series."""
+def _step_parallel(worlds, orders, given, mission, behaviors, native, plant, team, record):
     failed = 0
     for b in numba.prange(worlds):
-        failed += mission_step(b, *args)
+        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
     return failed
 
 
 @compiled
-def roll_out(b, sequence, orders, reward, *args):  # type: ignore[no-untyped-def]
-    """One mission step after the other of world ``b``, with the orders ``sequence`` (M, B, N); ``orders`` and ``reward`` are
-    the arrays inside ``args``. Returns the sum of rewards, up to the step that failed if one did.
+def step_parallel(orders, given, a):
+    """:func:`mission_step` of every world, shared out over numba's threads; the same numbers as in series."""
+    worlds = a.team.steps.shape[0]
+    return _step_parallel(worlds, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+
+
+@compiled
+def step_serial(orders, given, a):
+    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
+    mission, behaviors, native, plant, team, record = a.mission, a.behaviors, a.native, a.plant, a.team, a.record
+    failed = 0
+    for b in range(team.steps.shape[0]):
+        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
+    return failed
+
+
+@compiled
+def roll_out(b, sequence, given, mission, behaviors, native, plant, team, record):
+    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
+
+    Returns the sum of rewards, up to the step that failed if one did.
     """
     total = 0.0
     for m in range(sequence.shape[0]):
-        orders[b] = sequence[m, b]
-        failed = mission_step(b, *args)
-        if failed:
+        if mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record):
             break
-        total += reward[b]
+        total += team.reward[b]
     return total
 
 
-@compiled
-def rollout_serial(worlds, returns, *args):  # type: ignore[no-untyped-def]
-    """:func:`roll_out` of every world, one after the other."""
-    for b in range(worlds):
-        returns[b] = roll_out(b, *args)
-
-
 @threaded
-def rollout_parallel(worlds, returns, *args):  # type: ignore[no-untyped-def]
-    """:func:`roll_out` of every world, worlds shared out over numba's threads; the same numbers as in series."""
-    for b in numba.prange(worlds):
-        returns[b] = roll_out(b, *args)
+def _rollout_parallel(returns, sequence, given, mission, behaviors, native, plant, team, record):
+    for b in numba.prange(returns.shape[0]):
+        returns[b] = roll_out(b, sequence, given, mission, behaviors, native, plant, team, record)
+
+
+@compiled
+def rollout_parallel(returns, sequence, given, a):
+    """:func:`roll_out` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series."""
+    _rollout_parallel(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+
+
+@compiled
+def rollout_serial(returns, sequence, given, a):
+    """:func:`roll_out` of every world into ``returns`` (B,), one after the other."""
+    for b in range(returns.shape[0]):
+        returns[b] = roll_out(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)

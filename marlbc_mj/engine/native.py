@@ -12,6 +12,7 @@ import mujoco
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
+from numba.core.extending import _Intrinsic
 from numba.extending import intrinsic, overload
 from numba.np.arrayobj import populate_array
 
@@ -24,39 +25,39 @@ def step_address() -> int:
     return int(ctypes.cast(library.mj_step, ctypes.c_void_p).value or 0)
 
 
-def call_step(step, model, data):  # type: ignore[no-untyped-def]
+def call_step(step, model, data):
     """``step(model, data)``; for ``mj_step``."""
     step(model, data)
 
 
-def as_behavior(law):  # type: ignore[no-untyped-def]
+def as_behavior(law):
     """A behavior that can be called, from its address."""
     return law
 
 
-def as_controller(law):  # type: ignore[no-untyped-def]
+def as_controller(law):
     """A controller that can be called for a whole team, from its address."""
     return law
 
 
-def as_disturbance(law):  # type: ignore[no-untyped-def]
+def as_disturbance(law):
     """A disturbance that can be called for a whole team, from its address."""
     return law
 
 
-def as_drive(law):  # type: ignore[no-untyped-def]
+def as_drive(law):
     """A robot's drive that can be called for a whole team, from its address."""
     return law
 
 
-def as_reading(law):  # type: ignore[no-untyped-def]
+def as_reading(law):
     """A robot's reading that can be called for a whole team, from its address."""
     return law
 
 
 @intrinsic
-def _call_address(typing_context, step, model, data):  # type: ignore[no-untyped-def]
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+def _call_address(typing_context, step, model, data):
+    def codegen(context, builder, signature, args):
         kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 2)
         builder.call(builder.inttoptr(args[0], kind.as_pointer()), [args[1], args[2]])
         return context.get_dummy_value()
@@ -64,11 +65,8 @@ def _call_address(typing_context, step, model, data):  # type: ignore[no-untyped
     return types.void(types.uintp, types.uintp, types.uintp), codegen
 
 
-@intrinsic
-def doubles(typing_context, address, n):  # type: ignore[no-untyped-def]
-    """The n float64 at an address as an array that owns nothing; compiled code only."""
-
-    def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+def _doubles_at(typing_context, address, n):
+    def codegen(context, builder, signature, args):
         array = context.make_array(signature.return_type)(context, builder)
         size = context.get_constant(types.intp, 8)
         data = builder.inttoptr(args[0], array.data.type)
@@ -78,18 +76,29 @@ def doubles(typing_context, address, n):  # type: ignore[no-untyped-def]
     return types.float64[::1](types.uintp, types.intp), codegen
 
 
+class _Doubles(_Intrinsic):  # type: ignore[misc]
+    """The n float64 of one of MuJoCo's arrays: the array itself in Python, from its address a view that owns nothing."""
+
+    def __call__(self, array, n):
+        return array
+
+
+doubles = _Doubles("doubles", _doubles_at)  # an overload would not do: without reference counting none may return an array
+doubles._register()
+
+
 @overload(call_step, inline="always")
-def _call_step(step, model, data):  # type: ignore[no-untyped-def]
+def _call_step(step, model, data):
     return lambda step, model, data: _call_address(step, model, data)
 
 
-def _compile_as(function, kind):  # type: ignore[no-untyped-def]
+def _compile_as(function, kind):
     """Give ``function`` its compiled face: the law of signature ``kind`` at an address."""
     function_type = types.FunctionType(kind)
 
     @intrinsic
-    def from_address(typing_context, law):  # type: ignore[no-untyped-def]
-        def codegen(context, builder, signature, args):  # type: ignore[no-untyped-def]
+    def from_address(typing_context, law):
+        def codegen(context, builder, signature, args):
             struct = cgutils.create_struct_proxy(function_type)(context, builder)
             pointer = builder.inttoptr(args[0], context.get_value_type(types.voidptr))
             struct.c_addr = struct.py_addr = struct.jit_addr = pointer
@@ -98,7 +107,7 @@ def _compile_as(function, kind):  # type: ignore[no-untyped-def]
         return function_type(types.uintp), codegen
 
     @overload(function, inline="always")
-    def compiled_face(law):  # type: ignore[no-untyped-def]
+    def compiled_face(law):
         return lambda law: from_address(law)
 
 

@@ -13,6 +13,8 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.engine.assembly import agent_prefix, assemble
+from marlbc_mj.engine.composition import Behaviors
+from marlbc_mj.engine.loop import Mission, Native, Plant
 from marlbc_mj.engine.native import step_address
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
@@ -28,24 +30,15 @@ class Plan:
 
     scenario: Scenario
     controller: Controller
+    robot: Robot
     xml: str  # the assembled MJCF
     model: mujoco.MjModel
-    indices: np.ndarray  # (3, N, 2) int64: where each agent's axes are in qpos, in qvel and in ctrl
-    sizes: np.ndarray  # (3,) int64: nq, nv, nu
-    behavior_laws: np.ndarray  # (M,) addresses; the laws themselves where numba is off
-    behavior_params: np.ndarray  # (M, N, P)
-    sees: np.ndarray  # (M,) what each behavior's law looks at, see marlbc_mj.core.behaviors
-    controller_params: np.ndarray  # (N, P)
+    mission: Mission
+    behaviors: Behaviors
+    plant: Plant
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     disturbance_params: np.ndarray  # (P,)
-    path: np.ndarray  # (2, 2): p_cd(0) [m], its velocity [m/s]
-    settings: np.ndarray  # (5,) mission step, substep [s], tolerance, safe distance [m], virtual (0 or 1)
-    robot: Robot
-    spans: np.ndarray  # (3, N, 2) int64: first and last + 1 of each robot in qpos, qvel, ctrl; (3, 0, 2) for a direct robot
-    robot_params: np.ndarray  # (N, P) for its laws
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
-    limits: np.ndarray  # (3,) speed [m/s] and acceleration [m/s^2] of references, force unit [N]
-    senses: np.ndarray  # (5,) Imperfections.params()
 
     @property
     def grid_room(self) -> int:
@@ -55,58 +48,35 @@ class Plan:
     @property
     def native(self) -> bool:
         """Whether the compiled loop can run it: every law is compiled."""
-        robot = [law for law in (self.robot.drive, self.robot.reading) if law is not None]
-        return all(map(laws.is_compiled, (self.controller.law, self.scenario.disturbance.law, *robot)))
+        return all(laws.is_compiled(law) for law, _ in self._laws() if law is not None)
 
-    def compiled_laws(self) -> tuple[np.uint64, np.uint64]:
-        """Addresses of controller and disturbance for compiled callers."""
-        controller, disturbance = self.controller.law, self.scenario.disturbance.law
-        return np.uint64(laws.address(controller, laws.CONTROLLER)), np.uint64(laws.address(disturbance, laws.DISTURBANCE))
-
-    def python_laws(self) -> tuple[laws.Law, laws.Law]:
-        """Controller and disturbance for the Python path, which calls them agent by agent."""
-        controller, disturbance = self.controller.law, self.scenario.disturbance.law
-        return laws.for_team(controller, laws.CONTROLLER), laws.for_team(disturbance, laws.DISTURBANCE)
-
-    def compiled_body(self) -> tuple[Any, ...]:
-        """The robot for compiled callers: addresses of drive and reading, spans and numbers."""
-        drive, reading = self.robot.drive, self.robot.reading
-        addresses = (0, 0)
-        if drive is not None and reading is not None:
-            addresses = laws.address(drive, laws.DRIVE), laws.address(reading, laws.READING)
-        return (*map(np.uint64, addresses), self.spans, self.robot_params)
-
-    def python_body(self) -> tuple[Any, ...]:
-        """The robot for the Python path, which calls its laws robot by robot."""
-        drive, reading = self.robot.drive, self.robot.reading
-        if drive is None or reading is None:
-            return None, None, self.spans, self.robot_params
-        return laws.for_team(drive, laws.DRIVE), laws.for_team(reading, laws.READING), self.spans, self.robot_params
-
-    def fixed_arguments(self) -> tuple[object, ...]:
-        """The arguments of ``mission_step`` that are the same for all worlds, in its order."""
-        orders = self.scenario.orders
-        controller, disturbance = self.compiled_laws()
+    def _laws(self) -> tuple[tuple[laws.Law | None, Any], ...]:
+        """Controller, disturbance, drive and reading with their kinds; None where the robot has no such law."""
         return (
-            np.uint64(step_address()),
-            np.uint64(self.model._address),
-            self.indices,
-            self.sizes,
-            *self.compiled_body(),
-            self.senses,
-            self.limits,
-            controller,
-            self.controller_params,
-            disturbance,
-            self.behavior_laws,
-            self.behavior_params,
-            self.sees,
-            orders.table,
-            orders.command_of,
-            self.path,
-            self.scenario.formations,
-            self.settings,
+            (self.controller.law, laws.CONTROLLER),
+            (self.scenario.disturbance.law, laws.DISTURBANCE),
+            (self.robot.drive, laws.DRIVE),
+            (self.robot.reading, laws.READING),
         )
+
+    def compiled_side(self, data: Sequence[mujoco.MjData]) -> Native:
+        """What compiled code reaches by address, for one MjData per world; whoever calls keeps them alive."""
+        team_laws = (0 if law is None else laws.address(law, kind) for law, kind in self._laws())
+        arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
+        columns = ([d._address for d in data], *arrays)
+        entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
+        return Native._make((*entries, *(np.array(column, dtype=np.uint64) for column in columns)))
+
+    def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
+        """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
+        team_laws = (None if law is None else laws.for_team(law, kind) for law, kind in self._laws())
+        columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
+        return Native._make((mujoco.mj_step, self.model, *team_laws, *columns))
+
+
+def _arrays(data: Any) -> tuple[np.ndarray, ...]:
+    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.loop.Native`."""
+    return data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force
 
 
 def make_plan(scenario: Scenario, controller: Controller) -> Plan:
@@ -126,57 +96,87 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
     limit = scenario.force_limit if controller.limited else np.inf
     xml = assemble(scenario, limit)
     model = mujoco.MjModel.from_xml_string(xml)
-    agents = range(scenario.agents)
-    behavior_laws, behavior_params = behavior_arrays(scenario.behaviors, scenario.agents)
     return Plan(
         scenario=scenario,
         controller=controller,
+        robot=robot,
         xml=xml,
         model=model,
-        indices=find_indices(model, scenario),
-        sizes=np.array([model.nq, model.nv, model.nu], dtype=np.int64),
-        behavior_laws=behavior_laws,
-        behavior_params=behavior_params,
-        sees=sees_array(scenario.behaviors),
-        controller_params=_padded([[controller.params(i, limit / scenario.unit_force) for i in agents]])[0],
-        initial_state=np.array([controller.initial_state(i) for i in agents], dtype=np.float64),
+        mission=make_mission(scenario),
+        behaviors=make_behaviors(scenario),
+        plant=_make_plant(scenario, controller, limit, model),
+        initial_state=np.array([controller.initial_state(i) for i in range(scenario.agents)], dtype=np.float64),
         disturbance_params=np.array(scenario.disturbance.params(), dtype=np.float64),
-        path=np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64),
-        settings=np.array(
-            [
-                scenario.mission_step,
-                scenario.substep,
-                scenario.formation_tolerance,
-                scenario.safe_distance,
-                scenario.reference == "virtual",
-            ],
-            dtype=np.float64,
-        ),
-        robot=robot,
-        spans=find_spans(model, scenario),
-        robot_params=np.tile(np.array(robot.params, dtype=np.float64), (scenario.agents, 1)),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
-        limits=np.array([scenario.speed_limit, scenario.acceleration_limit, scenario.unit_force]),
+    )
+
+
+def make_mission(scenario: Scenario) -> Mission:
+    """The clocks of a scenario and what it is judged by, as the loop takes them."""
+    return Mission(
+        mission_step=float(scenario.mission_step),
+        substep=float(scenario.substep),
+        substeps=int(scenario.substeps),
+        formations=scenario.formations,
+        tolerance=float(scenario.formation_tolerance),
+        safe_distance=float(scenario.safe_distance),
+    )
+
+
+def make_behaviors(scenario: Scenario) -> Behaviors:
+    """The behaviors of a scenario and how they become references, as the loop takes them.
+
+    Raises:
+        ConfigurationError: a law that is not compiled, or not a behavior's.
+    """
+    addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
+    return Behaviors(
+        laws=addresses,
+        params=params,
+        sees=sees_array(scenario.behaviors),
+        table=scenario.orders.table,
+        command_of=scenario.orders.command_of,
+        path=np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64),
+        virtual=scenario.reference == "virtual",
+        speed_limit=float(scenario.speed_limit),
+        acceleration_limit=float(scenario.acceleration_limit),
+    )
+
+
+def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel) -> Plant:
+    params = [controller.params(i, limit / scenario.unit_force) for i in range(scenario.agents)]
+    qpos_index, qvel_index, ctrl_index = find_indices(model, scenario)
+    return Plant(
+        qpos_index=qpos_index,
+        qvel_index=qvel_index,
+        ctrl_index=ctrl_index,
+        nq=int(model.nq),
+        nv=int(model.nv),
+        nu=int(model.nu),
+        spans=find_spans(model, scenario),
+        robot_params=np.tile(np.array(make_robot(scenario.robot).params, dtype=np.float64), (scenario.agents, 1)),
+        controller_params=_padded([params])[0],
+        unit_force=float(scenario.unit_force),
         senses=np.array(scenario.imperfections.params(), dtype=np.float64),
     )
 
 
-def find_indices(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
-    """(3, N, 2): addresses of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, found by name.
+def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Addresses of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, (N, 2) each, found by name.
 
     A free joint's axes are its first two. Robots that are not direct have zeros for ctrl.
     """
     robot = make_robot(scenario.robot)
-    indices = np.zeros((3, scenario.agents, 2), dtype=np.int64)
+    qpos, qvel, ctrl = np.zeros((3, scenario.agents, 2), dtype=np.int64)
     for i in range(scenario.agents):
         for axis in range(2):
             joint = model.joint(agent_prefix(i) + robot.joints[axis % len(robot.joints)])
             offset = axis if len(robot.joints) == 1 else 0
-            indices[0, i, axis] = joint.qposadr[0] + offset
-            indices[1, i, axis] = joint.dofadr[0] + offset
+            qpos[i, axis] = joint.qposadr[0] + offset
+            qvel[i, axis] = joint.dofadr[0] + offset
             if robot.direct:
-                indices[2, i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id
-    return indices
+                ctrl[i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id
+    return qpos, qvel, ctrl
 
 
 def find_spans(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:

@@ -1,32 +1,23 @@
 """World: B simulated copies of one scenario, stepped together, one mission step at a time."""
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numba
 import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
-from marlbc_mj.engine import loop
+from marlbc_mj.core import laws
+from marlbc_mj.engine import loop, team
+from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
-from marlbc_mj.engine.state import TeamState
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 """What of MuJoCo's data is a world's state."""
-
-
-class Record(NamedTuple):
-    """Every substep of one mission step: where the team was, and the planar force that its actuators gave."""
-
-    position: np.ndarray  # (B, substeps, N, 2) [m]
-    velocity: np.ndarray  # (B, substeps, N, 2) [m/s]
-    reference: np.ndarray  # (B, substeps, N, 2) p_r [m]
-    reference_velocity: np.ndarray  # (B, substeps, N, 2) v_r [m/s]
-    force: np.ndarray  # (B, substeps, N, 2) actuator_force of a direct robot, or as its reading has it [N]
 
 
 class Step(NamedTuple):
@@ -42,8 +33,8 @@ class World:
     """B copies of one scenario under one controller.
 
     Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled
-    controller
-    the whole mission step runs inside one compiled call; a plain Python one takes the Python path, slower, with the same results.
+    controller the whole mission step runs inside one compiled call. A plain Python one takes the Python path: slower, with the
+    same results. ``state`` is the :class:`~marlbc_mj.engine.loop.Team` of all worlds, ``data`` has one MjData per world.
 
     Args:
         scenario: the problem instance.
@@ -79,15 +70,19 @@ class World:
         self.native = self.plan.native if native is None else native
         if self.native and not self.plan.native:
             raise ConfigurationError("native=True needs compiled laws; decorate them with marlbc_mj.core.laws")
-        self.state = TeamState(self.plan, worlds)
+        self.state = team.make_team(self.plan, worlds)
         self.data = [mujoco.MjData(self.plan.model) for _ in range(worlds)]
-        self._handles = [(d, d.qpos, d.qvel, d.ctrl, d.qfrc_applied, d.actuator_force) for d in self.data]
-        self._addresses = np.array([_addresses(handles) for handles in self._handles], dtype=np.uint64)
-        self._status = np.zeros(worlds, dtype=np.int64)
-        self._record = np.zeros((worlds, scenario.substeps if record else 0, scenario.agents, 10))
-        self._fixed = self.plan.fixed_arguments() if self.native else ()
-        self._python_laws, self._python_body = self.plan.python_laws(), self.plan.python_body()
+        self._record = team.make_record(self.plan, worlds, record)
+        self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
+        self._arguments = self._make_arguments()
         self.reset()
+
+    def _make_arguments(self) -> Any:
+        """What the loop takes besides orders and velocities: bundled for the compiled one, a tuple for the Python path."""
+        plan = self.plan
+        self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
+        arguments = (plan.mission, plan.behaviors, self.side, plan.plant, self.state, self._record)
+        return loop.bundle(*arguments) if self.native else arguments
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
         """Start episodes anew: all of them, or those where ``mask`` (B,) is true.
@@ -100,9 +95,9 @@ class World:
             raise ConfigurationError(f"mask must have shape ({self.worlds},), got {np.shape(mask)}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
             rng = np.random.default_rng(np.random.SeedSequence([seed, int(b)]))
-            starts = self.state.reset(int(b), rng)
+            starts = team.reset(self.plan, self.state, int(b), rng)
             mujoco.mj_resetData(self.plan.model, self.data[b])
-            self.state.put(int(b), self.data[b], starts, np.zeros_like(starts))
+            team.put(self.plan, self.state, int(b), self.data[b], starts, np.zeros_like(starts))
         return self.observe()
 
     def copy_world(self, source: "World", source_world: int, world: int) -> None:
@@ -110,7 +105,7 @@ class World:
 
         For starting many predictions from one state.
         """
-        self.state.copy_row(source.state, source_world, world)
+        team.copy_row(source.state, source_world, self.state, world)
         mujoco.mj_setState(self.plan.model, self.data[world], source.physics(source_world), PHYSICS)
 
     def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
@@ -122,10 +117,14 @@ class World:
             position, velocity: (N, 2) [m], [m/s] of the agents and of their references alike.
             command: (N,) indices into ``scenario.orders.commands`` that count as given last.
         """
-        self.state.place(b, step, position, velocity, command)
+        team.place(self.plan, self.state, b, step, position, velocity, command)
         mujoco.mj_resetData(self.plan.model, self.data[b])
         self.data[b].time = step * self.scenario.mission_step
-        self.state.put(b, self.data[b], position, velocity)
+        self.put(b, position, velocity)
+
+    def put(self, b: int, position: np.ndarray, velocity: np.ndarray) -> None:
+        """Move the robots of world ``b`` to positions (N, 2) [m] and velocities (N, 2) [m/s]; references stay where they are."""
+        team.put(self.plan, self.state, b, self.data[b], position, velocity)
 
     def physics(self, b: int) -> np.ndarray:
         """MuJoCo's integration state of world ``b``."""
@@ -135,11 +134,12 @@ class World:
 
     def snapshot(self) -> dict[str, np.ndarray]:
         """Copies of everything that changes while worlds run, by name; :meth:`restore` continues from it bit for bit."""
-        return {**self.state.arrays(copy=True), "physics": np.stack([self.physics(b) for b in range(self.worlds)])}
+        state = {name: array.copy() for name, array in team.lasting(self.state).items()}
+        return {**state, "physics": np.stack([self.physics(b) for b in range(self.worlds)])}
 
     def restore(self, snapshot: Mapping[str, np.ndarray]) -> None:
         """Go back to a :meth:`snapshot` of a World with the same plan and number of worlds."""
-        for name, array in self.state.arrays().items():
+        for name, array in team.lasting(self.state).items():
             if array.size:
                 array[:] = snapshot[name]
         for b in range(self.worlds):
@@ -147,7 +147,7 @@ class World:
 
     def observe(self) -> Observation:
         """What a supervisor decides on, as copies."""
-        return self.state.observe()
+        return team.observe(self.plan, self.state)
 
     def step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
         """One mission step of every world.
@@ -185,38 +185,35 @@ class World:
         if not self.native:
             raise ConfigurationError("rollout needs compiled laws; use step")
         sequence = np.stack([self._checked(row) for row in np.asarray(orders)])
-        buffer, returns = np.zeros_like(sequence[0]), np.zeros(self.worlds)
-        args = self._arguments(buffer)
-        if self.threads == 1 or self.worlds == 1:
-            loop.rollout_serial(self.worlds, returns, sequence, buffer, self.state.reward, *args)
-        else:
-            numba.set_num_threads(self.threads)
-            loop.rollout_parallel(self.worlds, returns, sequence, buffer, self.state.reward, *args)
+        returns = np.zeros(self.worlds)
+        run = loop.rollout_serial if self._serial() else loop.rollout_parallel
+        run(returns, sequence, self._orders_alone, self._arguments)
         self.raise_if_diverged()
         return returns
 
+    def _serial(self) -> bool:
+        """Whether one thread does it all; otherwise numba is told how many there are."""
+        if self.threads == 1 or self.worlds == 1:
+            return True
+        numba.set_num_threads(self.threads)
+        return False
+
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
-        if self._status.any():
-            b = int(np.flatnonzero(self._status)[0])
-            raise self.state.diverged(b, int(self._status[b]))
+        if self.state.status.any():
+            b = int(np.flatnonzero(self.state.status)[0])
+            raise team.diverged(self.plan, self.state, b, int(self.state.status[b]), int(self.state.steps[b]) - 1)
 
     def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
         """:meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both contiguous: no checks, no
         copies; how many worlds failed.
         """
-        if not self.native:
-            return self._advance_in_python(orders, velocity)
-        args = self._arguments(orders, velocity)
-        if self.threads == 1 or self.worlds == 1:
-            return int(loop.step_serial(self.worlds, *args))
-        numba.set_num_threads(self.threads)
-        return int(loop.step_parallel(self.worlds, *args))
-
-    def _arguments(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> tuple[object, ...]:
-        """The arguments of ``mission_step`` after ``b``, in its order."""
-        state = self.state
-        return (*self._fixed, self._addresses, *state.rows(orders, velocity), self._status, self._record, state.scratch)
+        given = self._orders_alone if velocity is None else velocity
+        if self.native:
+            run = loop.step_serial if self._serial() else loop.step_parallel
+            return int(run(orders, given, self._arguments))
+        mission_step = laws.plain(loop.mission_step)
+        return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         if getattr(orders, "dtype", np.dtype(np.int64)).kind not in "iu":
@@ -243,57 +240,6 @@ class World:
             raise ConfigurationError(f"velocity must be finite, got {velocity[b, i, axis]} for world {b}, agent {i + 1}")
         return velocity
 
-    def _advance_in_python(self, orders: np.ndarray, velocity: np.ndarray | None) -> int:
-        given = [None] * self.worlds if velocity is None else velocity
-        return sum(self._python_step(b, orders[b], given[b]) for b in range(self.worlds))
-
-    def _python_step(self, b: int, orders: np.ndarray, velocity: np.ndarray | None) -> bool:
-        """The Python path: the same source as the compiled loop, with laws and ``mj_step`` called from Python; True if it
-        failed.
-        """
-        plan, state = self.plan, self.state
-        start = state.time(b)
-        state.begin(b, orders, velocity)
-        drag, force = np.split(state.scratch[b, loop.SCRATCH :], 2)
-        self._status[b] = loop.run_substeps(
-            mujoco.mj_step,
-            plan.model,
-            *self._handles[b],
-            plan.indices,
-            self._python_body,
-            plan.senses,
-            plan.limits[2],
-            self._python_laws[0],
-            plan.controller_params,
-            self._python_laws[1],
-            state.disturbance_params[b],
-            start,
-            self.scenario.substep,
-            self.scenario.substeps,
-            state.position[b],
-            state.velocity[b],
-            state.reference[b],
-            state.reference_velocity[b],
-            state.controller[b],
-            state.robot[b],
-            state.history[b],
-            state.sensed[b],
-            int(state.noise_seed[b]),
-            int(state.steps[b]) * self.scenario.substeps,
-            drag,
-            force,
-            self._record[b],
-        )
-        state.finish(b)
-        return bool(self._status[b])
-
     def _read_record(self) -> Record | None:
-        if self._record.shape[1] == 0:
-            return None
-        return Record(*(self._record[..., k : k + 2].copy() for k in range(0, 10, 2)))
-
-
-def _addresses(handles: tuple[object, ...]) -> list[int]:
-    """Addresses of MjData and of its arrays, in the order that ``run_substeps`` wants."""
-    data, *arrays = handles
-    return [data._address, *(a.ctypes.data for a in arrays)]  # type: ignore[attr-defined]
+        recording = self._record.force.shape[1] > 0
+        return Record(*(array.copy() for array in self._record)) if recording else None

@@ -6,8 +6,8 @@ import numpy as np
 
 from marlbc_mj.controllers import Controller
 from marlbc_mj.core.motion import nearest_places, obstacles_at
-from marlbc_mj.engine.loop import judge
-from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.loop import fill_clearance, verdict
+from marlbc_mj.engine.plan import make_mission, make_plan
 from marlbc_mj.episode import NO_POSE, Trajectory
 
 
@@ -94,9 +94,9 @@ def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np
     scenario = trajectory.scenario
     clearance = np.empty(position.shape[:2])
     formation = np.empty(len(position), dtype=np.int64)
-    rule = (scenario.formations, scenario.formation_tolerance, scenario.safe_distance)
-    scratch = np.empty((1, 2))
+    mission, no_grid, normal = make_mission(scenario), np.empty(0), np.empty(2)
     for k in range(len(position)):
         obstacles = obstacles_at(k * scenario.mission_step, trajectory.obstacles, trajectory.motions)
-        formation[k], _ = judge(position[k], obstacles, *rule, clearance[k], scratch)
+        fill_clearance(position[k], obstacles, no_grid, clearance[k], normal)
+        formation[k], _ = verdict(position[k], clearance[k], mission)
     return clearance, formation

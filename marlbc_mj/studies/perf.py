@@ -102,7 +102,7 @@ class Fleet:
         finished = state.steps >= len(self.orders)
         if finished.any():
             self.world.reset(mask=finished)
-        return self.orders[state.steps]
+        return np.asarray(self.orders[state.steps])
 
 
 def _bare(fleet: Fleet, threads: int) -> Callable[[], None]:
@@ -110,7 +110,7 @@ def _bare(fleet: Fleet, threads: int) -> Callable[[], None]:
     run = _bare_serial if threads == 1 else _bare_parallel
     step, model = np.uint64(step_address()), np.uint64(world.plan.model._address)
     copies = World(world.scenario, worlds=world.worlds)
-    data = np.ascontiguousarray(copies._addresses[:, 0])
+    data = copies.side.data
     substeps = world.scenario.substeps
     missions = BURST // (world.worlds * substeps)
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
-from marlbc_mj.engine.loop import path_at, set_references
-from marlbc_mj.engine.plan import behavior_arrays, grid_room, sees_array
+from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team, path_at
+from marlbc_mj.engine.plan import grid_room, make_behaviors
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend, Situation
 from marlbc_mj.supervisors.fms import memberships
@@ -23,19 +23,14 @@ from marlbc_mj.supervisors.neighbors import GiveWay, crowded, give_way
 from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA, _AA = 0, 1, 2, 3
-_ALONE = np.array([[_FM], [_FR], [_OA], [_AA]])  # (4, 1): a table of orders that hold one behavior each
 
 
 class Repertoire(NamedTuple):
     """What a framework blends, fixed for an episode."""
 
-    laws: np.ndarray  # (3,) FM, FR, OA, or (4,) with AA, as the engine calls them
-    params: np.ndarray  # (3, N, P)
-    sees: np.ndarray  # (3,) what each looks at
-    orders: np.ndarray  # (3,) the order that labels each
-    path: np.ndarray  # (2, 2) p_cd(0) [m], its velocity [m/s]
+    behaviors: Behaviors  # of the scenario, in a table of orders that hold one behavior each: FM, FR, OA, and AA if named
+    orders: np.ndarray  # (3,) or (4,) the order that labels each
     safe_distance: float  # d_OA [m]
-    virtual: bool  # behaviors are evaluated at p_r
     way: GiveWay  # to other agents
     grid: np.ndarray  # scratch
 
@@ -48,30 +43,26 @@ def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) 
     """
     labels = {"FM": "FM", "FR": "FR", "OA": "OA>FM", "AA": "AA>FM"}
     orders = np.array([scenario.orders.index(labels[name]) for name in names])
-    by_name = {b.name: b for b in scenario.behaviors}
-    behaviors = [by_name[name] for name in names]
-    laws, params = behavior_arrays(behaviors, scenario.agents)
-    path = np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64)
-    virtual, way, grid = scenario.reference == "virtual", give_way(scenario), np.zeros(grid_room(scenario))
-    return Repertoire(laws, params, sees_array(behaviors), orders, path, scenario.safe_distance, virtual, way, grid)
+    place = [b.name for b in scenario.behaviors]
+    alone = np.array([[place.index(name)] for name in names])
+    behaviors = make_behaviors(scenario)._replace(table=alone)
+    return Repertoire(behaviors, orders, scenario.safe_distance, give_way(scenario), np.zeros(grid_room(scenario)))
 
 
 def evaluated_at(situation: Situation, memory: Repertoire) -> np.ndarray:
     """(N, 2) where the mission evaluates behaviors [m]."""
-    return np.ascontiguousarray(situation.reference if memory.virtual else situation.position)
+    return np.ascontiguousarray(situation.reference if memory.behaviors.virtual else situation.position)
 
 
 def behavior_velocities(situation: Situation, memory: Repertoire) -> tuple[np.ndarray, np.ndarray]:
     """Velocity (8) of FM, FR, OA (and AA), each alone, for every agent, (3 or 4, N, 2) [m/s]; and p_cd, p_cd' (2, 2)."""
     at = evaluated_at(situation, memory)
-    now, scratch = np.empty((2, 2)), np.empty((7, 2))
-    path_at(situation.time, memory.path, now)
-    velocities = np.empty((len(memory.laws), *at.shape))
+    now, workspace = np.empty((2, 2)), np.empty((WORKSPACE, 2))
+    path_at(situation.time, memory.behaviors.path, now)
+    velocities = np.empty((len(memory.orders), *at.shape))
     for behavior, velocity in enumerate(velocities):
         alone = np.full(len(at), behavior)
-        set_references(
-            memory.laws, memory.params, memory.sees, _ALONE, alone, at, now, situation.obstacles, memory.grid, scratch, velocity
-        )  # fmt: skip
+        compose_team(situation.time, alone, memory.behaviors, at, situation.obstacles, memory.grid, workspace, velocity)
     return velocities, now
 
 
@@ -104,7 +95,7 @@ class Layered:
     def decide(self, situation: Situation, memory: Repertoire) -> tuple[Blend, Repertoire]:
         """One behavior per agent."""
         weights = self.weights(situation.clearance, memory.safe_distance)
-        if len(memory.laws) > _AA:
+        if len(memory.orders) > _AA:
             close = crowded(situation, memory.way, reach=1.0)  # alone, AA has an agent stand still from d_AA on
             weights = np.concatenate([weights * ~close, close[None].astype(np.float64)])
         velocities, _ = behavior_velocities(situation, memory)

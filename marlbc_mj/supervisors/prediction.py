@@ -11,42 +11,36 @@ import numpy as np
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.laws import allocation_free, compiled
 from marlbc_mj.core.motion import drift
-from marlbc_mj.engine.limits import keep, limit
-from marlbc_mj.engine.loop import path_at, set_references
+from marlbc_mj.engine.composition import WORKSPACE, compose_team, keep, limit, path_at
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.supervisors.base import Situation
 
-SCRATCH = 11
-"""Rows of two that one candidate needs: desired path, what ``set_references`` asks for, and a normal."""
+SCRATCH = WORKSPACE + 3
+"""Rows of two that one candidate needs: what composing asks for, the desired path and a normal."""
 
 
 @allocation_free
-def roll_out(  # type: ignore[no-untyped-def]
-    start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits, obstacles, drifted,
-    grid, scratch, v_r, before_v, trail,
-):  # fmt: skip
+def predict(start, moving, first, mission_step, orders, behaviors, obstacles, drifted, grid, scratch, v_r, before_v, trail):
     """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
 
     Args:
         start: (N, 2) [m] at mission step ``first``; moving: (N, 2) its velocity [m/s], from which limited references go on.
-        limits: speed [m/s] and acceleration [m/s^2] of references; before_v: (N, 2), scratch.
-        orders: (H, N) int64, indices into ``table``.
-        path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3), or (K, 5) now; drifted: the same, scratch.
-        sees, grid: as ``set_references`` takes them; scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
+        before_v: (N, 2), scratch.
+        orders: (H, N) int64, indices into the behaviors' table.
+        obstacles: (K, 3), or (K, 5) now; drifted: the same, scratch.
+        grid, scratch, v_r: of the candidate, scratch.
         trail: (H, N, 2) [m], written in place.
     """
-    now = scratch[:2]
     before = start
     for i in range(start.shape[0]):
         for axis in range(2):
             v_r[i, axis] = moving[i, axis]
     for k in range(orders.shape[0]):
-        path_at((first + k) * mission_step, path, now)
-        keep(limits, v_r, before_v)
+        keep(behaviors, v_r, before_v)
         seen = _after(k * mission_step, obstacles, drifted)
-        set_references(behavior_laws, behavior_params, sees, table, orders[k], before, now, seen, grid, scratch[2:9], v_r)
-        limit(limits, mission_step, before_v, v_r)
+        compose_team((first + k) * mission_step, orders[k], behaviors, before, seen, grid, scratch[3:], v_r)
+        limit(behaviors, mission_step, before_v, v_r)
         for i in range(start.shape[0]):
             for axis in range(2):
                 trail[k, i, axis] = before[i, axis] + mission_step * v_r[i, axis]
@@ -54,7 +48,7 @@ def roll_out(  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def _after(t, obstacles, drifted):  # type: ignore[no-untyped-def]
+def _after(t, obstacles, drifted):
     """Obstacles after ``t`` [s]: themselves where they are at rest."""
     if obstacles.shape[1] == 3:
         return obstacles
@@ -63,13 +57,13 @@ def _after(t, obstacles, drifted):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted, weights, scratch):  # type: ignore[no-untyped-def]
+def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted, weights, scratch):
     """Sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
 
     Slots are those of the desired centroid. ``weights`` (5,): w_F, w_R, w_slack [1/m], d_min [m], scale [m];
     ``formations`` (2, N, 2) [m]; ``scratch`` (SCRATCH, 2).
     """
-    now, normal = scratch[:2], scratch[9]
+    now, normal = scratch[:2], scratch[2]
     cost = 0.0
     for k in range(trail.shape[0]):
         path_at((first + k + 1) * mission_step, path, now)
@@ -84,31 +78,37 @@ def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted,
 
 
 @allocation_free
-def judge_candidate(  # type: ignore[no-untyped-def]
-    c, kinematic, start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits,
-    formations, obstacles, drifted, grid, weights, scratch, v_r, before_v, trails, costs,
+def judge_candidate(
+    c, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
+    scratch, v_r, before_v, trails, costs,
 ):  # fmt: skip
     """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
     if kinematic:
-        roll_out(
-            start, moving, first, mission_step, orders[c], behavior_laws, behavior_params, sees, table, path, limits, obstacles,
-            drifted[c], grid[c], scratch[c], v_r[c], before_v[c], trails[c],
+        predict(
+            start, moving, first, mission_step, orders[c], behaviors, obstacles, drifted[c], grid[c], scratch[c], v_r[c],
+            before_v[c], trails[c],
         )  # fmt: skip
-    costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, drifted[c], weights, scratch[c])
+    costs[c] = trail_cost(trails[c], first, mission_step, behaviors.path, formations, obstacles, drifted[c], weights, scratch[c])
 
 
 @compiled
-def judge_serial(candidates, *args):  # type: ignore[no-untyped-def]
+def judge_serial(candidates, *args):
     """:func:`judge_candidate` of every candidate, one after the other."""
     for c in range(candidates):
         judge_candidate(c, *args)
 
 
 @numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def judge_parallel(candidates, *args):  # type: ignore[no-untyped-def]
+def judge_parallel(
+    candidates, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
+    scratch, v_r, before_v, trails, costs,
+):  # fmt: skip
     """:func:`judge_candidate` of every candidate, shared out over numba's threads; the same numbers as in series."""
     for c in numba.prange(candidates):
-        judge_candidate(c, *args)
+        judge_candidate(
+            c, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
+    scratch, v_r, before_v, trails, costs,
+        )  # fmt: skip
 
 
 def judge(
@@ -127,8 +127,8 @@ def judge(
     costs = np.empty(candidates)
     arguments = (
         kinematic, np.ascontiguousarray(start), np.ascontiguousarray(np.zeros_like(start) if moving is None else moving), first,
-        scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params, plan.sees, scenario.orders.table, plan.path,
-        plan.limits, scenario.formations, np.ascontiguousarray(obstacles), np.zeros((candidates, *obstacles.shape)),
+        scenario.mission_step, orders, plan.behaviors, scenario.formations, np.ascontiguousarray(obstacles),
+        np.zeros((candidates, *obstacles.shape)),
         np.zeros((candidates, plan.grid_room)), weights, np.zeros((candidates, SCRATCH, 2)),
         *np.zeros((2, candidates, scenario.agents, 2)), trails, costs,
     )  # fmt: skip
@@ -142,14 +142,14 @@ def judge(
 
 def follow(twin: World, situation: Situation) -> None:
     """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
-    state = twin.state
-    state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
-    if state.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
+    team = twin.state
+    team.position[0], team.velocity[0], team.obstacles[0] = situation.position, situation.velocity, situation.obstacles
+    if team.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
         place, velocity = situation.obstacles[:, :3], situation.obstacles[:, 3:]
-        state.motions[0, :, :2], state.motions[0, :, 2:] = velocity, 0.0
-        state.anchors[0] = place
-        state.anchors[0, :, :2] -= velocity * situation.time
-    state.put(0, twin.data[0], situation.position, situation.velocity)
+        team.motions[0, :, :2], team.motions[0, :, 2:] = velocity, 0.0
+        team.anchors[0] = place
+        team.anchors[0, :, :2] -= velocity * situation.time
+    twin.put(0, situation.position, situation.velocity)
 
 
 def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:

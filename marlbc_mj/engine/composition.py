@@ -1,0 +1,151 @@
+"""How a priority order becomes a reference velocity: behaviors evaluated in turn, composed in the null space (12), limited.
+
+Errata 5 and 6 apply. The engine, predictions of supervisors and older frameworks all compose through :func:`compose`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE
+from marlbc_mj.core.cells import fill, nearest, room
+from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.nullspace import add_behavior
+from marlbc_mj.engine.native import as_behavior
+
+WORKSPACE = 9
+"""Rows of two numbers that a :class:`Scene` is made from."""
+
+
+class Behaviors(NamedTuple):
+    """The behaviors of a scenario and how they become references: M behaviors, N agents, O orders, C commands."""
+
+    laws: np.ndarray  # (M,) addresses; the laws themselves where numba is off
+    params: np.ndarray  # (M, N, P) each law's own
+    sees: np.ndarray  # (M,) what each law looks at, see marlbc_mj.core.behaviors
+    table: np.ndarray  # (O, M) behavior indices of every order, highest priority first
+    command_of: np.ndarray  # (O,) index of the command that each order gives
+    path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
+    virtual: bool  # behaviors are evaluated at p_r; else at the measured p
+    speed_limit: float  # of references [m/s]
+    acceleration_limit: float  # of references [m/s^2]
+
+
+class Scene(NamedTuple):
+    """What behaviors look at in one team, and room to evaluate them in."""
+
+    at: np.ndarray  # (N, 2) positions at which they are evaluated [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move
+    path: np.ndarray  # (2, 2) p_cd [m] and its velocity [m/s], now
+    grid: np.ndarray  # room for a grid of the obstacles and one of the team; empty where trying all pairs costs less
+    velocity: np.ndarray  # (2,) scratch: one behavior's desired velocity
+    jacobian: np.ndarray  # (2, 2) scratch: its Jacobian
+    basis: np.ndarray  # (2, 2) scratch: span of the Jacobians of higher priority
+    pair: np.ndarray  # (2, 2) scratch: an agent and its nearest neighbor
+
+
+@allocation_free
+def path_at(t, path, out):
+    """Desired centroid and its velocity at ``t`` [s]: ``out`` (2, 2) from ``path`` (2, 2) = origin [m], velocity [m/s]."""
+    for axis in range(2):
+        out[0, axis] = path[0, axis] + t * path[1, axis]
+        out[1, axis] = path[1, axis]
+
+
+@inlined
+def make_scene(t, behaviors, at, obstacles, grid, workspace):
+    """The :class:`Scene` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids, where there is room, are filled."""
+    path = workspace[0:2]
+    path_at(t, behaviors.path, path)
+    if grid.shape[0] > 0:
+        count = obstacles.shape[0]
+        fill(obstacles, grid[: room(count)])
+        fill(at, grid[room(count) :])
+    return Scene(at, obstacles, path, grid, workspace[2], workspace[3:5], workspace[5:7], workspace[7:9])
+
+
+@allocation_free
+def evaluate(j, i, behaviors, scene):
+    """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the scene; returns the Jacobian's rows.
+
+    A law that looks only at the nearest obstacle or neighbor is handed that one alone where the scene has a grid to find it in.
+    """
+    obstacles, team, own = scene.obstacles, scene.at, i
+    if scene.grid.shape[0] > 0:
+        count = scene.obstacles.shape[0]
+        if behaviors.sees[j] == NEAREST_OBSTACLE:
+            k = nearest(scene.at[i], scene.obstacles, scene.grid[: room(count)], -1)
+            if k >= 0:
+                obstacles = scene.obstacles[k : k + 1]
+        elif behaviors.sees[j] == NEAREST_NEIGHBOR:
+            k = nearest(scene.at[i], scene.at, scene.grid[room(count) :], i)
+            if k >= 0:
+                own, team = 1 if i > k else 0, scene.pair
+                for axis in range(2):
+                    team[own, axis], team[1 - own, axis] = scene.at[i, axis], scene.at[k, axis]
+    law = as_behavior(behaviors.laws[j])
+    return law(behaviors.params[j, i], scene.at[i], scene.path, obstacles, team, own, scene.velocity, scene.jacobian)
+
+
+@allocation_free
+def compose(order, i, behaviors, scene, v_r):
+    """v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12), for agent ``i``, into ``v_r`` (2,) [m/s].
+
+    ``order`` (M,) lists behavior indices, highest priority first. A stacks the Jacobians of all behaviors above j (erratum 5).
+    A behavior is evaluated only if those above it leave a direction free.
+    """
+    v_r[0] = v_r[1] = 0.0
+    rank = 0
+    for j in order:
+        if rank == 2:
+            break
+        rows = evaluate(j, i, behaviors, scene)
+        rank = add_behavior(scene.velocity, scene.jacobian, rows, scene.basis, rank, v_r)
+
+
+@allocation_free
+def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
+    """:func:`compose` for every agent of a team at ``t`` [s]: reference velocities ``v_r`` (N, 2) [m/s].
+
+    Args:
+        t: mission time [s].
+        orders: (N,) int64, indices into ``behaviors.table``.
+        behaviors: of the scenario.
+        at: (N, 2) positions at which they are evaluated [m].
+        obstacles: (K, 3 or 5), see :class:`Scene`.
+        grid: room for a grid of the obstacles and one of the team, or empty, which has every law try all of them.
+        workspace: (WORKSPACE, 2) scratch.
+        v_r: (N, 2), written in place.
+    """
+    scene = make_scene(t, behaviors, at, obstacles, grid, workspace)
+    for i in range(orders.shape[0]):
+        compose(behaviors.table[orders[i]], i, behaviors, scene, v_r[i])
+
+
+@allocation_free
+def keep(behaviors, v_r, previous):
+    """Remember v_r (N, 2) in ``previous`` (N, 2) before it is computed anew, where references have limits."""
+    if behaviors.speed_limit < np.inf or behaviors.acceleration_limit < np.inf:
+        for i in range(v_r.shape[0]):
+            for axis in range(2):
+                previous[i, axis] = v_r[i, axis]
+
+
+@allocation_free
+def limit(behaviors, duration, previous, v_r):
+    """Bound |v_r| (N, 2) by the speed limit, and its change since ``previous`` by the acceleration limit times ``duration`` [s].
+
+    Directions are kept: both are limits of vectors. Infinite limits cost a comparison.
+    """
+    if not (behaviors.speed_limit < np.inf or behaviors.acceleration_limit < np.inf):
+        return
+    for i in range(v_r.shape[0]):
+        speed = np.sqrt(v_r[i, 0] ** 2 + v_r[i, 1] ** 2)
+        if speed > behaviors.speed_limit:
+            v_r[i, 0] *= behaviors.speed_limit / speed
+            v_r[i, 1] *= behaviors.speed_limit / speed
+        x, y = v_r[i, 0] - previous[i, 0], v_r[i, 1] - previous[i, 1]
+        change, most = np.sqrt(x * x + y * y), behaviors.acceleration_limit * duration
+        if change > most:
+            v_r[i, 0] = previous[i, 0] + x * (most / change)
+            v_r[i, 1] = previous[i, 1] + y * (most / change)

@@ -1,0 +1,167 @@
+"""B teams between mission steps, apart from the physics: how their rows are made, reset, placed and observed.
+
+World and the dm_control task both keep a :class:`~marlbc_mj.engine.loop.Team`; this is what they do with it.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.core import laws
+from marlbc_mj.core.imperfections import sense
+from marlbc_mj.core.motion import MOVING, NUMBERS
+from marlbc_mj.engine.body import DIVERGED
+from marlbc_mj.engine.composition import WORKSPACE
+from marlbc_mj.engine.loop import Record, Team, judge
+from marlbc_mj.engine.observation import NEVER, Observation
+from marlbc_mj.engine.plan import Plan
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+
+SCRATCH = ("status", "drag", "force", "workspace", "grid")
+"""Fields of a team that carry nothing from one mission step to the next."""
+
+
+def make_team(plan: Plan, worlds: int) -> Team:
+    """Rows for ``worlds`` teams; :func:`reset` starts an episode in one."""
+    scenario, imperfections = plan.scenario, plan.scenario.imperfections
+    agents, count, moving = scenario.agents, len(scenario.obstacles), scenario.moving
+    each, pairs, tracks = (worlds, agents), (worlds, agents, 2), (worlds, count if moving else 0)
+    return Team(
+        steps=np.zeros(worlds, dtype=np.int64),
+        position=np.zeros(pairs),
+        velocity=np.zeros(pairs),
+        reference=np.zeros(pairs),
+        reference_velocity=np.zeros(pairs),
+        controller=np.zeros((worlds, *plan.initial_state.shape)),
+        command=np.zeros(each, dtype=np.int64),
+        since=np.full(each, NEVER, dtype=np.int64),
+        clearance=np.zeros(each),
+        formation=np.zeros(worlds, dtype=np.int64),
+        reward=np.zeros(worlds),
+        obstacles=np.zeros((worlds, count, MOVING if moving else 3)),
+        anchors=np.zeros((*tracks, 3)),
+        motions=np.zeros((*tracks, NUMBERS)),
+        disturbance_params=np.zeros((worlds, len(plan.disturbance_params))),
+        robot=np.zeros((*each, len(plan.robot.state))),
+        history=np.zeros((worlds, imperfections.depth(scenario.substep), 2, agents, 2)),
+        sensed=np.zeros((worlds, 2 if imperfections.sensing else 0, agents, 2)),
+        noise_seed=np.zeros(worlds, dtype=np.int64),
+        status=np.zeros(worlds, dtype=np.int64),
+        drag=np.zeros(pairs),
+        force=np.zeros(pairs),
+        workspace=np.zeros((worlds, WORKSPACE, 2)),
+        grid=np.zeros((worlds, plan.grid_room)),
+    )
+
+
+def make_record(plan: Plan, worlds: int, recording: bool) -> Record:
+    """Room for every substep of one mission step; for none unless ``recording``."""
+    shape = (worlds, plan.scenario.substeps if recording else 0, plan.scenario.agents, 2)
+    return Record(*(np.zeros(shape) for _ in Record._fields))
+
+
+def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarray:
+    """Put row ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m], for :func:`put`.
+
+    Raises:
+        ConfigurationError: no layout for this draw, or obstacles of a size that the model does not have.
+    """
+    draw = plan.scenario.draw(rng)
+    _check_solid(plan, draw.obstacles)
+    team.obstacles[b, :, :3] = draw.obstacles
+    if team.motions.shape[1]:
+        team.anchors[b], team.motions[b] = draw.obstacles, draw.motions
+    team.disturbance_params[b] = plan.disturbance_params
+    team.disturbance_params[b, 0] *= draw.drag_scale
+    team.noise_seed[b] = rng.integers(2**32)
+    place(plan, team, b, 0, draw.starts, np.zeros_like(draw.starts), 0)
+    return draw.starts
+
+
+def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
+    """Raise ConfigurationError for obstacles (K, 3) that robots would collide with in a size that the model does not have."""
+    scenario = plan.scenario
+    if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
+        raise ConfigurationError(
+            f"robot {scenario.robot!r} collides with obstacles, whose radii no seed can change; "
+            "give the family one radius: [r, r]"
+        )
+
+
+def place(
+    plan: Plan, team: Team, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray | int
+) -> None:
+    """Put row ``b`` at mission step ``step``; agents and references are at ``position`` [m] and ``velocity`` [m/s], (N, 2) each.
+
+    Controllers and robots start anew. ``command`` (N,) counts as given last, since ever.
+    """
+    team.position[b] = team.reference[b] = position
+    team.velocity[b] = team.reference_velocity[b] = velocity
+    team.controller[b] = plan.initial_state
+    team.robot[b] = plan.robot.state
+    team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
+    judge(b, plan.mission, team)
+
+
+def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:
+    """Move the physics of row ``b``, ``data``, to positions (N, 2) [m] and velocities (N, 2) [m/s], and measure it.
+
+    The base of a robot that is read elsewhere (a look-ahead point) is shifted until the reading is the position. Its
+    velocity is what its joints allow. Obstacles that are solid go where this episode has them.
+    """
+    plant, reading = plan.plant, plan.robot.reading
+    base = plant.qpos_index.ravel()
+    data.qpos[base] = np.ravel(position)
+    data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)
+    if len(plan.solid):
+        data.mocap_pos[plan.solid, :2] = team.obstacles[b, :, :2]
+    if reading is not None:
+        p, v, force = np.zeros((3, *team.position[b].shape))
+        read = laws.for_team(reading, laws.READING)
+        read(plant.robot_params, team.robot[b], data.qpos, data.qvel, data.actuator_force, plant.spans, p, v, force)
+        data.qpos[base] += np.ravel(position - p)
+        team.velocity[b] = v
+    if team.sensed.shape[1] > 0:  # the past that delays look into is the present
+        team.history[b] = np.stack([team.position[b], team.velocity[b]])
+        count = int(team.steps[b]) * plan.mission.substeps
+        sense(plant.senses, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
+
+
+def lasting(team: Team) -> dict[str, np.ndarray]:
+    """The arrays that a mission step depends on, by name: the very ones."""
+    return {name: array for name, array in team._asdict().items() if name not in SCRATCH}
+
+
+def copy_row(source: Team, source_world: int, team: Team, world: int) -> None:
+    """Make row ``world`` equal to a row of another team of the same plan."""
+    for name, array in lasting(team).items():
+        array[world] = getattr(source, name)[source_world]
+
+
+def observe(plan: Plan, team: Team) -> Observation:
+    """What supervisors decide on, as copies."""
+    measured = (team.sensed[:, 0], team.sensed[:, 1]) if team.sensed.shape[1] > 0 else (team.position, team.velocity)
+    duration = plan.mission.mission_step
+    return Observation(
+        step=team.steps.copy(),
+        time=team.steps * duration,
+        position=measured[0].copy(),
+        velocity=measured[1].copy(),
+        clearance=team.clearance.copy(),
+        formation=team.formation.copy(),
+        command=team.command.copy(),
+        age=np.where(team.since == NEVER, np.inf, (team.steps[:, None] - team.since) * duration),
+        reference=team.reference.copy(),
+        obstacles=team.obstacles.copy(),
+    )
+
+
+def diverged(plan: Plan, team: Team, b: int, status: int, steps: int) -> SimulationError:
+    """The error for a ``status`` of the loop in the mission step that began at ``steps``: names world, agent and time."""
+    agent, substep = (status - 1) % plan.scenario.agents, (status - 1) // plan.scenario.agents
+    time = steps * plan.mission.mission_step + substep * plan.mission.substep
+    return SimulationError(
+        f"world {b}, agent {agent + 1}, t = {time:.3f} s: position, velocity or "
+        f"force is not finite or beyond {DIVERGED:g} "
+        f"(p = {team.position[b, agent].tolist()}, v = {team.velocity[b, agent].tolist()})"
+    )
