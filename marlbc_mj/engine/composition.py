@@ -64,7 +64,7 @@ def make_scene(t, behaviors, at, obstacles, grid, workspace):
     return Scene(at, obstacles, path, grid, workspace[2], workspace[3:5], workspace[5:7], workspace[7:9])
 
 
-@allocation_free
+@inlined
 def evaluate(j, i, behaviors, scene):
     """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the scene; returns the Jacobian's rows.
 
@@ -87,7 +87,7 @@ def evaluate(j, i, behaviors, scene):
     return law(behaviors.params[j, i], scene.at[i], scene.path, obstacles, team, own, scene.velocity, scene.jacobian)
 
 
-@allocation_free
+@inlined
 def compose(order, i, behaviors, scene, v_r):
     """v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12), for agent ``i``, into ``v_r`` (2,) [m/s].
 

@@ -17,12 +17,11 @@ import numba
 import numpy as np
 from numba import types
 from numba.experimental import structref
-from numba.extending import register_jitable
 
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.imperfections import sense, weaken
-from marlbc_mj.core.laws import allocation_free, compiled, threaded
+from marlbc_mj.core.laws import allocation_free, compiled, inlined, threaded
 from marlbc_mj.core.motion import move
 from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
@@ -87,7 +86,7 @@ class Team(NamedTuple):
     reference_velocity: np.ndarray  # (B, N, 2) v_r [m/s]
     controller: np.ndarray  # (B, N, S) the controllers' own state
     command: np.ndarray  # (B, N) int64, index into scenario.orders.commands
-    since: np.ndarray  # (B, N) int64, mission step at which each command came into force, or NEVER
+    since: np.ndarray  # (B, N) mission step at which each command came into force, or NEVER
     clearance: np.ndarray  # (B, N) [m]
     formation: np.ndarray  # (B,) int64, G
     reward: np.ndarray  # (B,) r1 + r2 of the last mission step
@@ -196,7 +195,7 @@ def begin(b, orders, given, mission, behaviors, team):
     limit(behaviors, mission.mission_step, previous, v_r)
 
 
-@register_jitable
+@inlined
 def set_forces(b, t, h, native, plant, team):
     """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
 
@@ -225,7 +224,7 @@ def set_forces(b, t, h, native, plant, team):
     return 0
 
 
-@register_jitable
+@inlined
 def apply(b, k, mission, native, plant, team):
     """Substep ``k`` of world ``b`` before MuJoCo's step: force law, drag and robot of every agent, into ctrl and qfrc_applied.
 
@@ -248,7 +247,7 @@ def apply(b, k, mission, native, plant, team):
     return 0
 
 
-@register_jitable
+@inlined
 def settle(b, k, mission, native, plant, team, record):
     """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, measure what was reached, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]

@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-NEVER = -1
-"""Mission step since which a command has been in force that an episode began with."""
+NEVER = -np.inf
+"""Mission step since which a command is in force that an episode began with."""
 
 
 class Observation(NamedTuple):

@@ -34,7 +34,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         reference_velocity=np.zeros(pairs),
         controller=np.zeros((worlds, *plan.initial_state.shape)),
         command=np.zeros(each, dtype=np.int64),
-        since=np.full(each, NEVER, dtype=np.int64),
+        since=np.full(each, NEVER),
         clearance=np.zeros(each),
         formation=np.zeros(worlds, dtype=np.int64),
         reward=np.zeros(worlds),
@@ -150,7 +150,7 @@ def observe(plan: Plan, team: Team) -> Observation:
         clearance=team.clearance.copy(),
         formation=team.formation.copy(),
         command=team.command.copy(),
-        age=np.where(team.since == NEVER, np.inf, (team.steps[:, None] - team.since) * duration),
+        age=(team.steps[:, None] - team.since) * duration,
         reference=team.reference.copy(),
         obstacles=team.obstacles.copy(),
     )
