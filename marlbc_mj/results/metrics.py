@@ -5,6 +5,7 @@ from typing import TypedDict
 import numpy as np
 
 from marlbc_mj.core.cells import spacing
+from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.scenarios import Scenario
 
@@ -70,7 +71,7 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
     return {
         "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
         "clearance_min": float(clearance.min()),
-        "violation_time": float((clearance <= scenario.safe_distance).sum() * h),
+        "violation_time": float(violates(clearance, scenario.safe_distance).sum() * h),
         "force_max_inf": float(np.abs(force).max()),
         "force_max_2": float(size.max()),
         "effort_integral": float(size.sum() * h),
