@@ -1,5 +1,7 @@
 """The test that makes a clearance a violation, and stretches of equal values."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -33,4 +35,4 @@ def test_stretches_tile_the_sequence():
     values = np.random.default_rng(0).integers(0, 3, 200)
     parts = list(stretches(values))
     assert np.concatenate([np.full(end - start, value) for start, end, value in parts]).tolist() == values.tolist()
-    assert all(left[2] != right[2] for left, right in zip(parts, parts[1:], strict=False))
+    assert all(left[2] != right[2] for left, right in pairwise(parts))

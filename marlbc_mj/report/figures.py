@@ -20,8 +20,8 @@ from marlbc_mj.report.curves import (
     weight_norms,
 )
 from marlbc_mj.report.formats import listed
+from marlbc_mj.report.paper_tables import one_per_controller, one_per_supervisor
 from marlbc_mj.report.pareto import coincident, pareto
-from marlbc_mj.report.printed import by_controller, by_supervisor
 from marlbc_mj.results.summary import Result
 
 FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
@@ -66,8 +66,8 @@ def plots(results: Sequence[Result]) -> list[Plot]:
 
 def _paper(results: Sequence[Result]) -> list[Plot]:
     """Figures 2 to 9; those of one method only where that method ran, those of several with the ones that did."""
-    supervisors = [r.trajectory for r in by_supervisor(results).values() if r.trajectory]
-    under, supervisor = by_controller(results)
+    supervisors = [r.trajectory for r in one_per_supervisor(results).values() if r.trajectory]
+    under, supervisor = one_per_controller(results)
     laws = {name: r.trajectory for name, r in under.items() if r.trajectory}
     found = []
     if len(supervisors) > 1:
@@ -115,7 +115,7 @@ def _comparison(results: Sequence[Result]) -> list[Plot]:
 
 
 def _methods(results: Sequence[Result]) -> list[Plot]:
-    shown = {result.key for result in by_supervisor(results).values()}
+    shown = {result.key for result in one_per_supervisor(results).values()}
     found = []
     for result in results:
         if result.trajectory is not None:
@@ -160,13 +160,13 @@ def write_figures(results: Sequence[Result], folder: Path, progress: Callable[[i
     jobs = plots(results)
     paths: list[Path] = []
     for done, plot in enumerate(jobs, start=1):
-        paths += save(plot.draw, folder / plot.stem)
+        paths += save_figure(plot.draw, folder / plot.stem)
         if progress is not None:
             progress(done, len(jobs))
     return paths
 
 
-def save(draw: Callable[[], Figure], stem: Path) -> list[Path]:
+def save_figure(draw: Callable[[], Figure], stem: Path) -> list[Path]:
     """Draw a figure in the common style and write ``stem``.pdf and .png; the same figure gives the same bytes."""
     paths = [stem.with_name(stem.name + suffix) for suffix in (".pdf", ".png")]
     with pl.style():
