@@ -19,11 +19,11 @@ from marlbc_mj.util.stretches import stretches
 
 _MARGIN = (0.16, 0.06)  # left and right, above and below everything that happens: room for the agents' numbers [in]
 _POINT = 0.35  # radius at which a point obstacle is drawn [m]
-_VIOLATION = "#1A1A1A"  # casing of a path
+_VIOLATION = "#1A1A1A"  # color of the casing of a path in violation
 
 
 def trajectories(episodes: Sequence[Trajectory]) -> Figure:
-    """Paths of all agents: one episode over both columns, several as panels of one column's width, two a row."""
+    """Paths of all agents: one episode over both columns of text, several as panels of one column's width, two per row."""
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
     margins = pl.Margins(left=0.5, right=0.05, top=0.3 if columns == 1 else 0.42, across=0.12, between=0.3)
@@ -51,7 +51,7 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
 
 
 def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float, float, float]:
-    """x and y limits [m] that hold every path and every obstacle's safe-distance ring, for a panel of ``width`` [in]."""
+    """x and y limits [m] around every path and every obstacle's ring of the safe distance, for a panel of ``width`` [in]."""
     points = np.concatenate([e.position.reshape(-1, 2) for e in episodes])
     rings = np.concatenate([_discs(e) for e in episodes])
     reach = rings[:, 2:] + episodes[0].scenario.safe_distance
@@ -99,7 +99,7 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
 
 
 def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -> None:
-    """A dark casing around the stretches with a clearance of at most the safe distance."""
+    """A dark casing around those parts of a path that are in violation."""
     path = episode.position[1:, agent]
     violated = violates(episode.clearances()[:, agent], episode.scenario.safe_distance)
     every = max(1, episode.scenario.substeps // 2)
@@ -116,7 +116,7 @@ def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
     distance = episodes[0].scenario.safe_distance
     handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2)), label=f"safe distance {distance:g} m"))
     if any(len(e.motions) for e in episodes):
-        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="way of an obstacle, drawn where it came nearest"))
+        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="path of an obstacle, drawn where it came nearest"))
     if any(violates(e.clearances(), distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
     pl.legend_above(figure, handles)

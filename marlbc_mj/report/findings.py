@@ -23,8 +23,6 @@ WHY = {
     "sign (erratum 4) and on the compensator's, which pushes further into the limit while the force is saturated (erratum 2).",
 }
 """Why a published order may not hold, by table."""
-PUBLISHED_CONVERGENCE = {"sorlc": 0.7, "rlc": 3.4}
-"""Figs. 6c and 7c [s]."""
 
 
 class Claim(NamedTuple):
@@ -195,7 +193,8 @@ def _gap_row(result: Result, top: float) -> tuple[str, ...]:
 def convergence(results: Sequence[Result]) -> Table | None:
     """How fast the velocity error of SORLC and RLC decays at the start; None where neither ran."""
     chosen, supervisor = paper_tables.one_per_controller(results)
-    times = {n: convergence_time(r.trajectory) for n, r in chosen.items() if n in PUBLISHED_CONVERGENCE and r.trajectory}
+    published = paper_values.PUBLISHED_CONVERGENCE
+    times = {n: convergence_time(r.trajectory) for n, r in chosen.items() if n in published and r.trajectory}
     if not times:
         return None
     with_paper = next(iter(chosen.values())).trajectory
@@ -204,7 +203,7 @@ def convergence(results: Sequence[Result]) -> Table | None:
     columns = [Column("", "controller"), *(Column("", f"agent {i + 1}") for i in range(agents))]
     columns += [Column("", "published")] if of_paper else []
     rows = tuple(
-        (name, *(fixed(t, 2) for t in each), *([significant(PUBLISHED_CONVERGENCE[name], 2)] if of_paper else []))
+        (name, *(fixed(t, 2) for t in each), *([significant(published[name], 2)] if of_paper else []))
         for name, each in times.items()
     )
     notes = (

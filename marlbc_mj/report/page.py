@@ -90,7 +90,7 @@ def write_benchmark_page(
         ("Seed", str(config["seed"])),
         *origin_facts(config),
     ]
-    return write_page(
+    return fill_page(
         path,
         "page.html",
         links,
@@ -108,7 +108,7 @@ def write_benchmark_page(
     )
 
 
-def write_page(path: Path, template: str, links: Sequence[Path], **values: Any) -> Path:
+def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -> Path:
     """Fill a template that extends page.html and write it; the citation, the errata and the links are added to ``values``."""
     text = render(
         template,

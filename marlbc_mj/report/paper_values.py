@@ -1,4 +1,4 @@
-"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and what has to be known to read them."""
+"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and the errata that one needs to read them."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Published(NamedTuple):
 
 
 PUBLISHED_SWITCHES = Published({"marlms": (4, 2, 2, 4), "fsams": (118, 86, 86, 118), "mpcms": (4, 2, 2, 4), "rlms": (6, 4, 4, 6)})
-"""Table 3."""
+"""Switches of each agent, Table 3."""
 PUBLISHED_DECISION_MS = Published(
     {
         "marlms": (1.4, 1.1, 1.3, 1.5),
@@ -32,18 +32,18 @@ PUBLISHED_DECISION_MS = Published(
         "rlms": (1.0, 0.7, 0.8, 1.1),
     }
 )
-"""Table 4, one agent at a time [ms]."""
+"""Decision time of one agent at a time, Table 4 [ms]."""
 PUBLISHED_COST_MAX = Published({"sorlc": (9, 9, 9, 9), "finite-time": (17, 17, 60, 60), "fixed-time": (103, 115, 372, 372)})
-"""Table 5, in units of 1e4."""
+"""Largest control cost, Table 5, in units of 1e4."""
 PUBLISHED_COST_TOTAL = Published(
     {"sorlc": (382, 364, 570, 609), "finite-time": (435, 404, 1384, 1391), "fixed-time": (518, 790, 1813, 1868)},
     comparable=False,
 )
-"""Table 5, in units of 1e4 (erratum 16)."""
+"""Total control cost, Table 5, in units of 1e4 (erratum 16)."""
 PUBLISHED_INPUT_MAX = Published(
     {"sorlc": (200, 200, 200, 200), "finite-time": (384, 384, 768, 768), "fixed-time": (960, 1061, 1920, 1920)}
 )
-"""Table 6 [N]."""
+"""Largest control input, Table 6 [N]."""
 PUBLISHED_INPUT_TOTAL = Published(
     {
         "sorlc": (2210, 2341, 4118, 4285),
@@ -51,7 +51,9 @@ PUBLISHED_INPUT_TOTAL = Published(
         "fixed-time": (9127, 13370, 16112, 16646),
     }
 )
-"""Table 6, a sum over samples [N]."""
+"""Total control input, Table 6, a sum over samples [N]."""
+PUBLISHED_CONVERGENCE = {"sorlc": 0.7, "rlc": 3.4}
+"""Time in which the velocity error converges, Figs. 6c and 7c [s]."""
 
 ERRATA = {
     2: "The compensator enters the force with a sign that pushes further into the limit while the force is saturated. "

@@ -51,7 +51,7 @@ _STYLE: Any = {
 
 
 def style() -> AbstractContextManager[None]:
-    """Matplotlib's settings for the time of drawing or saving a figure; fonts are embedded as TrueType."""
+    """A context with Matplotlib's settings, for drawing and saving; fonts are embedded as TrueType."""
     return matplotlib.rc_context(_STYLE)
 
 
@@ -60,7 +60,7 @@ Share = bool | Literal["none", "all", "row", "col"]
 
 
 class Margins(NamedTuple):
-    """Room around and between panels [in]; fixed, so that one kind of figure has its axes in one place for every method."""
+    """Room around and between panels [in]; fixed, so that a kind of figure has its axes in the same place for every method."""
 
     left: float = 0.5
     right: float = 0.14

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.figures import save_figure
 from marlbc_mj.report.formats import loose_interval, score_interval, spans
-from marlbc_mj.report.page import files_beside, origin_facts, picture, scenario_facts, write_page
+from marlbc_mj.report.page import files_beside, fill_page, origin_facts, picture, scenario_facts
 from marlbc_mj.report.seed_files import seed_summary, write_seed_csv
 from marlbc_mj.report.seed_tables import caution, make_seed_tables
 from marlbc_mj.report.table import Column, Table
@@ -95,7 +95,7 @@ def _write_page(
     failed = sum(len(s.runs.failed) for s in methods)
     caption = f"Median and 95 % interval of each method over draws{caution(draws)}."
     figure = picture(path.parent / "figures" / f"{FIGURE}.png", caption)
-    return write_page(
+    return fill_page(
         path,
         "seed_page.html",
         files_beside(path.parent),

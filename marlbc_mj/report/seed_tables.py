@@ -39,7 +39,7 @@ def make_seed_tables(results: SeedResults, methods: Sequence[MethodStatistics]) 
 
 
 def caution(draws: int) -> str:
-    """What a caption adds where there are too few draws for their intervals; empty where there are enough."""
+    """What is added to a caption where there are too few draws for intervals; empty where there are enough."""
     if draws == 1:
         return " (a single draw: no intervals)"
     return f" (only {draws} draws: intervals are too narrow)" if draws < ENOUGH else ""
@@ -74,7 +74,7 @@ def _return_table(results: SeedResults, methods: Sequence[MethodStatistics]) -> 
 
 
 def outcome_table(results: SeedResults) -> Table:
-    """Success of each method, and what kept the others from it."""
+    """Success rate of each method, and the rates of what prevents success."""
     columns = (
         Column("", "method"),
         Column("success", "rate", "%"),
@@ -102,7 +102,7 @@ def outcome_table(results: SeedResults) -> Table:
 
 
 def _never_ran(statistics: MethodStatistics) -> bool:
-    """Whether no run finished, so that rates and comparisons would say nothing about safety or return."""
+    """Whether no run finished, so that rates and comparisons mean nothing."""
     return len(statistics.runs.failed) == len(statistics.runs.runs)
 
 

@@ -52,13 +52,21 @@ def _method_statistics(method: MethodRuns, agents: int, against: np.ndarray) -> 
 
     return MethodStatistics(
         method,
-        tuple({key: over(lambda m, i=i, key=key: m["agents"][i][key]) for key in AGENT_KEYS} for i in range(agents)),  # type: ignore[misc]
-        {key: over(lambda m, key=key: m["team"][key]) for key in TEAM_KEYS},  # type: ignore[misc]
+        tuple({key: over(_agent_metric(i, key)) for key in AGENT_KEYS} for i in range(agents)),
+        {key: over(_team_metric(key)) for key in TEAM_KEYS},
         {name: over(score.read) for name, score in SCORES.items()},
         {name: over(score.read, iqm) for name, score in SCORES.items()},
         rate([run.violated for run in method.runs]),
         paired_improvement(method.values(SCORES["return"].read, failure=-np.inf), against),
     )
+
+
+def _agent_metric(agent: int, key: str) -> Callable[[Metrics], Any]:
+    return lambda metrics: dict(metrics["agents"][agent])[key]
+
+
+def _team_metric(key: str) -> Callable[[Metrics], Any]:
+    return lambda metrics: dict(metrics["team"])[key]
 
 
 def group(results: SeedResults, by: Callable[[MethodRuns], str]) -> list[GroupStatistics]:
