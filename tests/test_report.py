@@ -6,12 +6,15 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 from PIL import Image
 
+from marlbc_mj.cli.terminal import print_results
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -32,6 +35,11 @@ from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
+HEADINGS = {
+    *("return, team", "switches, each agent", "violation, worst agent [s]"),
+    *("clearance, worst agent [m]", "effort, sum [N s]"),
+}
+"""Headings of the columns that the terminal shows."""
 REASON = "world 0, agent 3, t = 1.25 s: force | 100% of <limit> & more_so\nsecond line"
 
 
@@ -227,6 +235,29 @@ def test_html_escapes_and_spans() -> None:
     assert 'colspan="2">g</th>' in text
     with pytest.raises(ValueError, match="1 cells in a row of 3"):
         Table("t", "c", table.columns, (("1",),))
+
+
+def test_templates_escape_everything_and_know_every_name() -> None:
+    """None marks text as safe; a value that is not given stops the page."""
+    folder = Path(str(resources.files("marlbc_mj.report")))
+    assert {path.name for path in folder.glob("*.html")} >= {"base.html", "page.html", "seed_page.html", "table.html"}
+    assert not [path.name for path in folder.glob("*.html") if re.search(r"\|\s*safe|autoescape", path.read_text())]
+    with pytest.raises(UndefinedError, match="'table' is undefined"):
+        render("table.html")
+
+
+def test_the_terminal_says_what_the_tables_say(results: list[Result], capsys: pytest.CaptureFixture[str]) -> None:
+    """Heading, aggregation and digits of the table of all metrics; a failure with its reason."""
+    print_results(results)
+    out = capsys.readouterr().out
+    assert "worst agent [s]" in out and "worst agent [m]" in out and "sum [N s]" in out
+    table = make_tables(results, "paper")[0]
+    shown = [k for k, column in enumerate(table.columns) if column.text == "method" or column.text in HEADINGS]
+    assert len(shown) == 1 + len(HEADINGS)
+    for row in table.rows[:3]:
+        (line,) = [line for line in out.splitlines() if row[0] in line]
+        assert [cell.strip() for cell in line.split("│")[1:-1]] == [row[k] for k in shown]
+    assert f"mpcms+sorlc failed: {REASON}" in out
 
 
 def test_failures_appear_in_every_form(results: list[Result]) -> None:

@@ -13,7 +13,7 @@ from marlbc_mj.results.metrics import AgentMetrics, Metrics
 WORST, SUM, MEAN, RMS, TEAM, PAIR = "worst agent", "sum", "mean", "RMS", "team", "closest pair"
 """How agents are aggregated, as headings say it. Sum, mean and RMS are over all agents."""
 
-Read = Callable[[AgentMetrics], float]
+_Read = Callable[[AgentMetrics], float]
 
 
 class Score(NamedTuple):
@@ -32,19 +32,19 @@ class Score(NamedTuple):
         return f"{self.quantity}, {self.aggregation}" + (f" [{self.unit}]" if self.unit else "")
 
 
-def _sum(read: Read) -> Callable[[Metrics], float]:
+def _sum(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: sum(map(read, metrics["agents"]))
 
 
-def _greatest(read: Read) -> Callable[[Metrics], float]:
+def _greatest(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: max(map(read, metrics["agents"]))
 
 
-def _least(read: Read) -> Callable[[Metrics], float]:
+def _least(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: min(map(read, metrics["agents"]))
 
 
-def _rms(read: Read) -> Callable[[Metrics], float]:
+def _rms(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: float(np.sqrt(np.mean([read(agent) ** 2 for agent in metrics["agents"]])))
 
 
