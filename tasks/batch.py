@@ -10,6 +10,7 @@ from marlbc_mj.controllers import Controller
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.core.motion import obstacles_at
 from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.actions import order_of
@@ -297,7 +298,7 @@ class FormationBatch:
 
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
         """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
-        return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
+        return np.asarray(violates(clearances(positions, obstacles), self.scenario.safe_distance))
 
 
 def stream(seed: int, world: int) -> np.random.Generator:

@@ -1,6 +1,7 @@
 """Metrics of trajectories made by hand, whose answers are closed forms."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.results.metrics import convergence_time, measure
+from marlbc_mj.results.scores import MEAN, PAIR, RMS, SCORES, SUM, TEAM, WORST, switches_text, team_scores
 from marlbc_mj.scenarios import Obstacle, Scenario, paper, standard_behaviors
 from marlbc_mj.supervisors import make_supervisor
 
@@ -180,6 +182,57 @@ def test_metrics_agree_with_the_worlds_own_verdict(episode):
     r2 = np.concatenate([[0.0], -3.0 * switched])
     np.testing.assert_array_equal(trajectory.reward, r1 + r2)
     assert metrics["team"]["return"] == (r1 + r2).sum()
+
+
+def test_scores_by_hand():
+    """Two agents pass a point at 3 m and 5 m, the first in violation for 81 substeps; forces (3, -4) and (0, 12) N."""
+    trajectory = straight(pair(safe_distance=3.4001))
+    trajectory.force[:, 0], trajectory.force[:, 1] = (3.0, -4.0), (0.0, 12.0)
+    trajectory.reference[:, 1] -= (0.6, 0.8)
+    assert team_scores(measure(trajectory)) == pytest.approx(
+        {
+            "return": 200.0,
+            "violation_time_worst": 81 * H,
+            "violation_time_sum": 81 * H,
+            "clearance_min_worst": 3.0,
+            "agent_distance_min": 2.0,
+            "formation_error_mean": 0.0,
+            "end_error_worst": 8.0 - trajectory.scenario.path_velocity[0] - trajectory.scenario.path_origin[0],
+            "effort_integral_sum": 5.0 + 12.0,
+            "cost_integral_sum": 25.0 + 144.0 + 1.0,
+            "saturation_duty_worst": 0.0,
+            "rms_position_error_rms": np.sqrt(0.5),
+            "rms_velocity_error_rms": 0.0,
+        },
+        abs=1e-9,
+    )
+
+
+def test_sum_and_worst_differ_where_two_agents_violate():
+    """Both count in the sum, the longer one alone is the worst."""
+    times = measure(straight(pair(safe_distance=5.2)))["agents"]
+    first, second = (agent["violation_time"] for agent in times)
+    scores = team_scores(measure(straight(pair(safe_distance=5.2))))
+    assert first > second > 0.0
+    assert (scores["violation_time_worst"], scores["violation_time_sum"]) == (first, first + second)
+
+
+def test_names_and_headings_of_scores_tell_their_aggregation():
+    """The end of a score's name is its aggregation, which its heading has too; concepts.md lists each under both."""
+    words = {"worst": WORST, "sum": SUM, "mean": MEAN, "rms": RMS, "min": PAIR, "return": TEAM}
+    for name, score in SCORES.items():
+        assert score.aggregation == words[name.rsplit("_", 1)[-1]]
+        assert score.label.startswith(f"{score.quantity}, {score.aggregation}")
+    concepts = Path(__file__).resolve().parents[1] / "docs" / "concepts.md"
+    if concepts.is_file():
+        text = concepts.read_text(encoding="utf-8")
+        assert [name for name, score in SCORES.items() if f"`{name}`" not in text or score.label not in text] == []
+
+
+def test_switches_of_each_agent_as_text():
+    trajectory = straight(pair())
+    trajectory.command[3, 0], trajectory.command[10:, 0] = 0, 3
+    assert switches_text(measure(trajectory)) == "3/0"
 
 
 def test_frames_show_the_state_in_which_orders_were_given():

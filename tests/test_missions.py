@@ -11,7 +11,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
-from marlbc_mj.results.outcomes import FAILED, outcome
+from marlbc_mj.results.outcomes import FAILED_MISSION, outcome
 from marlbc_mj.results.seeds import perturbed, run_methods
 from marlbc_mj.scenarios import held_out, make_scenario
 from marlbc_mj.scenarios.families import Gates
@@ -44,8 +44,8 @@ def test_every_part_of_an_outcome_can_fail(flown):
     collided = outcome({"agents": agents, "team": {**team, "agent_distance_min": 1.0}}, scenario)
     assert (late, violated) == ((False, False, False, False), (True, True, False, False))
     assert (struck, collided) == ((True, False, True, False), (True, False, False, True))
-    assert not any(one.success for one in (late, violated, struck, collided, FAILED))
-    assert outcome(None, scenario) == FAILED
+    assert not any(one.success for one in (late, violated, struck, collided, FAILED_MISSION))
+    assert outcome(None, scenario) == FAILED_MISSION
 
 
 def test_the_end_is_absolute(flown):

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.core.nullspace import compose, projector
+from marlbc_mj.core.nullspace import RANK_TOLERANCE, compose
 
 OA, FM, FR = 0, 1, 2
 seeds = st.integers(0, 2**32 - 1)
@@ -20,14 +20,21 @@ def composed(order, velocities, jacobians, rows) -> np.ndarray:
     return out
 
 
+def projector(stack: np.ndarray) -> np.ndarray:
+    """N = I - A^+ A for a stack of Jacobians, (m, n) -> (n, n): the textbook form.
+
+    It drops directions relative to the largest singular value, ``compose`` relative to each row's own length.
+    """
+    return np.eye(stack.shape[1]) - np.linalg.pinv(stack, rcond=RANK_TOLERANCE) @ stack
+
+
 def literal(order, velocities, jacobians, rows) -> np.ndarray:
     """v_r = v^1 + sum_j N^{1..j-1} v^j with N = I - A^+ A (12), the Jacobians above j stacked (erratum 5)."""
     n = velocities.shape[1]
     v_r = np.zeros(n)
     stack = np.zeros((0, n))
     for j in order:
-        null = np.eye(n) - np.linalg.pinv(stack, rcond=1e-9) @ stack
-        v_r = v_r + null @ velocities[j]
+        v_r = v_r + projector(stack) @ velocities[j]
         stack = np.vstack([stack, jacobians[j, : rows[j]]])
     return v_r
 

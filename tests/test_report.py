@@ -6,12 +6,15 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
 import pytest
+from jinja2 import UndefinedError
 from PIL import Image
 
+from marlbc_mj.cli.terminal import print_results
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -19,17 +22,24 @@ from marlbc_mj.report import curves, figures, paper_values, plotting, write_repo
 from marlbc_mj.report.arena import trajectories
 from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actuator
 from marlbc_mj.report.formats import significant, spans
-from marlbc_mj.report.page import write_page
+from marlbc_mj.report.page import write_benchmark_page
 from marlbc_mj.report.paper_values import order_mark
 from marlbc_mj.report.pareto import coincident, pareto
-from marlbc_mj.report.table import Column, Table, latex, to_html, to_markdown
+from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
+from marlbc_mj.report.templates import render
 from marlbc_mj.results.metrics import AgentMetrics, TeamMetrics
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
+HEADINGS = {
+    *("return, team", "switches, each agent", "violation, worst agent [s]"),
+    *("clearance, worst agent [m]", "effort, sum [N s]"),
+}
+"""Headings of the columns that the terminal shows."""
 REASON = "world 0, agent 3, t = 1.25 s: force | 100% of <limit> & more_so\nsecond line"
 
 
@@ -51,14 +61,16 @@ def drawn(results: list[Result], tmp_path_factory: pytest.TempPathFactory) -> tu
 
 
 def test_summary_has_the_schema_and_no_nan(results: list[Result]) -> None:
-    """Keys are those of design.md section 7, a failed method is its reason, and JSON takes it strictly."""
+    """Keys are those of the metrics and scores, a failed method is its reason, and JSON takes it strictly."""
     content = summary(results, "paper", {"mujoco": "3.17"})
     assert set(content) == {"schema", "scenario", "versions", "methods"} and content["schema"] == 1
     assert list(content["methods"]) == ["scripted+sorlc", "scripted+pd", "fsams+sorlc", "mpcms+sorlc"]
     method = content["methods"]["scripted+sorlc"]
-    assert set(method) == {"agents", "team"} and len(method["agents"]) == 4
+    assert set(method) == {"agents", "team", "scores"} and len(method["agents"]) == 4
     assert set(method["agents"][0]) == set(AgentMetrics.__annotations__)
     assert set(method["team"]) == set(TeamMetrics.__annotations__)
+    assert set(method["scores"]) == set(SCORES)
+    assert {"agents": method["agents"], "team": method["team"]} == results[0].metrics
     assert content["methods"]["mpcms+sorlc"] == {"failure": REASON}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
@@ -101,17 +113,17 @@ def cells(text: str) -> list[list[str]]:
 
 
 def test_table_cells_are_the_metrics(results: list[Result]) -> None:
-    """Tables read back from Markdown hold the metrics, rounded, and the printed values beside them."""
+    """Tables read back from Markdown hold the metrics, rounded, and the published values beside them."""
     tables = {table.name: cells(to_markdown(table)) for table in make_tables(results, "paper")}
     ran = [result.metrics for result in results if result.metrics is not None]
     head, *rows = tables["switches"]
     assert head == ["supervisor", "agent 1", "agent 2", "agent 3", "agent 4"]
-    assert [row[0] for row in rows] == ["scripted", "fsams", "FSAMS, printed", "mpcms", "MPCMS, printed"]
+    assert [row[0] for row in rows] == ["scripted", "fsams", "FSAMS, published", "mpcms", "MPCMS, published"]
     assert [int(cell) for cell in rows[1][1:]] == [agent["switches"] for agent in ran[2]["agents"]]
-    assert [int(cell) for cell in rows[2][1:]] == list(paper_values.SWITCHES.values["fsams"])
+    assert [int(cell) for cell in rows[2][1:]] == list(paper_values.PUBLISHED_SWITCHES.values["fsams"])
     assert rows[3][1] == "failed"
     rows = tables["control-cost"][1:]
-    assert [row[0] for row in rows] == ["sorlc", "MARLBC, printed", "pd"]
+    assert [row[0] for row in rows] == ["sorlc", "MARLBC, published", "pd"]
     ours = [agent["cost_max"] for agent in ran[0]["agents"]] + [agent["cost_sum"] for agent in ran[0]["agents"]]
     np.testing.assert_allclose([float(cell) for cell in rows[0][1:9]], np.array(ours) * 1e-4, atol=0.05)
     assert rows[1][5] == "382†" and rows[0][9] == "1.00"
@@ -124,11 +136,32 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
     assert rows[-1][1] == "failed"
 
 
-def test_printed_values_belong_to_the_paper_scenario_only(results: list[Result]) -> None:
+def test_published_values_belong_to_the_paper_scenario_only(results: list[Result]) -> None:
     """Elsewhere there is one row a method and no mark."""
     switches = next(table for table in make_tables(results, "other") if table.name == "switches")
     assert [row[0] for row in switches.rows] == ["scripted", "fsams", "mpcms"]
-    assert not any("rinted" in note for note in switches.notes)
+    assert not any("ublished" in note for note in switches.notes)
+
+
+def test_one_word_means_one_aggregation(results: list[Result]) -> None:
+    """A heading that two tables share has the same cell for the same method, and says how agents are aggregated."""
+    run = [*results, scaled("oracle+sorlc", results[0], 1.0), scaled("oracle+pd", results[1], 1.0)]
+    said: dict[tuple[str, str], str] = {}
+    for table in make_tables(run, "paper"):
+        for row in table.rows:
+            for column, cell in zip(table.columns, row, strict=True):
+                if column.group in {score.quantity for score in SCORES.values()}:
+                    assert column[1:3] in {score[1:3] for score in SCORES.values()}
+                    assert said.setdefault((row[0], column.text), cell) in (cell, "failed", "–")
+    assert ("scripted+sorlc", "violation, worst agent [s]") in said
+
+
+def test_latex_units_have_a_line_of_their_own() -> None:
+    """Below the labels, so that a column is as wide as its words."""
+    table = Table("t", "c", (Column("", "x"), Column("g", "a", "m"), Column("g", "b")), (("r", "1", "2"),))
+    lines = to_latex(table).splitlines()
+    assert lines[lines.index(r"x & a & b \\") + 1] == r" & [m] &  \\"
+    assert to_markdown(table).splitlines()[2] == "| x | g, a [m] | g, b |"
 
 
 @pytest.mark.parametrize(
@@ -143,24 +176,25 @@ def test_printed_values_belong_to_the_paper_scenario_only(results: list[Result])
     ],
 )
 def test_order_mark(ours: dict[str, float], mark: str) -> None:
-    """Pairs among the methods that both have; a tie of ours where the printed differ is a mismatch."""
+    """Pairs among the methods that both have; a tie of ours where the published differ is a mismatch."""
     assert order_mark(ours, {"a": 10.0, "b": 20.0, "c": 30.0}) == mark
 
 
-def test_order_mark_ignores_printed_ties() -> None:
-    """A printed tie orders nothing."""
+def test_order_mark_ignores_published_ties() -> None:
+    """A published tie orders nothing."""
     assert order_mark({"a": 2.0, "b": 1.0}, {"a": 4.0, "b": 4.0}) == "–"
     assert order_mark({"a": 2.0, "b": 1.0, "c": 3.0}, {"a": 4.0, "b": 4.0, "c": 6.0}) == "yes"
 
 
-def test_printed_values_cover_four_agents() -> None:
-    """Every printed quantity has four agents, and its methods are named in the paper."""
-    supervisors = (paper_values.SWITCHES, paper_values.DECISION_MS)
-    controllers = (paper_values.COST_MAX, paper_values.COST_TOTAL, paper_values.INPUT_MAX, paper_values.INPUT_TOTAL)
-    for names, group in ((paper_values.SUPERVISORS, supervisors), (paper_values.CONTROLLERS, controllers)):
-        for printed in group:
-            assert set(printed.values) == set(names)
-            assert {len(values) for values in printed.values.values()} == {4}
+def test_published_values_cover_four_agents() -> None:
+    """Every published quantity has four agents, and its methods are named in the paper."""
+    supervisors = (paper_values.PUBLISHED_SWITCHES, paper_values.PUBLISHED_DECISION_MS)
+    costs = (paper_values.PUBLISHED_COST_MAX, paper_values.PUBLISHED_COST_TOTAL)
+    controllers = (*costs, paper_values.PUBLISHED_INPUT_MAX, paper_values.PUBLISHED_INPUT_TOTAL)
+    for names, group in ((paper_values.PAPER_SUPERVISORS, supervisors), (paper_values.PAPER_CONTROLLERS, controllers)):
+        for published in group:
+            assert set(published.values) == set(names)
+            assert {len(values) for values in published.values.values()} == {4}
 
 
 def test_latex_is_balanced_and_rectangular(results: list[Result]) -> None:
@@ -196,11 +230,34 @@ def test_latex_escaping(plain: str, escaped: str) -> None:
 def test_html_escapes_and_spans() -> None:
     """Cells are text, groups span their columns."""
     table = Table("t", "c<d", (Column("", "x"), Column("g", "a"), Column("g", "b")), (("<i>", "1", "2"),))
-    text = to_html(table)
+    text = render("table.html", table=table)
     assert "<i>" not in text and "&lt;i&gt;" in text and "c&lt;d" in text
-    assert "colspan=2>g</th>" in text
+    assert 'colspan="2">g</th>' in text
     with pytest.raises(ValueError, match="1 cells in a row of 3"):
         Table("t", "c", table.columns, (("1",),))
+
+
+def test_templates_escape_everything_and_know_every_name() -> None:
+    """None marks text as safe; a value that is not given stops the page."""
+    folder = Path(str(resources.files("marlbc_mj.report")))
+    assert {path.name for path in folder.glob("*.html")} >= {"base.html", "page.html", "seed_page.html", "table.html"}
+    assert not [path.name for path in folder.glob("*.html") if re.search(r"\|\s*safe|autoescape", path.read_text())]
+    with pytest.raises(UndefinedError, match="'table' is undefined"):
+        render("table.html")
+
+
+def test_the_terminal_says_what_the_tables_say(results: list[Result], capsys: pytest.CaptureFixture[str]) -> None:
+    """Heading, aggregation and digits of the table of all metrics; a failure with its reason."""
+    print_results(results)
+    out = capsys.readouterr().out
+    assert "worst agent [s]" in out and "worst agent [m]" in out and "sum [N s]" in out
+    table = make_tables(results, "paper")[0]
+    shown = [k for k, column in enumerate(table.columns) if column.text == "method" or column.text in HEADINGS]
+    assert len(shown) == 1 + len(HEADINGS)
+    for row in table.rows[:3]:
+        (line,) = [line for line in out.splitlines() if row[0] in line]
+        assert [cell.strip() for cell in line.split("│")[1:-1]] == [row[k] for k in shown]
+    assert f"mpcms+sorlc failed: {REASON}" in out
 
 
 def test_failures_appear_in_every_form(results: list[Result]) -> None:
@@ -223,7 +280,7 @@ def scaled(name: str, result: Result, cost: float, violation: float = 0.0) -> Re
 
 
 def test_orders_hold_and_differ_by_the_numbers(results: list[Result]) -> None:
-    """A rival made dearer keeps all printed orders of Tables 5 and 6, one made cheaper none; ties of the paper make none."""
+    """A rival made costlier keeps all published orders of Tables 5 and 6, one made cheaper none; ties of the paper make none."""
     sorlc = results[0]
     for factor, holds in ((2.0, True), (0.5, False)):
         found = claims([sorlc, scaled("scripted+finite-time", sorlc, factor)])
@@ -250,10 +307,10 @@ def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
     cheap = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 0.25), scaled("scripted+lqr", sorlc, 0.125, 1.7)])
     assert "every rival is cheaper: finite-time" in cheap and "(0.25 times)" in cheap
     assert "LQR is the floor" in cheap and "violates the safe distance for 1.70 s" in cheap
-    assert "turns round for finite-time" in cheap
+    assert "is reversed for finite-time" in cheap
     dear = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 1.5), scaled("scripted+lqr", sorlc, 3.0)])
     assert "no rival is cheaper: finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
-    assert "turns round" not in dear and "stands" in dear
+    assert "reversed" not in dear and "stands" in dear
     assert same_actuator(results) == ""
 
 
@@ -264,9 +321,9 @@ def test_limited_rivals_and_lqr_are_a_block_of_their_own(results: list[Result]) 
     labels = [row[0] for row in table.rows]
     assert labels == [
         "sorlc",
-        "MARLBC, printed",
+        "MARLBC, published",
         "finite-time",
-        "finite-time, printed",
+        "finite-time, published",
         "same order",
         "lqr",
         "finite-time-limited",
@@ -347,12 +404,6 @@ def test_envelope_keeps_peaks_and_ends() -> None:
     assert plotting.bin_maxima(time, values, bins=300)[1].max() == 50.0
 
 
-def test_runs_cover_the_sequence() -> None:
-    """Stretches of equal values, end exclusive."""
-    assert list(plotting.runs(np.array([1, 1, 0, 2, 2]))) == [(0, 2, 1), (2, 3, 0), (3, 5, 2)]
-    assert list(plotting.runs(np.array([], dtype=int))) == []
-
-
 def test_figures_are_written_at_their_size(drawn: tuple[Path, list[Path]]) -> None:
     """One column or two wide at 300 dpi; PDFs are small and embed TrueType (Type 42) fonts only."""
     folder, paths = drawn
@@ -390,14 +441,11 @@ def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]]
     """No address but the citation's, figures and video embedded, failures and files named, command escaped."""
     video = tmp_path / "paper.mp4"
     video.write_bytes(b"not really a video")
-    page = write_page(
+    config = {"scenario": paper(), "versions": {"mujoco": "3.17"}, "seed": 7, "git_revision": "abc1234"}
+    page = write_benchmark_page(
         tmp_path / "index.html",
         results=results,
-        scenario=paper(),
-        versions={"mujoco": "3.17"},
-        seed=7,
-        revision="abc1234",
-        command="marlbc bench --out <here>",
+        config={**config, "command": "marlbc bench --out <here>"},
         tables=make_tables(results, "paper"),
         figures=drawn[0],
         video=video,
@@ -407,7 +455,7 @@ def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]]
     assert not re.search(r"(?:src|href)=\"?(?:/|\.\./|file:)|<script|@import|url\(", page)
     assert page.count('src="data:image/png;base64,') == 5 + 3
     assert 'src="data:video/mp4;base64,' in page
-    assert "$" not in re.sub(r"base64,[^\"]*", "", page)
+    assert not re.search(r"\$|{{|{%|{#", re.sub(r"base64,[^\"]*", "", page))
     for text in ("mpcms+sorlc", "abc1234", "--out &lt;here&gt;", 'href="logs/a%20b.mcap"', "scripted+pd", "&lt;limit&gt;"):
         assert text in page
 

@@ -11,12 +11,14 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.disturbances import ConstantWind, PaperDrag
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.report.seed_files import summary, write_csv
+from marlbc_mj.report.seed_files import seed_summary, write_seed_csv
 from marlbc_mj.report.seed_page import write_seed_report
-from marlbc_mj.report.seed_tables import make_tables
-from marlbc_mj.report.table import to_html, to_latex, to_markdown
+from marlbc_mj.report.seed_tables import make_seed_tables
+from marlbc_mj.report.table import to_latex, to_markdown
+from marlbc_mj.report.templates import render
 from marlbc_mj.results.metrics import measure
-from marlbc_mj.results.seed_statistics import analyse, by_supervisor, group
+from marlbc_mj.results.scores import SCORES
+from marlbc_mj.results.seed_statistics import analyse, group, supervisor_of
 from marlbc_mj.results.seeds import (
     CASE_STUDY_PERTURBATION,
     Instance,
@@ -116,7 +118,7 @@ def test_progress_and_rows_grow_with_methods_times_seeds(results: SeedResults, t
     small = run_seeds(paper(duration=0.5), ("scripted",), ("pd", "sorlc"), (5, 6, 7), lambda *step: told.append(step))
     assert told == [(key, k, 3) for key in ("scripted+pd", "scripted+sorlc") for k in (1, 2, 3)]
     for matrix, methods, seeds in ((small, 2, 3), (results, 4, 4)):
-        with write_csv(matrix, tmp_path / "episodes.csv").open(newline="") as file:
+        with write_seed_csv(matrix, tmp_path / "episodes.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
         assert len(rows) == methods * seeds * 4
         assert len({(row["supervisor"], row["controller"], row["seed"], row["agent"]) for row in rows}) == len(rows)
@@ -130,11 +132,11 @@ def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
         assert [run.seed for run in method.failed] == [0, 1, 2] and len(method.runs) == 3
         assert all("world 0, agent" in str(run.failure) and run.violated for run in method.runs)
     methods = analyse(results)
-    content = summary(results, methods, {})
+    content = seed_summary(results, methods, {})
     assert content["methods"]["scripted+pd"]["violation_rate"] == 1.0
     assert set(content["methods"]["scripted+pd"]["failures"]) == {"0", "1", "2"}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
-    return_table, *_, failures = make_tables(results, methods)
+    return_table, *_, failures = make_seed_tables(results, methods)
     assert return_table.rows[1][:2] == ("scripted+sorlc", "failed")
     assert failures.rows[0] == ("scripted+pd", "3/3", "0 to 2")
 
@@ -153,24 +155,24 @@ def test_failures_are_left_out_of_medians_and_count_as_violation_and_loss(failin
     assert half.agents[0]["effort_integral"].value == np.median(kept) and len(kept) == 2
     assert half.violation.value == 0.5 and whole.violation.value == 0.0
     assert half.improvement.value <= 0.5 and whole.improvement == (0.5, 0.5, 0.5)
-    (together,) = group(failing, by_supervisor)
+    (together,) = group(failing, supervisor_of)
     assert (together.name, together.methods, together.draws) == ("scripted", 2, 2)
     assert together.violation.value == 0.25
 
 
 def test_tables_name_who_failed_and_why(failing: SeedResults) -> None:
-    tables = make_tables(failing, analyse(failing))
+    tables = make_seed_tables(failing, analyse(failing))
     assert tables[-1].rows == (("scripted+sorlc", "2/4", "3, 5"),)
     assert "scripted+sorlc on seed 3: seed 3: | 100% of <limit> second line." in tables[-1].notes
     assert tables[1].rows[1][:2] == ("scripted+sorlc", "2/4")
     for table in tables:
         assert r"\toprule" in to_latex(table) and "?" not in to_latex(table)
-        assert "<limit>" not in to_html(table) and "<limit>" not in to_markdown(table)
+        assert "<limit>" not in render("table.html", table=table) and "<limit>" not in to_markdown(table)
 
 
 def test_summary_has_medians_with_intervals_beside_them(results: SeedResults) -> None:
     """Keys are those of one episode, each with ``_ci``; the value of every median is NumPy's own."""
-    content = summary(results, analyse(results), {"mujoco": "3.17"})
+    content = seed_summary(results, analyse(results), {"mujoco": "3.17"})
     assert content["schema"] == 1 and content["seeds"] == [0, 1, 2, 3] and content["reference"] == "scripted+sorlc"
     assert list(content["methods"]) == ["scripted+sorlc", "scripted+pd", "fsams+sorlc", "fsams+pd"]
     for method in results.methods:
@@ -183,14 +185,16 @@ def test_summary_has_medians_with_intervals_beside_them(results: SeedResults) ->
                 values = [run.metrics["agents"][i][key] for run in method.runs]  # type: ignore[index,literal-required]
                 low, high = agent[f"{key}_ci"]
                 assert agent[key] == np.median(values) and min(values) <= low <= agent[key] <= high <= max(values)
+        for name, score in SCORES.items():
+            assert entry["scores"][name]["median"] == np.median([score.read(run.metrics) for run in method.runs if run.metrics])
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
 def test_one_draw_has_no_interval(tmp_path: Path) -> None:
     single = run_seeds(paper(duration=0.5), ("scripted",), ("pd",), seed_range(1))
     methods = analyse(single)
-    assert summary(single, methods, {})["methods"]["scripted+pd"]["team"]["return_ci"] == [None, None]
-    assert "[" not in make_tables(single, methods)[0].rows[0][1]
+    assert seed_summary(single, methods, {})["methods"]["scripted+pd"]["team"]["return_ci"] == [None, None]
+    assert "[" not in make_seed_tables(single, methods)[0].rows[0][1]
     write_seed_report(single, tmp_path, config=CONFIG)
 
 
@@ -223,21 +227,21 @@ def test_a_method_that_cannot_start_is_a_row_on_every_seed(tmp_path: Path) -> No
     assert all("no schedule" in str(run.failure) for run in oracle.runs) and len(oracle.runs) == 2
     assert all("25 ms" in str(run.failure) and run.instance is None for run in unstable.runs)
     statistics = analyse(results)
-    assert [row[:2] for row in make_tables(results, statistics)[-1].rows] == [("oracle+lqr", "2/2"), (unstable.key, "2/2")]
+    assert [row[:2] for row in make_seed_tables(results, statistics)[-1].rows] == [("oracle+lqr", "2/2"), (unstable.key, "2/2")]
     write_seed_report(results, tmp_path, config=CONFIG, figures=False)
     assert "no schedule" in (tmp_path / "tables.md").read_text()
 
 
 def test_captions_flag_too_few_draws(results: SeedResults) -> None:
     """Four draws have intervals that are too narrow, and every table says so."""
-    tables = make_tables(results, analyse(results))
+    tables = make_seed_tables(results, analyse(results))
     assert all("(only 4 draws: intervals are too narrow)" in table.caption for table in tables)
 
 
 def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, failing: SeedResults) -> None:
     """One supervisor with two controllers is one pooled row beside nothing."""
-    assert "seeds-groups" in [table.name for table in make_tables(results, analyse(results))]
-    assert "seeds-groups" not in [table.name for table in make_tables(failing, analyse(failing))]
+    assert "seeds-groups" in [table.name for table in make_seed_tables(results, analyse(results))]
+    assert "seeds-groups" not in [table.name for table in make_seed_tables(failing, analyse(failing))]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Statistics against closed cases: hand arithmetic, binomial quantiles, the coverage that an interval promises."""
 
+from statistics import NormalDist
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,6 @@ from marlbc_mj.results.statistics import (
     mean,
     median,
     paired_improvement,
-    probability_of_improvement,
     rate,
     wilson,
 )
@@ -90,22 +91,14 @@ def test_too_few_runs_have_no_interval() -> None:
     assert np.isnan(bootstrap([np.array([])])).all()
     one = bootstrap([np.array([4.0])])
     assert one.value == 4.0 and np.isnan([one.low, one.high]).all()
-    assert np.isnan(rate([])).all() and np.isnan(probability_of_improvement(np.array([]), np.array([1.0])))
-
-
-def test_probability_of_improvement_by_hand() -> None:
-    """Of the six pairs of {1, 3} and {1, 2, 4}, (3, 1), (3, 2) win and (1, 1) ties: 2.5 / 6."""
-    x, y = np.array([1.0, 3.0]), np.array([1.0, 2.0, 4.0])
-    assert probability_of_improvement(x, y) == pytest.approx(2.5 / 6)
-    assert probability_of_improvement(y, x) == pytest.approx(3.5 / 6)
-    assert probability_of_improvement(x, x) == 0.5
+    assert np.isnan(rate([])).all() and np.isnan(paired_improvement(np.array([]), np.array([]))).all()
 
 
 def test_pairing_removes_what_a_draw_does_to_both() -> None:
     """y = x - 0.1 loses on every draw, though the two samples overlap almost entirely."""
     x = np.random.default_rng(4).normal(size=50)
     assert paired_improvement(x, x - 0.1) == (1.0, 1.0, 1.0)
-    assert 0.45 < probability_of_improvement(x, x - 0.1) < 0.6
+    assert 0.45 < (x[:, None] > (x - 0.1)[None, :]).mean() < 0.6  # over all pairs
 
 
 def test_paired_improvement_counts_ties_half_and_failures_as_losses() -> None:
@@ -125,6 +118,17 @@ def test_wilson_by_hand() -> None:
     width = np.sqrt(10 * z2 + z2**2) / (2 * (10 + z2))
     assert half == pytest.approx((0.5, 0.5 - width, 0.5 + width), abs=1e-12)
     assert rate([True, False, True, True]) == wilson(3, 4)
+
+
+@pytest.mark.parametrize("level", [0.5, 0.9, 0.95, 0.99])
+def test_wilson_is_its_closed_form(level: float) -> None:
+    """(k + z²/2 ± z sqrt(k (n - k) / n + z²/4)) / (n + z²) for every k of n = 1, 2, 7, 50, 1000, cut off at 0 and 1."""
+    z = NormalDist().inv_cdf(0.5 + level / 2.0)
+    for n in (1, 2, 7, 50, 1000):
+        for k in range(0, n + 1, max(1, n // 50)):
+            half = z * np.sqrt(k * (n - k) / n + z * z / 4.0)
+            low, high = ((k + z * z / 2.0 + sign * half) / (n + z * z) for sign in (-1.0, 1.0))
+            assert wilson(k, n, level=level) == pytest.approx((k / n, max(0.0, low), min(1.0, high)), abs=1e-12)
 
 
 def test_wilson_bounds_solve_its_quadratic() -> None:

@@ -17,6 +17,7 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.policies.checkpoint import read_arrays, signature, write_arrays, write_policy
 from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.results.metrics import Metrics, measure
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.config import TrainConfig
@@ -236,8 +237,8 @@ def scores(metrics: Metrics) -> Row:
     return {
         "return": metrics["team"]["return"],
         **{f"switches_{i + 1}": float(a["switches"]) for i, a in enumerate(agents)},
-        "violation_time": max(a["violation_time"] for a in agents),
-        "clearance_min": min(a["clearance_min"] for a in agents),
+        "violation_time": SCORES["violation_time_worst"].read(metrics),
+        "clearance_min": SCORES["clearance_min_worst"].read(metrics),
     }
 
 

@@ -7,6 +7,8 @@ from typing import Any
 
 from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.shipped import FOLDER
+from marlbc_mj.report.table import pipe_table
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.training.config import METHODS, flat_settings, make_config
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file, write_json
@@ -14,6 +16,7 @@ from marlbc_mj.util.provenance import plain_data
 
 CHOICE = {"commands": "one of the commands", "orders": "one of all orders", "avoidance": "formation with or without avoidance"}
 """What is chosen from an action set."""
+_SAFETY = ("violation_time_worst", "clearance_min_worst")
 
 
 def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
@@ -63,19 +66,20 @@ def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> 
         f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
         f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {description['cpu']}.",
         f"- On the case study: return {evaluation['return']:.0f}, switches {switches}, "
-        f"violation {evaluation['violation_time']:.3f} s, least clearance {evaluation['clearance_min']:.3f} m.",
+        f"violation of the worst agent {evaluation['violation_time']:.3f} s, "
+        f"least clearance {evaluation['clearance_min']:.3f} m.",
         f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
         "",
-        "| mission steps | return | switches | violation [s] | least clearance [m] |",
-        "|---:|---:|---|---:|---:|",
+        pipe_table(("mission steps", "return", "switches", *(SCORES[name].label for name in _SAFETY)), list(map(_cells, rows))),
     ]
-    for row in rows:
-        counts = "/".join(f"{float(value):.0f}" for key, value in row.items() if key.startswith("switches_"))
-        lines.append(
-            f"| {float(row['mission_steps']):.0f} | {float(row['return']):.0f} | {counts} | {float(row['violation_time']):.3f} "
-            f"| {float(row['clearance_min']):.3f} |"
-        )
     return "\n".join(lines) + "\n"
+
+
+def _cells(row: dict[str, str]) -> tuple[str, ...]:
+    """One evaluation as a row of the card's table."""
+    counts = "/".join(f"{float(value):.0f}" for key, value in row.items() if key.startswith("switches_"))
+    violation, clearance = (f"{float(row[key]):.3f}" for key in ("violation_time", "clearance_min"))
+    return (f"{float(row['mission_steps']):.0f}", f"{float(row['return']):.0f}", counts, violation, clearance)
 
 
 def _settings(train: dict[str, object]) -> list[str]:

@@ -20,6 +20,7 @@ from marlbc_mj.cli.study import Study
 from marlbc_mj.cli.terminal import prepare_gl
 from marlbc_mj.cli.training import Train
 from marlbc_mj.util.errors import MarlbcError
+from marlbc_mj.util.text import one_line
 
 Command = (
     Annotated[Bench, subcommand("bench")]
@@ -87,8 +88,8 @@ def _one_line(box: str) -> str:
             kept.append(part)
         elif part.startswith("Perhaps you meant"):
             kept.append("perhaps " + ", ".join(dict.fromkeys(re.findall(r"^--[\w-]+", part, re.MULTILINE))))
-    advice = re.search(r"marlbc[\w -]* --help", " ".join(parts[-1].split()))
+    advice = re.search(r"marlbc[\w -]* --help", one_line(parts[-1]))
     if advice:
         kept.append(f"see `{advice[0]}`")
-    text = "; ".join(" ".join(part.split()).rstrip(".:") for part in kept)
+    text = "; ".join(one_line(part).rstrip(".:") for part in kept)
     return re.sub(r" ([.,])", r"\1", text)

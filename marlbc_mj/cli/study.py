@@ -186,7 +186,7 @@ def run_job(job: Job, say: Say, stopping: Callable[[], bool] = lambda: False) ->
         share = min(1.0, trainer.steps / job.config.budget)
         if int(10 * share) > tenth:
             tenth = int(10 * share)
-            scores = f"return {row['return']:.0f}, violation {row['violation_time']:.2f} s"
+            scores = f"return {row['return']:.0f}, violation of the worst agent {row['violation_time']:.2f} s"
             say(f"{job.key}: {share:4.0%}, {trainer.steps / 1e6:.2f} M steps, {scores}")
 
     (folder / FAILED).unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""What the command line shows on the terminal: progress bars and results; and the choice of a renderer before all else."""
+"""What the command line shows on the terminal, progress bars and results, and the choice of a renderer before anything else."""
 
 import os
 import sys
@@ -8,11 +8,18 @@ from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError
 
-LEAST_WIDTH = 112  # of the table of results [characters]
+LEAST_WIDTH = 112  # least width of the table of results [characters]
 
 
 def prepare_gl(strict: bool) -> None:
-    """See to it, before MuJoCo is imported, that a MUJOCO_GL that does not work stops only what renders."""
+    """Make sure, before MuJoCo is imported, that a MUJOCO_GL that does not work stops only the commands that render.
+
+    Args:
+        strict: the command renders, so that it must stop.
+
+    Raises:
+        ConfigurationError: ``strict``, and no renderer works.
+    """
     if not strict and "MUJOCO_GL" not in os.environ:
         return
     from marlbc_mj.recording.gl import choose_gl
@@ -55,26 +62,25 @@ def progress_bars() -> Iterator[Callable[[str, float, float], None]]:
 
 
 def print_results(results: list[Any]) -> None:
-    """A table with one line a method (:class:`~marlbc_mj.results.summary.Result`), and why a method failed."""
+    """A table with one line per method (:class:`~marlbc_mj.results.summary.Result`), and why a method failed."""
     from rich.console import Console
     from rich.table import Column, Table
+    from rich.text import Text
 
-    names = ("method", "return", "switches", "violation s", "clearance m", "effort N s")
-    table = Table(*(Column(name, no_wrap=True) for name in names))
+    from marlbc_mj.report.formats import score_cell, score_column
+    from marlbc_mj.results.scores import switches_text
+
+    shown = ("return", "violation_time_worst", "clearance_min_worst", "effort_integral_sum")
+    columns = [score_column(name) for name in shown]
+    heads = [f"{column.group}\n{column.second}" for column in columns]
+    heads.insert(1, "switches\neach agent")
+    table = Table(*(Column(Text(head), no_wrap=True) for head in ("method", *heads)))  # Text: [m] is no markup
     for result in results:
-        key = result.key
         if result.metrics is None:
-            table.add_row(key, "failed")
+            table.add_row(result.key, "failed")
             continue
-        agents, team = result.metrics["agents"], result.metrics["team"]
-        table.add_row(
-            key,
-            f"{team['return']:.0f}",
-            "/".join(str(a["switches"]) for a in agents),
-            f"{sum(a['violation_time'] for a in agents):.2f}",
-            f"{min(a['clearance_min'] for a in agents):.3f}",
-            f"{sum(a['effort_integral'] for a in agents):.0f}",
-        )
+        first, *others = (score_cell(name, result.metrics) for name in shown)
+        table.add_row(result.key, first, switches_text(result.metrics), *others)
     console = Console()
     Console(width=max(console.width, LEAST_WIDTH)).print(table)
     for result in results:
@@ -84,7 +90,7 @@ def print_results(results: list[Any]) -> None:
 
 @contextmanager
 def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
-    """Progress of a training run: mission steps, rate, time left and the last evaluation; a line an evaluation elsewhere."""
+    """Progress of a training run: mission steps, rate, time left and the last evaluation; elsewhere a line per evaluation."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -104,7 +110,7 @@ def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
         def update(trainer: Any, row: dict[str, float]) -> None:
             nonlocal seen
             switches = "/".join(f"{value:.0f}" for name, value in row.items() if name.startswith("switches_"))
-            last = f"return {row['return']:.0f}  switches {switches}  violation {row['violation_time']:.2f} s"
+            last = f"return {row['return']:.0f}  switches {switches}  violation of the worst agent {row['violation_time']:.2f} s"
             if row["mission_steps"] != seen:
                 seen = row["mission_steps"]
                 console.print(f"{seen / 1e6:6.2f} M steps {row['wall_s']:6.0f} s  {last}", highlight=False)

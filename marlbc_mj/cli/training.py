@@ -58,7 +58,7 @@ class Train:
         switches = "/".join(f"{value:.0f}" for name, value in best.items() if name.startswith("switches_"))
         print(
             f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps and {best['wall_s']:.0f} s: "
-            f"return {best['return']:.0f}, switches {switches}, violation {best['violation_time']:.3f} s"
+            f"return {best['return']:.0f}, switches {switches}, violation of the worst agent {best['violation_time']:.3f} s"
         )
         print(f"{folder / 'checkpoint'} holds the best and the last policy")
 

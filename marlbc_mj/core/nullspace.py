@@ -79,11 +79,3 @@ def _length(vector):  # type: ignore[no-untyped-def]
     for axis in range(vector.shape[0]):
         square += vector[axis] * vector[axis]
     return np.sqrt(square)
-
-
-def projector(stack: np.ndarray) -> np.ndarray:
-    """N = I - A^+ A for a stack of Jacobians, (m, n) -> (n, n); the textbook form, for analysis and tests.
-
-    It drops directions relative to the largest singular value, :func:`compose` relative to each row's own length.
-    """
-    return np.asarray(np.eye(stack.shape[1]) - np.linalg.pinv(stack, rcond=RANK_TOLERANCE) @ stack)

@@ -11,17 +11,19 @@ from matplotlib.patches import Circle
 
 from marlbc_mj.core.motion import moved, nearest_places
 from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.util.palette import command_color
+from marlbc_mj.util.stretches import stretches
 
 _MARGIN = (0.16, 0.06)  # left and right, above and below everything that happens: room for the agents' numbers [in]
 _POINT = 0.35  # radius at which a point obstacle is drawn [m]
-_VIOLATION = "#1A1A1A"  # casing of a path
+_VIOLATION = "#1A1A1A"  # color of the casing of a path in violation
 
 
 def trajectories(episodes: Sequence[Trajectory]) -> Figure:
-    """Paths of all agents: one episode over both columns, several as panels of one column's width, two a row."""
+    """Paths of all agents: one episode over both columns of text, several as panels of one column's width, two per row."""
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
     margins = pl.Margins(left=0.5, right=0.05, top=0.3 if columns == 1 else 0.42, across=0.12, between=0.3)
@@ -49,7 +51,7 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
 
 
 def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float, float, float]:
-    """x and y limits [m] that hold every path and every obstacle's safe-distance ring, for a panel of ``width`` [in]."""
+    """x and y limits [m] around every path and every obstacle's ring of the safe distance, for a panel of ``width`` [in]."""
     points = np.concatenate([e.position.reshape(-1, 2) for e in episodes])
     rings = np.concatenate([_discs(e) for e in episodes])
     reach = rings[:, 2:] + episodes[0].scenario.safe_distance
@@ -82,11 +84,11 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
     points = episode.position[::every]  # (M + 1, N, 2)
     for i in range(points.shape[1]):
         _draw_violation(axes, episode, i, 2.4 * width)
-        stretches = list(pl.runs(episode.command[:, i]))
+        bands = list(stretches(episode.command[:, i]))
         axes.add_collection(
             LineCollection(
-                [points[start : end + 1, i] for start, end, _ in stretches],
-                colors=[command_color(commands[value]) for _, _, value in stretches],
+                [points[start : end + 1, i] for start, end, _ in bands],
+                colors=[command_color(commands[value]) for _, _, value in bands],
                 linewidths=width,
                 capstyle="round",
             )
@@ -97,11 +99,11 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
 
 
 def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -> None:
-    """A dark casing around the stretches with a clearance of at most the safe distance."""
+    """A dark casing around those parts of a path that are in violation."""
     path = episode.position[1:, agent]
-    violated = episode.clearances()[:, agent] <= episode.scenario.safe_distance
+    violated = violates(episode.clearances()[:, agent], episode.scenario.safe_distance)
     every = max(1, episode.scenario.substeps // 2)
-    bands = [path[start : end + every : every] for start, end, value in pl.runs(violated.astype(int)) if value]
+    bands = [path[start : end + every : every] for start, end, value in stretches(violated.astype(int)) if value]
     axes.add_collection(LineCollection(bands, colors=_VIOLATION, linewidths=width, zorder=1.5))
 
 
@@ -114,7 +116,7 @@ def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
     distance = episodes[0].scenario.safe_distance
     handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2)), label=f"safe distance {distance:g} m"))
     if any(len(e.motions) for e in episodes):
-        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="way of an obstacle, drawn where it came nearest"))
-    if any((e.clearances() <= distance).any() for e in episodes):
+        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="path of an obstacle, drawn where it came nearest"))
+    if any(violates(e.clearances(), distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
     pl.legend_above(figure, handles)

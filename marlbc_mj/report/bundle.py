@@ -6,7 +6,7 @@ from typing import Any
 
 from marlbc_mj.report.figures import write_figures
 from marlbc_mj.report.findings import same_actuator
-from marlbc_mj.report.page import write_page
+from marlbc_mj.report.page import files_beside, write_benchmark_page
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
 from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.util.files import write_json
@@ -24,6 +24,8 @@ def write_report(
     """Write summary.json, episodes.csv, tables.md, tables.tex, figures/ and index.html; returns the page's path.
 
     Args:
+        results: one per method.
+        folder: is there already.
         config: of the run: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``, as config.json has them.
         videos: in ``folder``; the first one is embedded in the page, the others linked.
         figures: False leaves the figures out.
@@ -37,25 +39,13 @@ def write_report(
     (folder / "tables.tex").write_text(latex_document(tables, paragraph), encoding="utf-8")
     if figures:
         write_figures(results, folder / "figures", lambda done, total: progress("figures", done, total) if progress else None)
-    return write_page(
+    return write_benchmark_page(
         folder / "index.html",
         results=results,
-        scenario=scenario,
-        versions=config["versions"],
-        seed=config["seed"],
-        revision=config["git_revision"],
-        command=config["command"],
+        config=config,
         tables=tables,
-        paragraph=paragraph,
         figures=folder / "figures",
+        paragraph=paragraph,
         video=videos[0] if videos else None,
         links=files_beside(folder, videos[1:]),
     )
-
-
-def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
-    """What lies beside the page and is worth a link."""
-    names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
-    files = [folder / name for name in names if (folder / name).exists()]
-    figures = [folder / "figures"] if (folder / "figures").is_dir() else []
-    return [*files, *figures, *sorted((folder / "logs").glob("*.mcap")), *videos]

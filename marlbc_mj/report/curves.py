@@ -12,6 +12,7 @@ from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.util.palette import command_color
+from marlbc_mj.util.stretches import stretches
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
@@ -21,13 +22,13 @@ _FLAT = 1e-9  # relative change below which a weight counts as constant
 _SMALL_WEIGHT = 1e-2  # smaller norms are drawn in units of a power of ten
 
 _SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "va": "center_baseline", "annotation_clip": False}
-"""Text beside a strip."""
+"""Options of the text beside a strip."""
 
 
 def priorities(episodes: Sequence[Trajectory]) -> Figure:
-    """Each agent's command over time, color and height of the strip being those of its highest behavior.
+    """Each agent's command over time: color and height of a strip show its highest behavior.
 
-    One episode fills one column of text, several are panels, two a row.
+    One episode fills one column of text; several are panels, two per row.
     """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
@@ -47,7 +48,7 @@ def priorities(episodes: Sequence[Trajectory]) -> Figure:
 
 
 def _hide_rest(panels: np.ndarray, used: int) -> None:
-    """Hide panels beyond ``used`` and label the time axis of the lowest one left in every column."""
+    """Hide the panels beyond ``used``, and label the time axis of the lowest visible one in every column."""
     for axes in panels.flat[used:]:
         axes.set_visible(False)
     for column in range(panels.shape[1]):
@@ -68,7 +69,7 @@ def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
     for i in range(agents):
         base = (agents - 1 - i) * _LANE
         bars: dict[str, list[tuple[float, float]]] = {head: [] for head in heads}
-        for start, end, value in pl.runs(trajectory.command[:, i]):
+        for start, end, value in stretches(trajectory.command[:, i]):
             bars[commands[value].split(SEPARATOR)[0]].append((start * step, (end - start) * step))
         for head, spans in bars.items():
             axes.broken_barh(spans, (base, height[head]), color=command_color(head), linewidth=0.2, snap=False)
@@ -82,16 +83,16 @@ def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def _rank(trajectory: Trajectory) -> Callable[[str], int]:
-    """Formation first, then column, then whatever else, so that avoidance stands highest."""
+    """Sort key of the strips' heights: formation lowest, then column, then the others, so that avoidance is highest."""
     known = trajectory.scenario.formation_names
     return lambda head: known.index(head) if head in known else len(known)
 
 
 def forces(trajectory: Trajectory) -> Figure:
-    """The applied force, one row an agent: both axes over the episode, and both around the wildest two seconds.
+    """The applied force, one row per agent: both axes over the episode, and both in the two seconds in which it changes most.
 
-    Over the episode, light bands hold every sample and dark lines are means of 500 bins, so that a chattering force shows what
-    it amounts to; the limit is dashed.
+    Over the episode, light bands hold every sample and dark lines are means of 500 bins, so that the mean of a
+    chattering force is visible; the limit is dashed.
     """
     agents, limit = trajectory.scenario.agents, trajectory.scenario.force_limit
     margins = pl.Margins(left=0.56, top=0.24, bottom=0.36)
@@ -122,19 +123,19 @@ def forces(trajectory: Trajectory) -> Figure:
 
 
 def busiest(trajectory: Trajectory) -> slice:
-    """The window in which the forces of all agents change most, in total variation over the episode's largest magnitude."""
+    """The window of two seconds in which the total variation of all agents' forces is largest."""
     size = min(len(trajectory.time), max(2, round(_ZOOM / trajectory.scenario.substep)))
     change = np.abs(np.diff(trajectory.force, axis=0)).sum(axis=(1, 2))
     total = np.concatenate([[0.0], np.cumsum(change)])
     start = int((total[size - 1 :] - total[: len(total) - size + 1]).argmax())
-    start = max(0, start - size // 20)  # a little before, so that the first edge is seen
+    start = max(0, start - size // 20)  # a little earlier, so that the first edge is visible
     return slice(start, start + size)
 
 
 def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
-    """One agent's force, one column a framework, each on its own scale; the limit is dashed.
+    """One agent's force, one column per framework, each on its own scale; the limit is dashed.
 
-    Two rows show the axes over the episode, the third both of them around the largest force of all these episodes.
+    Two rows show the axes over the episode; the third shows both around the largest force of all these episodes.
     """
     margins = pl.Margins(left=0.5, top=0.24, across=0.52, between=0.42)
     figure, panels = pl.panels(pl.DOUBLE, 3.9, 3, len(episodes), margins, sharex="row", sharey="col")
@@ -173,7 +174,7 @@ def _draw_pulse(axes: Axes, episode: Trajectory, agent: int, peak: float) -> Non
 
 
 def errors(trajectory: Trajectory) -> Figure:
-    """Tracking errors of every agent on logarithmic axes, cut off where they vanish; decimated to each bin's largest."""
+    """Tracking errors of every agent on logarithmic axes, cut off where they vanish; decimated to the largest of each bin."""
     figure, panels = pl.panels(pl.SINGLE, 3.1, 2, 1, pl.Margins(left=0.56, between=0.12), sharex=True)
     pairs = (
         (trajectory.position[:-1] - trajectory.reference, r"$\|e_p\|$ [m]"),
@@ -202,7 +203,9 @@ def weight_norms(trajectory: Trajectory) -> Figure:
 
 
 def weight_errors(trajectory: Trajectory) -> Figure:
-    """Frobenius norms of their distance from the values at the end: ideal weights, which the paper subtracts, are unknown.
+    """Frobenius norms of the distance of SORLC's weights from their values at the end.
+
+    The paper subtracts ideal weights instead, which are unknown.
 
     Raises:
         ValueError: the controller's state is not SORLC's.
@@ -246,7 +249,7 @@ def has_weights(trajectory: Trajectory) -> bool:
 
 
 def flat_after(trajectory: Trajectory) -> float:
-    """Time from which neither actor nor critic changes any more, beyond rounding [s]; about the duration if they do."""
+    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they always do."""
     read, last = network_weights(trajectory), 0
     for matrix in (read.actor, read.critic):
         norms = np.linalg.norm(matrix, axis=(-2, -1))

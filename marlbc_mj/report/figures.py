@@ -1,6 +1,7 @@
-"""Which figures a run allows, under the paper's numbers where it has them, and how they are written."""
+"""The figures that a run allows, numbered as in the paper where it has them, and how they are written."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,13 +21,13 @@ from marlbc_mj.report.curves import (
     weight_norms,
 )
 from marlbc_mj.report.formats import listed
+from marlbc_mj.report.paper_tables import one_per_controller, one_per_supervisor
 from marlbc_mj.report.pareto import coincident, pareto
-from marlbc_mj.report.printed import by_controller, by_supervisor
 from marlbc_mj.results.summary import Result
 
 FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
-"""Of Figures 8 and 9."""
-_AGENT = 3  # agent 4, of Figure 9
+"""Controllers of the frameworks in Figures 8 and 9."""
+_AGENT = 3  # index of the agent in Figure 9
 
 _PATHS = "colored by the highest behavior in force; black casing: inside the safe distance."
 _STRIPS = (
@@ -57,8 +58,8 @@ class Plot(NamedTuple):
 def plots(results: Sequence[Result]) -> list[Plot]:
     """Every figure that these results allow: the paper's, the comparison, then those of each method.
 
-    Paths and priorities belong to a supervisor and are drawn once for each, with SORLC where it ran; tracking errors and forces
-    of every method, weights where they keep changing.
+    Paths and priorities belong to a supervisor and are drawn once for each, with SORLC where it ran. Tracking errors and forces
+    are drawn for every method, weights where they keep changing.
     """
     ran = [result for result in results if result.metrics is not None]
     return _paper(ran) + _comparison(ran) + _methods(ran)
@@ -66,45 +67,54 @@ def plots(results: Sequence[Result]) -> list[Plot]:
 
 def _paper(results: Sequence[Result]) -> list[Plot]:
     """Figures 2 to 9; those of one method only where that method ran, those of several with the ones that did."""
-    supervisors = [r.trajectory for r in by_supervisor(results).values() if r.trajectory]
-    under, supervisor = by_controller(results)
+    supervisors = [r.trajectory for r in one_per_supervisor(results).values() if r.trajectory]
+    under, supervisor = one_per_controller(results)
     laws = {name: r.trajectory for name, r in under.items() if r.trajectory}
+    return _supervisor_figures(supervisors) + _controller_figures(laws, supervisor) + _framework_figures(laws)
+
+
+def _supervisor_figures(episodes: Sequence[Trajectory]) -> list[Plot]:
+    """Figures 2 and 3, if there is something to compare."""
+    if len(episodes) < 2:
+        return []
+    paths = f"Figure 2: paths under each supervisor, {_PATHS}"
+    strips = f"Figure 3: behavior priorities of each supervisor; {_STRIPS}"
+    return [
+        Plot("figure2_trajectories_supervisors", paths, partial(trajectories, episodes)),
+        Plot("figure3_priorities_supervisors", strips, partial(priorities, episodes)),
+    ]
+
+
+def _controller_figures(laws: Mapping[str, Trajectory], supervisor: str) -> list[Plot]:
+    """Figures 4 to 7: weights of SORLC, tracking errors of SORLC and RLC."""
     found = []
-    if len(supervisors) > 1:
-        found.append(
-            Plot(
-                "figure2_trajectories_supervisors",
-                f"Figure 2: paths under each supervisor, {_PATHS}",
-                lambda: trajectories(supervisors),
-            )
-        )
-        found.append(
-            Plot(
-                "figure3_priorities_supervisors",
-                f"Figure 3: behavior priorities of each supervisor; {_STRIPS}",
-                lambda: priorities(supervisors),
-            )
-        )
     if "sorlc" in laws:
         own = laws["sorlc"]
-        found.append(Plot("figure4_weights_sorlc", f"Figure 4: {weights_caption(own)}", lambda: weight_norms(own)))
+        found.append(Plot("figure4_weights_sorlc", f"Figure 4: {weights_caption(own)}", partial(weight_norms, own)))
         text = (
             "Figure 5: distance of SORLC's weights from their values at the end (Frobenius norm). The paper subtracts ideal "
             "weights, which nobody knows."
         )
-        found.append(Plot("figure5_weight_errors_sorlc", text, lambda: weight_errors(own)))
+        found.append(Plot("figure5_weight_errors_sorlc", text, partial(weight_errors, own)))
     for number, name in ((6, "sorlc"), (7, "rlc")):
         if name in laws:
             text = f"Figure {number}: tracking errors of {name} under the {supervisor} supervisor, each pixel column its largest."
-            found.append(Plot(f"figure{number}_tracking_{name}", text, lambda e=laws[name]: errors(e), narrow=True))  # type: ignore[misc]
-    three = [laws[name] for name in FRAMEWORKS if name in laws]
-    if len(three) > 1:
-        text = f"Figure 8: paths with each framework's controller, {_PATHS}"
-        found.append(Plot("figure8_trajectories_frameworks", text, lambda: trajectories(three)))
-        agent = min(_AGENT, three[0].scenario.agents - 1)
-        text = f"Figure 9: force of agent {agent + 1} {_CONTROL}"
-        found.append(Plot(f"figure9_control_agent{agent + 1}_frameworks", text, lambda: control(three, agent)))
+            found.append(Plot(f"figure{number}_tracking_{name}", text, partial(errors, laws[name]), narrow=True))
     return found
+
+
+def _framework_figures(laws: Mapping[str, Trajectory]) -> list[Plot]:
+    """Figures 8 and 9, if there is something to compare."""
+    three = [laws[name] for name in FRAMEWORKS if name in laws]
+    if len(three) < 2:
+        return []
+    agent = min(_AGENT, three[0].scenario.agents - 1)
+    paths = f"Figure 8: paths with each framework's controller, {_PATHS}"
+    pulses = f"Figure 9: force of agent {agent + 1} {_CONTROL}"
+    return [
+        Plot("figure8_trajectories_frameworks", paths, partial(trajectories, three)),
+        Plot(f"figure9_control_agent{agent + 1}_frameworks", pulses, partial(control, three, agent)),
+    ]
 
 
 def _comparison(results: Sequence[Result]) -> list[Plot]:
@@ -115,7 +125,7 @@ def _comparison(results: Sequence[Result]) -> list[Plot]:
 
 
 def _methods(results: Sequence[Result]) -> list[Plot]:
-    shown = {result.key for result in by_supervisor(results).values()}
+    shown = {result.key for result in one_per_supervisor(results).values()}
     found = []
     for result in results:
         if result.trajectory is not None:
@@ -140,7 +150,7 @@ def _method(result: Result, trajectory: Trajectory, supervisor: bool) -> list[Pl
 
 
 def weights_caption(trajectory: Trajectory) -> str:
-    """What the weights show, and since when they show nothing any more."""
+    """The caption of a figure of weights, which says from when on they no longer change."""
     text, flat = "Frobenius norms of the network weights.", flat_after(trajectory)
     if flat >= 0.5 * trajectory.scenario.duration:
         return text
@@ -160,13 +170,13 @@ def write_figures(results: Sequence[Result], folder: Path, progress: Callable[[i
     jobs = plots(results)
     paths: list[Path] = []
     for done, plot in enumerate(jobs, start=1):
-        paths += save(plot.draw, folder / plot.stem)
+        paths += save_figure(plot.draw, folder / plot.stem)
         if progress is not None:
             progress(done, len(jobs))
     return paths
 
 
-def save(draw: Callable[[], Figure], stem: Path) -> list[Path]:
+def save_figure(draw: Callable[[], Figure], stem: Path) -> list[Path]:
     """Draw a figure in the common style and write ``stem``.pdf and .png; the same figure gives the same bytes."""
     paths = [stem.with_name(stem.name + suffix) for suffix in (".pdf", ".png")]
     with pl.style():

@@ -3,12 +3,30 @@
 import math
 from collections.abc import Sequence
 
+from marlbc_mj.report.table import Column
+from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.statistics import Estimate
 
 DASH = "–"
 FAILED = "failed"
-COST_SCALE = 1e-4
-"""Costs are tabulated in units of 1e4."""
+
+
+def score_column(name: str) -> Column:
+    """The column of a score: quantity, aggregation and unit."""
+    return Column(*SCORES[name][:3])
+
+
+def score_cell(name: str, metrics: Metrics) -> str:
+    """A score of one episode, in the unit and with the decimals of its column."""
+    score = SCORES[name]
+    return fixed(score.factor * score.read(metrics), score.digits)
+
+
+def score_interval(name: str, estimate: Estimate) -> str:
+    """An estimate of a score, in the unit and with the decimals of its column."""
+    score = SCORES[name]
+    return interval(scaled(estimate, score.factor), score.digits)
 
 
 def fixed(value: float, digits: int) -> str:
@@ -38,20 +56,25 @@ def interval(estimate: Estimate, digits: int) -> str:
 
 
 def loose_interval(estimate: Estimate) -> str:
-    """The same with three significant digits."""
+    """``value [low, high]`` with three significant digits."""
     if not math.isfinite(estimate.value):
         return DASH
     ends = f" [{significant(estimate.low)}, {significant(estimate.high)}]"
     return significant(estimate.value) + ("" if math.isnan(estimate.low) else ends)
 
 
+def scaled(estimate: Estimate, factor: float) -> Estimate:
+    """An estimate in another unit."""
+    return Estimate(*(factor * value for value in estimate))
+
+
 def percent(estimate: Estimate) -> Estimate:
-    """A share as per cent."""
-    return Estimate(*(100.0 * value for value in estimate))
+    """A share in per cent."""
+    return scaled(estimate, 100.0)
 
 
 def spans(numbers: Sequence[int]) -> str:
-    """Whole numbers as spans of three and more, 0, 2, 3, 4, 6, 7 as ``0, 2 to 4, 6, 7``."""
+    """Whole numbers, three and more in a row as a span: ``0, 2 to 4, 6, 7``."""
     numbers = sorted(numbers)
     starts = [k for k, n in enumerate(numbers) if k == 0 or n != numbers[k - 1] + 1]
     pieces = [numbers[a:b] for a, b in zip(starts, [*starts[1:], len(numbers)], strict=True)]

@@ -1,123 +1,164 @@
 """index.html: the whole report as one page that needs no other file and no network."""
 
 import base64
-import html
 import io
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from importlib.resources import files
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from string import Template
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 from PIL import Image
 
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.figures import Plot, plots
-from marlbc_mj.report.table import Table, to_html
+from marlbc_mj.report.formats import score_cell
+from marlbc_mj.report.table import Table
+from marlbc_mj.report.templates import render
+from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
 
 LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]
 _SINGLE_PIXELS = 1200  # PNGs narrower than this fill one column only
-_READING = """
-<p>Every method is a <em>supervisor</em>, which picks each agent's behavior priorities at every mission step, and a
-<em>controller</em>, which turns the resulting reference into a force at every physics step. Supervisors are compared under one
-controller, controllers under one supervisor, on the same physics with the same force limit unless a name says otherwise.</p>
-<p>Look at safety first: the violation time counts every moment inside the safe distance, and a negative clearance
-is a collision. Only among safe methods do return, switches and cost mean much: a soft controller is cheap and may still be
-unsafe, so no single column ranks the methods. The return does not see how deep or how long a violation is at one place;
-violation time does. Decision times depend on the machine, ratios between methods less so.</p>"""
-_PAPER_TEXT = (
-    "Our numbers stand beside the printed ones. Reconstructed rivals cannot match digit for digit, so one row of each table says "
-    "whether the methods keep the printed order; values under an erratum are marked and compared by order only."
-)
-_OWN_TEXT = "This is not the paper's scenario, so no printed numbers are shown beside ours."
 
 
-def write_page(
+class Picture(NamedTuple):
+    """An embedded figure."""
+
+    caption: str
+    width: int  # [CSS pixels]
+    height: int  # [CSS pixels]
+    source: str  # data URL
+    narrow: bool  # one column of text
+
+
+class Link(NamedTuple):
+    """A file beside the page."""
+
+    name: str  # path relative to the page
+    address: str  # the same as a URL
+
+
+class EmbeddedVideo(NamedTuple):
+    """An mp4: its data URL, or for a large one a link."""
+
+    source: str
+    link: Link
+    megabytes: int
+
+
+class MethodSection(NamedTuple):
+    """A folding section of one method."""
+
+    key: str
+    facts: str
+    failed: bool = False
+    narrow: Sequence[Picture] = ()
+    wide: Sequence[Picture] = ()
+
+
+def write_benchmark_page(
     path: Path,
     *,
     results: Sequence[Result],
-    scenario: Scenario,
-    versions: Mapping[str, str],
-    seed: int,
-    revision: str,
-    command: str,
+    config: Mapping[str, Any],
     tables: Sequence[Table],
     figures: Path,
     paragraph: str = "",
     video: Path | None = None,
     links: Sequence[Path] = (),
 ) -> Path:
-    """Write the page.
+    """Write the page of a benchmark.
 
     Args:
         path: the file to write.
-        revision: of the sources, as git names it.
-        command: what makes this report again.
+        results: in the order in which methods are shown.
+        config: of the run: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``.
         tables: as :func:`marlbc_mj.report.tables.make_tables` gives them, the one of all metrics first.
-        paragraph: of plain text, shown above the tables.
         figures: folder that :func:`marlbc_mj.report.figures.write_figures` wrote to; figures that are not there are left out.
+        paragraph: plain text, shown above the tables.
         video: an mp4 to embed, or to link to beyond 20 MB.
         links: files to list, linked relative to the page.
     """
-    text = _PAPER_TEXT if scenario.name == paper_values.SCENARIO else _OWN_TEXT
-    drawn = plots(results)
-    overall = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in drawn if p.method is None)
+    scenario, drawn = config["scenario"], plots(results)
+    failed = [(result.key, str(result.failure)) for result in results if result.metrics is None]
+    facts = [
+        *scenario_facts(scenario),
+        ("Limits", f"force {scenario.force_limit:g} N per axis, safe distance {scenario.safe_distance:g} m"),
+        ("Methods", f"{len(results) - len(failed)} ran, {len(failed)} failed"),
+        ("Seed", str(config["seed"])),
+        *origin_facts(config),
+    ]
     return fill_page(
         path,
+        "page.html",
+        links,
         title=f"Behavioral control benchmark: {scenario.name}",
         lead=_lead(results, scenario),
-        facts=_facts(results, scenario, versions, seed, revision),
-        command=command,
-        failures=_failures(results),
-        overview=to_html(tables[0]) if tables else "",
-        paper=f"<p>{text}</p>" + (f"<p>{html.escape(paragraph)}</p>" if paragraph else "") + "".join(map(to_html, tables[1:])),
-        comparisons=overall or "<p>Not drawn.</p>",
-        video=video,
-        methods="".join(_method(r, drawn, figures, " open" if k == 0 else "") for k, r in enumerate(results)),
-        reading=_READING,
-        links=links,
+        facts=facts,
+        command=config["command"],
+        failures=failed,
+        tables=tables,
+        of_paper=scenario.name == paper_values.SCENARIO,
+        paragraph=paragraph,
+        pictures=_pictures(figures, [p for p in drawn if p.method is None]),
+        video=_video(video, path.parent) if video else None,
+        methods=[_method(result, [p for p in drawn if p.method == result.key], figures) for result in results],
     )
 
 
-def fill_page(
-    path: Path,
-    *,
-    title: str,
-    lead: str,
-    facts: Iterable[tuple[str, str]],
-    command: str,
-    overview: str,
-    paper: str,
-    comparisons: str,
-    methods: str,
-    reading: str,
-    links: Sequence[Path],
-    failures: str = "",
-    video: Path | None = None,
-) -> Path:
-    """Write one page; ``title``, ``lead``, ``facts`` and ``command`` are plain text, the other strings HTML."""
-    text = Template(files("marlbc_mj.report").joinpath("page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(title),
-        lead=html.escape(lead),
-        facts=pairs(facts),
-        command=html.escape(command),
-        failures=failures,
-        overview=overview,
-        paper=paper,
-        comparisons=comparisons,
-        video_link='<a href="#video">Video</a>' if video else "",
-        video=_video(video, path.parent) if video else "",
-        methods=methods,
-        reading=reading,
-        errata=pairs((str(n), text) for n, text in paper_values.ERRATA.items()),
-        files=_link_list(links, path.parent),
-        citation=f'{html.escape(paper_values.CITATION)} <a href="{paper_values.DOI}">{paper_values.DOI}</a>',
+def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -> Path:
+    """Fill a template that extends page.html and write it; the citation, the errata and the links are added to ``values``."""
+    text = render(
+        template,
+        links=[_link(link, path.parent) for link in links],
+        errata=paper_values.ERRATA.items(),
+        citation=paper_values.CITATION,
+        doi=paper_values.DOI,
+        **values,
     )
     path.write_text(text, encoding="utf-8")
     return path
+
+
+def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
+    """What a page says about a scenario, by name."""
+    return [
+        ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
+        ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
+    ]
+
+
+def origin_facts(config: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """Where the numbers come from, by name; ``config`` has ``git_revision`` and ``versions``."""
+    versions = ", ".join(f"{name} {version}" for name, version in config["versions"].items())
+    return [("Revision", str(config["git_revision"])), ("Versions", versions)]
+
+
+def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
+    """What lies beside the page and is worth a link."""
+    names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
+    files = [folder / name for name in names if (folder / name).exists()]
+    figures = [folder / "figures"] if (folder / "figures").is_dir() else []
+    return [*files, *figures, *sorted((folder / "logs").glob("*.mcap")), *videos]
+
+
+def picture(png: Path, caption: str) -> Picture | None:
+    """A figure's PNG at half its resolution in at most 256 colors; None where the file is missing."""
+    if not png.is_file():
+        return None
+    with Image.open(png) as source:
+        small = source.convert("RGB").reduce(2)
+        narrow = source.width < _SINGLE_PIXELS
+    buffer = io.BytesIO()
+    small.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    return Picture(caption, small.width, small.height, _data_url("image/png", buffer.getvalue()), narrow)
+
+
+def _pictures(figures: Path, drawn: Sequence[Plot]) -> list[Picture]:
+    found = [picture(figures / f"{plot.stem}.png", plot.caption) for plot in drawn]
+    return [one for one in found if one is not None]
 
 
 def _lead(results: Sequence[Result], scenario: Scenario) -> str:
@@ -130,87 +171,28 @@ def _lead(results: Sequence[Result], scenario: Scenario) -> str:
     )
 
 
-def _facts(
-    results: Sequence[Result], scenario: Scenario, versions: Mapping[str, str], seed: int, revision: str
-) -> tuple[tuple[str, str], ...]:
-    failed = sum(result.metrics is None for result in results)
-    return (
-        ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
-        ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
-        ("Limits", f"force {scenario.force_limit:g} N per axis, safe distance {scenario.safe_distance:g} m"),
-        ("Methods", f"{len(results) - failed} ran, {failed} failed"),
-        ("Seed", str(seed)),
-        ("Revision", revision),
-        ("Versions", ", ".join(f"{name} {version}" for name, version in versions.items())),
-    )
-
-
-def pairs(items: Iterable[tuple[str, str]]) -> str:
-    """Items of a definition list."""
-    return "".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in items)
-
-
-def _failures(results: Sequence[Result]) -> str:
-    lines = [
-        f"<li><strong>{html.escape(result.key)}</strong>: {html.escape(str(result.failure))}</li>"
-        for result in results
-        if result.metrics is None
-    ]
-    return f'<div class="failed"><p>Methods that failed:</p><ul>{"".join(lines)}</ul></div>' if lines else ""
-
-
-def _method(result: Result, drawn: Sequence[Plot], figures: Path, state: str) -> str:
-    """A folding section."""
-    if result.metrics is None:
-        return f'<details><summary>{html.escape(result.key)}<span class="failed">failed</span></summary></details>'
+def _method(result: Result, own: Sequence[Plot], figures: Path) -> MethodSection:
     metrics = result.metrics
-    switches = "/".join(str(agent["switches"]) for agent in metrics["agents"])
-    clearance = min(agent["clearance_min"] for agent in metrics["agents"])
-    facts = f"return {metrics['team']['return']:.0f}, switches {switches}, least clearance {clearance:.2f} m".replace("-", "−")
-    own = [p for p in drawn if p.method == result.key]
-    narrow = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in own if p.narrow)
-    wide = "".join(plot(figures / f"{p.stem}.png", p.caption) for p in own if not p.narrow)
-    return (
-        f"<details{state}><summary>{html.escape(result.key)}<span>{facts}</span></summary>"
-        + (f'<div class="pair">{narrow}</div>' if narrow else "")
-        + f"{wide}</details>"
+    if metrics is None:
+        return MethodSection(result.key, "failed", failed=True)
+    facts = (
+        f"return {score_cell('return', metrics)}, switches {switches_text(metrics)}, "
+        f"least clearance {score_cell('clearance_min_worst', metrics)} m"
     )
+    narrow, wide = (_pictures(figures, [plot for plot in own if plot.narrow is which]) for which in (True, False))
+    return MethodSection(result.key, facts, narrow=narrow, wide=wide)
 
 
-def plot(png: Path, caption: str) -> str:
-    """A figure's PNG at half its resolution in at most 256 colors, embedded; nothing where the file is missing."""
-    if not png.is_file():
-        return ""
-    with Image.open(png) as source:
-        small = source.convert("RGB").reduce(2)
-        kind = "plot single" if source.width < _SINGLE_PIXELS else "plot"
-    buffer = io.BytesIO()
-    small.quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
-    text = html.escape(caption)
-    return (
-        f'<figure><figcaption>{text}</figcaption><div class="{kind}"><img alt="{text}" '
-        f'width="{small.width}" height="{small.height}" src="data:image/png;base64,{_base64(buffer.getvalue())}"></div></figure>'
-    )
+def _video(video: Path, folder: Path) -> EmbeddedVideo:
+    size = video.stat().st_size
+    source = _data_url("video/mp4", video.read_bytes()) if size < LARGEST_VIDEO else ""
+    return EmbeddedVideo(source, _link(video, folder), round(size / 1e6))
 
 
-def _video(video: Path, folder: Path) -> str:
-    if video.stat().st_size < LARGEST_VIDEO:
-        source = f"data:video/mp4;base64,{_base64(video.read_bytes())}"
-        body = f'<video controls playsinline preload="metadata" src="{source}"></video>'
-    else:
-        body = f"<p>{_link(video, folder)} ({video.stat().st_size / 1e6:.0f} MB)</p>"
-    return f'<section id="video"><h2>Video</h2>{body}</section>'
-
-
-def _link_list(links: Sequence[Path], folder: Path) -> str:
-    items = "".join(f"<li>{_link(link, folder)}</li>" for link in links)
-    return f"<ul>{items}</ul>" if items else "<p>None beside this page.</p>"
-
-
-def _link(target: Path, folder: Path) -> str:
+def _link(target: Path, folder: Path) -> Link:
     relative = Path(os.path.relpath(target, folder)).as_posix()
-    return f'<a href="{quote(relative)}">{html.escape(relative)}</a>'
+    return Link(relative, quote(relative))
 
 
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode("ascii")
+def _data_url(kind: str, data: bytes) -> str:
+    return f"data:{kind};base64,{base64.b64encode(data).decode('ascii')}"

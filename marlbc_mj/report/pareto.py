@@ -9,25 +9,27 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.printed import LIMITED, by_controller, by_supervisor
+from marlbc_mj.report.paper_tables import LIMITED, one_per_controller, one_per_supervisor
 from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result
 from marlbc_mj.util.palette import AGENT_COLORS
 
-MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
-COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
+_MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
+_COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
 
 _INK = "#1A1A1A"
 _TOGETHER = 0.01  # marks closer than this share of every axis are one
-_PANELS: tuple[tuple[str, str, Callable[[Metrics], float]], ...] = (
-    ("return", "upper left is better", lambda m: m["team"]["return"]),
-    ("violation, worst agent [s]", "lower left is better", lambda m: max(agent["violation_time"] for agent in m["agents"])),
-    ("formation error [m]", "lower left is better", lambda m: m["team"]["formation_error"]),
-)
+_PANELS = {
+    "return": "upper left is better",
+    "violation_time_worst": "lower left is better",
+    "formation_error_mean": "lower left is better",
+}
+"""Scores on the ordinates, and where the better methods are."""
 
 
 class Group(NamedTuple):
-    """What shares a row of panels and a legend."""
+    """Methods that share a row of panels and a legend."""
 
     results: Sequence[Result]
     handles: Sequence[Line2D]
@@ -35,10 +37,10 @@ class Group(NamedTuple):
 
 
 def pareto(results: Sequence[Result]) -> Figure:
-    """Cost summed over agents against return, violation time and formation error; one mark a method that ran.
+    """Cost summed over agents against return, violation time and formation error; one mark per method that ran.
 
-    Where the methods are supervisors with one controller and controllers under one supervisor, each of the two has a row of its
-    own, since their ranges differ; else all share one row. Laws with and without force limit have one marker, open without.
+    Where the methods are supervisors with one controller and controllers under one supervisor, each of the two kinds has its own
+    row, since their ranges differ; else all share one row. A law with and without force limit has one marker, open without.
     """
     ran = [result for result in results if result.metrics is not None]
     groups = _groups(ran)
@@ -60,11 +62,11 @@ def pareto(results: Sequence[Result]) -> Figure:
 
 
 def coincident(results: Sequence[Result]) -> list[list[str]]:
-    """Methods whose marks a reader cannot tell apart in any panel, by their controllers where these tell which they are."""
+    """Methods whose marks a reader cannot tell apart in any panel, named by their controllers where these are enough."""
     found = []
     for group in _groups([result for result in results if result.metrics is not None]):
         named = len({result.supervisor for result in group.results}) == 1
-        points = np.array([[np.log10(_cost(r)), *(read(_metrics(r)) for *_, read in _PANELS)] for r in group.results])
+        points = np.array([[np.log10(_cost(r)), *(SCORES[name].read(_metrics(r)) for name in _PANELS)] for r in group.results])
         close = _TOGETHER * np.maximum(np.ptp(points, axis=0), 1e-12)
         rest = list(range(len(points)))
         while rest:
@@ -76,23 +78,23 @@ def coincident(results: Sequence[Result]) -> list[list[str]]:
 
 
 def _groups(ran: Sequence[Result]) -> list[Group]:
-    supervisors, controllers = list(by_supervisor(ran).values()), list(by_controller(ran)[0].values())
+    supervisors, controllers = list(one_per_supervisor(ran).values()), list(one_per_controller(ran)[0].values())
     laws = list(dict.fromkeys(map(_law, ran)))
     names = {result.controller for result in ran}
     twins = {law for law in laws if f"{law}{LIMITED}" in names}
-    chiefs = list(dict.fromkeys(result.supervisor for result in ran))
+    supervisor_names = list(dict.fromkeys(result.supervisor for result in ran))
 
     def of_supervisor(result: Result) -> dict[str, Any]:
-        return _style(chiefs.index(result.supervisor), 0, False)
+        return _style(supervisor_names.index(result.supervisor), 0, False)
 
     def of_law(result: Result) -> dict[str, Any]:
         k = laws.index(_law(result))
         return {**_style(k, k, result.controller in twins), "markersize": max(4.0, 7.5 - k)}  # laws that coincide stay visible
 
     def of_both(result: Result) -> dict[str, Any]:
-        return _style(chiefs.index(result.supervisor), laws.index(_law(result)), result.controller in twins)
+        return _style(supervisor_names.index(result.supervisor), laws.index(_law(result)), result.controller in twins)
 
-    named = [_entry(name, **_style(k, 0, False)) for k, name in enumerate(chiefs)]
+    named = [_entry(name, **_style(k, 0, False)) for k, name in enumerate(supervisor_names)]
     marked = [_entry(law, **_style(k, k, False)) for k, law in enumerate(laws)]
     plain = [_entry(law, **{**_style(0, k, False), "markerfacecolor": "#D0D0D0"}) for k, law in enumerate(laws)]
     limit = [_entry("open: no force limit", **{**_style(0, 0, True), "markeredgecolor": _INK})] if twins else []
@@ -110,11 +112,12 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
     limits = min(costs) / 1.6, max(costs) * 1.6
     if limits[1] < 30 * limits[0]:  # an axis with at least two labels
         limits = (10 ** np.floor(np.log10(limits[0])), 10 ** np.ceil(np.log10(limits[1])))
+    cost = SCORES["cost_integral_sum"]
     floor = [_cost(result) for result in group.results if result.controller == "lqr"]
-    for axes, (label, better, read) in zip(row, _PANELS, strict=True):
+    for axes, (name, better) in zip(row, _PANELS.items(), strict=True):
         for result in group.results:
-            axes.plot(_cost(result), read(_metrics(result)), linestyle="none", clip_on=False, **group.style(result))
-        axes.set(xscale="log", xlim=limits, xlabel="cost, sum of agents", ylabel=label)
+            axes.plot(_cost(result), SCORES[name].read(_metrics(result)), linestyle="none", clip_on=False, **group.style(result))
+        axes.set(xscale="log", xlim=limits, xlabel=f"{cost.quantity}, {cost.aggregation}", ylabel=SCORES[name].label)
         axes.set_title(better, loc="left", fontsize=7, color=pl.GREY)
         axes.margins(y=0.12)
         axes.grid(color="#E4E4E4", linewidth=0.4)
@@ -144,7 +147,7 @@ def _metrics(result: Result) -> Metrics:
 
 def _cost(result: Result) -> float:
     """Cost integral summed over agents, kept off zero for the logarithmic axis."""
-    return max(sum(agent["cost_integral"] for agent in _metrics(result)["agents"]), 1e-9)
+    return max(SCORES["cost_integral_sum"].read(_metrics(result)), 1e-9)
 
 
 def _law(result: Result) -> str:
@@ -152,9 +155,9 @@ def _law(result: Result) -> str:
 
 
 def _style(supervisor: int, law: int, hollow: bool) -> dict[str, Any]:
-    color = COLORS[supervisor % len(COLORS)]
+    color = _COLORS[supervisor % len(_COLORS)]
     return {
-        "marker": MARKERS[law % len(MARKERS)],
+        "marker": _MARKERS[law % len(_MARKERS)],
         "markerfacecolor": "white" if hollow else color,
         "markeredgecolor": color if hollow else _INK,
         "markeredgewidth": 0.9 if hollow else 0.4,

@@ -1,6 +1,6 @@
 """What all figures share: style, sizes, and decimation that keeps every peak."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from typing import Any, Literal, NamedTuple
 
@@ -51,7 +51,7 @@ _STYLE: Any = {
 
 
 def style() -> AbstractContextManager[None]:
-    """Matplotlib's settings for the time of drawing or saving a figure; fonts are embedded as TrueType."""
+    """A context with Matplotlib's settings, for drawing and saving; fonts are embedded as TrueType."""
     return matplotlib.rc_context(_STYLE)
 
 
@@ -60,7 +60,7 @@ Share = bool | Literal["none", "all", "row", "col"]
 
 
 class Margins(NamedTuple):
-    """Room around and between panels [in]; fixed, so that one kind of figure has its axes in one place for every method."""
+    """Room around and between panels [in]; fixed, so that a kind of figure has its axes in the same place for every method."""
 
     left: float = 0.5
     right: float = 0.14
@@ -135,14 +135,6 @@ def bands(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.nd
     counts = np.diff(np.append(starts, len(values)))
     low, high = np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)
     return time[starts], low, np.add.reduceat(values, starts) / counts, high
-
-
-def runs(values: np.ndarray) -> Iterator[tuple[int, int, int]]:
-    """(start, end, value) of every stretch of equal values in (M,); ``end`` is exclusive."""
-    if len(values):
-        starts = np.concatenate([[0], np.flatnonzero(np.diff(values)) + 1])
-        for start, end in zip(starts, [*starts[1:], len(values)], strict=True):
-            yield int(start), int(end), int(values[start])
 
 
 def command_handles(commands: tuple[str, ...], width: float = 2.0) -> list[Line2D]:

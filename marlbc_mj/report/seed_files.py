@@ -1,4 +1,4 @@
-"""What many draws leave for machines: summary.json and episodes.csv."""
+"""The machine-readable files of many draws: summary.json and episodes.csv."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -6,24 +6,21 @@ from pathlib import Path
 from typing import Any
 
 from marlbc_mj.results.outcomes import outcome
-from marlbc_mj.results.seed_statistics import (
-    SCORES,
-    GroupStatistics,
-    MethodStatistics,
-    by_controller,
-    by_supervisor,
-    group,
-)
+from marlbc_mj.results.scores import SCORES
+from marlbc_mj.results.seed_statistics import GroupStatistics, MethodStatistics, controller_of, group, supervisor_of
 from marlbc_mj.results.seeds import SeedResults, SeedRun
 from marlbc_mj.results.statistics import Estimate, rate
-from marlbc_mj.results.summary import AGENT_KEYS, SCHEMA, TEAM_KEYS, plain
+from marlbc_mj.results.summary import AGENT_KEYS, SCHEMA, TEAM_KEYS, json_numbers
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.text import one_line
 
 
-def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:
-    """The content of summary.json: schema 1 with medians, ``<key>_ci`` beside them, and what only draws can tell."""
-    groups = {"supervisors": by_supervisor, "controllers": by_controller}
+def seed_summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:
+    """The content of summary.json: schema 1, with medians in place of numbers and ``<key>_ci`` beside them.
+
+    It also has what only many draws can have: rates, interquartile means and groups.
+    """
+    groups = {"supervisors": supervisor_of, "controllers": controller_of}
     content = {
         "schema": SCHEMA,
         "scenario": results.scenario.name,
@@ -35,7 +32,7 @@ def summary(results: SeedResults, methods: Sequence[MethodStatistics], versions:
         "methods": {s.runs.key: {**_summary_entry(s), **_outcome_entry(s, results.scenario)} for s in methods},
         "groups": {key: {g.name: _group_entry(g) for g in group(results, by)} for key, by in groups.items()},
     }
-    return dict(plain(content))
+    return dict(json_numbers(content))
 
 
 def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
@@ -54,7 +51,7 @@ def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
 
 
 def _outcome_entry(statistics: MethodStatistics, scenario: Scenario) -> dict[str, Any]:
-    """Rates of every part of an outcome, with Wilson's intervals."""
+    """The rate of every part of an outcome, with Wilson's interval."""
     outcomes = [outcome(run.metrics, scenario) for run in statistics.runs.runs]
     parts = ("success", "reached", "struck", "collided")
     return {k: v for part in parts for k, v in _with_ci(f"{part}_rate", rate([getattr(o, part) for o in outcomes])).items()}
@@ -74,9 +71,10 @@ def _all_with_ci(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
     return {name: value for key, estimate in estimates.items() for name, value in _with_ci(key, estimate).items()}
 
 
-def write_csv(results: SeedResults, path: Path) -> Path:
-    """episodes.csv: one row per method, seed and agent, the team's columns repeated; a failed run has its reason in each, and
-    one row without agent where nothing was drawn.
+def write_seed_csv(results: SeedResults, path: Path) -> Path:
+    """Write episodes.csv: a row per method, seed and agent, the team's columns repeated.
+
+    A failed run has its reason in each of its rows. Where nothing was drawn, it has one row without an agent.
     """
     drawn = ("disturbance_scale", "start_x", "start_y")
     columns = ("supervisor", "controller", "seed", "agent", "failure", *drawn, *AGENT_KEYS, *(f"team_{k}" for k in TEAM_KEYS))
@@ -97,6 +95,6 @@ def _csv_rows(run: SeedRun) -> list[dict[str, Any]]:
     rows = [{"agent": i + 1, "disturbance_scale": scale, "start_x": x, "start_y": y} for i, (x, y) in enumerate(starts)]
     if run.metrics is None:
         return [{**row, "failure": one_line(run.failure)} for row in rows]
-    numbers = plain(run.metrics)
+    numbers = json_numbers(run.metrics)
     team = {f"team_{key}": value for key, value in numbers["team"].items()}
     return [{**row, **agent, **team} for row, agent in zip(rows, numbers["agents"], strict=True)]

@@ -1,22 +1,22 @@
 """The report of many draws: its files, its figure and its page."""
 
-import html
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.bundle import files_beside
-from marlbc_mj.report.formats import interval, loose_interval, spans
-from marlbc_mj.report.page import fill_page, plot
-from marlbc_mj.report.seed_files import summary, write_csv
-from marlbc_mj.report.seed_tables import caution, make_tables
-from marlbc_mj.report.table import Column, Table, to_html
+from marlbc_mj.report.figures import save_figure
+from marlbc_mj.report.formats import loose_interval, score_interval, spans
+from marlbc_mj.report.page import files_beside, fill_page, origin_facts, picture, scenario_facts
+from marlbc_mj.report.seed_files import seed_summary, write_seed_csv
+from marlbc_mj.report.seed_tables import caution, make_seed_tables
+from marlbc_mj.report.table import Column, Table
 from marlbc_mj.report.tables import latex_document, markdown
-from marlbc_mj.results.seed_statistics import SCORES, MethodStatistics, analyse
+from marlbc_mj.results.scores import SCORES
+from marlbc_mj.results.seed_statistics import MethodStatistics, analyse
 from marlbc_mj.results.seeds import Progress, SeedResults
 from marlbc_mj.results.summary import AGENT_KEYS
 from marlbc_mj.util.files import write_json
@@ -26,8 +26,8 @@ FIGURE = "intervals"
 
 
 def intervals(methods: Sequence[MethodStatistics]) -> Figure:
-    """Median and 95 % interval of return, violation time and effort; one line a method, that says so where all runs failed."""
-    names = ("return", "violation_time", "effort")
+    """Median and 95 % interval of return, violation time and effort: one line per method, with a word where all runs failed."""
+    names = ("return", "violation_time_worst", "effort_integral_sum")
     margins = pl.Margins(left=0.2 + 0.054 * max(len(s.runs.key) for s in methods), top=0.12, across=0.22)  # room for the names
     figure, panels = pl.panels(pl.DOUBLE, 0.65 + 0.16 * len(methods), 1, len(names), margins, sharey=True)
     supervisors = list(dict.fromkeys(s.runs.supervisor for s in methods))
@@ -41,13 +41,13 @@ def intervals(methods: Sequence[MethodStatistics]) -> Figure:
                 axes.annotate(
                     "failed", (0, k), (4, 0), xycoords=("axes fraction", "data"), textcoords="offset points", va="center"
                 )
-        if name == "violation_time":
+        if name == "violation_time_worst":
             most = max((s.medians[name].high for s in methods if s.medians[name].high > 0), default=1.0)
             axes.set_xlim(-0.04 * most, 1.04 * most)
-        axes.set_xlabel(f"{SCORES[name].group}, {SCORES[name].label}")
+        axes.set_xlabel(SCORES[name].label)
         axes.grid(axis="x", color="#E4E4E4", linewidth=0.4)
         axes.set_axisbelow(True)
-    ours = [s.medians["effort"].value for s in methods if s.medians["effort"].value > 0]
+    ours = [s.medians[names[-1]].value for s in methods if s.medians[names[-1]].value > 0]
     if ours and max(ours) > 30 * min(ours):
         panels[0, -1].set_xscale("log")
     panels[0, 0].set_yticks(range(len(methods)), [s.runs.key for s in methods])
@@ -71,9 +71,9 @@ def write_seed_report(
         progress: called with what is being done, how much of it is done and how much there is.
     """
     methods = analyse(results)
-    tables = make_tables(results, methods)
-    write_json(folder / "summary.json", summary(results, methods, config["versions"]))
-    write_csv(results, folder / "episodes.csv")
+    tables = make_seed_tables(results, methods)
+    write_json(folder / "summary.json", seed_summary(results, methods, config["versions"]))
+    write_seed_csv(results, folder / "episodes.csv")
     (folder / "tables.md").write_text(markdown(tables), encoding="utf-8")
     (folder / "tables.tex").write_text(latex_document(tables), encoding="utf-8")
     if figures:
@@ -85,64 +85,51 @@ def write_seed_report(
 
 def _write_figure(methods: Sequence[MethodStatistics], folder: Path) -> None:
     folder.mkdir(exist_ok=True)
-    with pl.style():
-        figure = intervals(methods)
-        for kind in ("pdf", "png"):
-            figure.savefig(folder / f"{FIGURE}.{kind}")
-
-
-_READING = """
-<p>Every method ran on the same draws around the scenario, so differences between methods are not differences of luck.
-Medians and interquartile means ignore a few odd draws; intervals say how far another set of draws might move them.</p>
-<p>Look at failures and the violation rate first: a supervisor whose schedule is fixed in time does not see that an obstacle
-has moved, and a median over the runs that finished flatters a method that often fails.</p>"""
-
-
-_PAPER = "<p>The paper prints single runs without perturbation; without --seeds the same command shows them.</p>"
-_NO_PAPER = "<p>The paper has no mission like this one.</p>"
+    save_figure(lambda: intervals(methods), folder / FIGURE)
 
 
 def _write_page(
     path: Path, results: SeedResults, methods: Sequence[MethodStatistics], tables: Sequence[Table], config: Mapping[str, Any]
 ) -> Path:
-    scenario = results.scenario
+    scenario, draws = results.scenario, len(results.seeds)
     failed = sum(len(s.runs.failed) for s in methods)
-    facts = (
-        ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
-        ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
-        ("Runs", f"{len(methods)} methods on {len(results.seeds)} draws, {failed} of {len(methods) * len(results.seeds)} failed"),
-        ("Seeds", spans(results.seeds)),
-        ("Revision", str(config["git_revision"])),
-        ("Versions", ", ".join(f"{name} {version}" for name, version in config["versions"].items())),
-    )
-    figure = plot(
-        path.parent / "figures" / f"{FIGURE}.png",
-        f"Median and 95 % interval of each method over draws{caution(len(results.seeds))}.",
-    )
+    caption = f"Median and 95 % interval of each method over draws{caution(draws)}."
+    figure = picture(path.parent / "figures" / f"{FIGURE}.png", caption)
     return fill_page(
         path,
-        title=f"Behavioral control benchmark: {scenario.name}, {len(results.seeds)} draws",
-        lead=f"{len(methods)} methods on the same {len(results.seeds)} draws around {scenario.description or scenario.name}.",
-        facts=facts,
+        "seed_page.html",
+        files_beside(path.parent),
+        title=f"Behavioral control benchmark: {scenario.name}, {draws} draws",
+        lead=f"{len(methods)} methods on the same {draws} draws around {scenario.description or scenario.name}.",
+        facts=[
+            *scenario_facts(scenario),
+            ("Runs", f"{len(methods)} methods on {draws} draws, {failed} of {len(methods) * draws} failed"),
+            ("Seeds", spans(results.seeds)),
+            *origin_facts(config),
+        ],
         command=str(config["command"]),
-        overview="".join(map(to_html, tables)),
-        paper=_PAPER if scenario.layout is None else _NO_PAPER,
-        comparisons=figure or "<p>Not drawn.</p>",
-        methods="".join(map(_method_section, methods)),
-        reading=_READING,
-        links=files_beside(path.parent),
+        tables=tables,
+        of_paper=scenario.layout is None,
+        pictures=[figure] if figure else [],
+        video=None,
+        methods=list(map(_method_section, methods)),
     )
 
 
-def _method_section(statistics: MethodStatistics) -> str:
+class _MethodTable(NamedTuple):
     """A folding section with every metric of every agent."""
+
+    key: str
+    facts: str
+    table: Table
+
+
+def _method_section(statistics: MethodStatistics) -> _MethodTable:
     key, failed = statistics.runs.key, statistics.runs.failed
-    state = (
-        f"{len(failed)} of {len(statistics.runs.runs)} runs failed"
-        if failed
-        else f"return {interval(statistics.medians['return'], 0)}"
-    )
+    if failed:
+        facts = f"{len(failed)} of {len(statistics.runs.runs)} runs failed"
+    else:
+        facts = f"return {score_interval('return', statistics.medians['return'])}"
     columns = (Column("", "median"), *(Column("", f"agent {i + 1}") for i in range(len(statistics.agents))))
     rows = tuple((name, *(loose_interval(agent[name]) for agent in statistics.agents)) for name in AGENT_KEYS)
-    table = Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows)
-    return f"<details><summary>{html.escape(key)}<span>{html.escape(state)}</span></summary>{to_html(table)}</details>"
+    return _MethodTable(key, facts, Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows))

@@ -3,37 +3,33 @@
 from collections.abc import Sequence
 from dataclasses import replace
 
-from marlbc_mj.report.formats import DASH, FAILED, interval, percent, spans
+from marlbc_mj.report.formats import DASH, FAILED, interval, percent, score_column, score_interval, spans
 from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.outcomes import outcome
-from marlbc_mj.results.seed_statistics import (
-    SCORES,
-    GroupStatistics,
-    MethodStatistics,
-    by_controller,
-    by_supervisor,
-    group,
-)
+from marlbc_mj.results.seed_statistics import GroupStatistics, MethodStatistics, controller_of, group, supervisor_of
 from marlbc_mj.results.seeds import MethodRuns, SeedResults
 from marlbc_mj.results.statistics import rate
 from marlbc_mj.robots import make_robot
 from marlbc_mj.util.text import one_line
 
+_SAFETY = ("violation_time_worst", "clearance_min_worst", "agent_distance_min")
+_COSTS = ("effort_integral_sum", "cost_integral_sum", "formation_error_mean", "saturation_duty_worst")
 ENOUGH = 10
-"""Draws from which a bootstrap interval is taken at its word."""
+"""Draws from which on a bootstrap interval is shown without a warning."""
 
 
-def make_tables(results: SeedResults, methods: Sequence[MethodStatistics]) -> list[Table]:
-    """All tables, outcomes first where a scenario draws layouts; the ones of groups (two or more that can be compared) and of
-    failures only where there are some.
+def make_seed_tables(results: SeedResults, methods: Sequence[MethodStatistics]) -> list[Table]:
+    """All tables, the outcomes first where a scenario draws layouts.
+
+    The table of groups is there where two or more can be compared, the table of failures where there are some.
     """
-    groups = [rows if len(rows) > 1 else [] for rows in (group(results, by_supervisor), group(results, by_controller))]
+    groups = [rows if len(rows) > 1 else [] for rows in (group(results, supervisor_of), group(results, controller_of))]
     failing = [statistics.runs for statistics in methods if statistics.runs.failed]
     first = [_return_table(results, methods), _safety_table(methods)]
     first.insert(len(first) if results.scenario.layout is None else 0, outcome_table(results))
     tables = [
         *first,
-        _score_table("costs", "What each method costs", ("effort", "cost", "formation_error", "saturation_duty"), methods),
+        _score_table("costs", "What each method costs", _COSTS, methods),
         _switch_table(methods, results.scenario.agents),
         *([_group_table(groups)] if any(groups) else []),
         *([_failure_table(failing)] if failing else []),
@@ -43,7 +39,7 @@ def make_tables(results: SeedResults, methods: Sequence[MethodStatistics]) -> li
 
 
 def caution(draws: int) -> str:
-    """What a caption adds where there are too few draws for their intervals; empty where there are enough."""
+    """What is added to a caption where there are too few draws for intervals; empty where there are enough."""
     if draws == 1:
         return " (a single draw: no intervals)"
     return f" (only {draws} draws: intervals are too narrow)" if draws < ENOUGH else ""
@@ -53,20 +49,20 @@ def _return_table(results: SeedResults, methods: Sequence[MethodStatistics]) -> 
     spread = results.scenario.perturbation
     columns = (
         Column("", "method"),
-        Column("return", "median"),
-        Column("return", "IQM"),
-        Column("better than reference", "chance [%]"),
+        Column("return", "team, median"),
+        Column("return", "team, IQM"),
+        Column("better than reference", "chance", "%"),
     )
     rows = [
         (
             s.runs.key,
-            FAILED if _never_ran(s) else interval(s.medians["return"], 0),
-            interval(s.iqms["return"], 0),
+            FAILED if _never_ran(s) else score_interval("return", s.medians["return"]),
+            score_interval("return", s.iqms["return"]),
             DASH if _never_ran(s) else "reference" if s.runs.key == results.reference else interval(percent(s.improvement), 0),
         )
         for s in methods
     ]
-    layouts = "" if results.scenario.layout is None else f"a layout each of the {results.scenario.split} split; "
+    layouts = "" if results.scenario.layout is None else f"one layout of the {results.scenario.split} split each; "
     notes = (
         f"{len(results.seeds)} draws, the same for every method: {layouts}starts within {spread.start_spread:g} m and obstacles "
         f"within {spread.obstacle_spread:g} m per axis, drag × {spread.drag_scale[0]:g} to {spread.drag_scale[1]:g}, uniformly.",
@@ -78,14 +74,14 @@ def _return_table(results: SeedResults, methods: Sequence[MethodStatistics]) -> 
 
 
 def outcome_table(results: SeedResults) -> Table:
-    """Success of each method, and what kept the others from it."""
+    """Success rate of each method, and the rates of what prevents success."""
     columns = (
         Column("", "method"),
-        Column("success", "rate [%]"),
-        Column("reached the end", "rate [%]"),
-        Column("violation", "rate [%]"),
-        Column("struck an obstacle", "rate [%]"),
-        Column("agents collided", "rate [%]"),
+        Column("success", "rate", "%"),
+        Column("reached the end", "rate", "%"),
+        Column("violation", "rate", "%"),
+        Column("struck an obstacle", "rate", "%"),
+        Column("agents collided", "rate", "%"),
     )
     rows = []
     for method in results.methods:
@@ -97,8 +93,8 @@ def outcome_table(results: SeedResults) -> Table:
         rows.append((method.key, *(interval(percent(rate(share)), 0) for share in shares)))
     scenario, radius = results.scenario, make_robot(results.scenario.robot).radius
     notes = (
-        f"Success: at the end every agent within {scenario.formation_tolerance:g} m of its slot around the desired centroid, on "
-        "the way no violation and no collision. In brackets: Wilson's 95 % interval.",
+        f"Success: at the end every agent is within {scenario.formation_tolerance:g} m of its slot around the desired centroid, "
+        "and on the way there was no violation and no collision. In brackets: Wilson's 95 % interval.",
         f"Violation: a clearance of at most {scenario.safe_distance:g} m. Struck: of at most {radius:g} m, the agent's radius. "
         f"Collided: two agents within {2 * radius:g} m. A run that failed counts against its method in every column.",
     )
@@ -106,40 +102,39 @@ def outcome_table(results: SeedResults) -> Table:
 
 
 def _never_ran(statistics: MethodStatistics) -> bool:
-    """Whether no run finished, so that rates and comparisons would say nothing about safety or return."""
+    """Whether no run finished, so that rates and comparisons mean nothing."""
     return len(statistics.runs.failed) == len(statistics.runs.runs)
 
 
 def _safety_table(methods: Sequence[MethodStatistics]) -> Table:
-    names = ("violation_time", "clearance", "agent_distance")
     columns = (
         Column("", "method"),
         Column("runs", "finished"),
-        Column("violation", "rate [%]"),
-        *(Column(SCORES[name].group, SCORES[name].label) for name in names),
+        Column("violation", "rate", "%"),
+        *map(score_column, _SAFETY),
     )
     rows = [
         (
             s.runs.key,
             f"{len(s.runs.runs) - len(s.runs.failed)}/{len(s.runs.runs)}",
             DASH if _never_ran(s) else interval(percent(s.violation), 0),
-            *(interval(s.medians[name], SCORES[name].digits) for name in names),
+            *(score_interval(name, s.medians[name]) for name in _SAFETY),
         )
         for s in methods
     ]
     notes = (
-        "Violation rate: share of draws on which an agent came within the safe distance, or the run failed; Wilson's interval.",
-        "The others: medians over the runs that finished. Worst and least are over agents.",
+        "Violation rate: share of draws in which an agent came within the safe distance or the run failed; Wilson's interval.",
+        "The others: medians over the runs that finished.",
     )
     return Table("seeds-safety", "Safety of each method over draws of the scenario", columns, tuple(rows), notes)
 
 
 def _score_table(name: str, caption: str, scores: Sequence[str], methods: Sequence[MethodStatistics]) -> Table:
-    columns = (Column("", "method"), *(Column(SCORES[key].group, SCORES[key].label) for key in scores))
-    rows = tuple((s.runs.key, *(interval(s.medians[key], SCORES[key].digits) for key in scores)) for s in methods)
+    columns = (Column("", "method"), *map(score_column, scores))
+    rows = tuple((s.runs.key, *(score_interval(name, s.medians[name]) for name in scores)) for s in methods)
     notes = (
-        "Medians over the runs that finished. Effort and cost: integrals over the episode, summed over agents.",
-        "At limit: share of time with an axis of the force at its limit, of the agent with the most.",
+        "Medians over the runs that finished. Effort and cost: integrals over the episode. Sum and mean are over all agents.",
+        "At limit: share of time with an axis of the force at its limit.",
     )
     return Table(f"seeds-{name}", f"{caption}, over draws of the scenario", columns, rows, notes)
 
@@ -153,16 +148,15 @@ def _switch_table(methods: Sequence[MethodStatistics], agents: int) -> Table:
 def _group_table(groups: Sequence[Sequence[GroupStatistics]]) -> Table:
     columns = (
         Column("", "group"),
-        Column("return", "IQM"),
-        Column("violation", "worst [s], IQM"),
-        Column("violation", "rate [%]"),
+        Column("return", "team, IQM"),
+        Column("violation", "worst agent, IQM", "s"),
+        Column("violation", "rate", "%"),
         Column("draws", "all finished"),
     )
     rows = [
         (
             f"{g.name} ({g.methods} methods)",
-            interval(g.iqms["return"], 0),
-            interval(g.iqms["violation_time"], 2),
+            *(score_interval(name, g.iqms[name]) for name in ("return", "violation_time_worst")),
             interval(percent(g.violation), 0),
             str(g.draws),
         )
@@ -170,7 +164,7 @@ def _group_table(groups: Sequence[Sequence[GroupStatistics]]) -> Table:
         for g in each
     ]
     notes = (
-        "Stratified bootstrap: each method is a stratum of equal weight; draws are common to all and resampled together.",
+        "Stratified bootstrap: each method is a stratum of equal weight; draws are common to all methods and resampled together.",
         "IQMs are over the draws on which all methods of the group finished, rates over all draws.",
     )
     caption = "Each supervisor over its controllers and each controller over its supervisors"
@@ -181,5 +175,5 @@ def _failure_table(methods: Sequence[MethodRuns]) -> Table:
     columns = (Column("", "method"), Column("", "failed"), Column("", "seeds"))
     rows = [(m.key, f"{len(m.failed)}/{len(m.runs)}", spans([run.seed for run in m.failed])) for m in methods]
     reasons = [f"{m.key} on seed {m.failed[0].seed}: {one_line(m.failed[0].failure).rstrip('.')}." for m in methods]
-    note = "Every reason is in episodes.csv and summary.json; the first of each method is"
-    return Table("seeds-failures", "Runs that failed", columns, tuple(rows), (f"{note} below.", *reasons))
+    note = "Every reason is in episodes.csv and summary.json; the first of each method is below."
+    return Table("seeds-failures", "Runs that failed", columns, tuple(rows), (note, *reasons))

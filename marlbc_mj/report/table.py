@@ -1,12 +1,13 @@
-"""A table as data, and its three renderings: Markdown, LaTeX (booktabs) and HTML."""
+"""A table as data, and two renderings, Markdown and LaTeX (booktabs); the third, HTML, is the template table.html."""
 
-import html
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from typing import NamedTuple
+
+from marlbc_mj.util.text import one_line
 
 _MATH = {
     "‖u‖∞": r"\|u\|_\infty",
@@ -36,10 +37,21 @@ _SPECIAL = re.compile("|".join(re.escape(k) for k in (*sorted(_MATH, key=len, re
 
 
 class Column(NamedTuple):
-    """A column's two lines of header; neighbours of one group share the first."""
+    """A column's header: two lines, and the unit; neighbors of one group share the first line."""
 
     group: str
     label: str
+    unit: str = ""
+
+    @property
+    def second(self) -> str:
+        """The second line, with the unit."""
+        return self.label + (f" [{self.unit}]" if self.unit else "")
+
+    @property
+    def text(self) -> str:
+        """The whole header on one line."""
+        return ", ".join(part for part in (self.group, self.second) if part)
 
 
 @dataclass(frozen=True)
@@ -63,21 +75,31 @@ class Table:
         """Whether the header has two lines."""
         return any(column.group and column.label for column in self.columns)
 
+    @property
+    def groups(self) -> list[tuple[str, int]]:
+        """The header's first line: every group and how many columns it spans; columns without one stand alone."""
+        keys = [(column.group, -1 if column.group else at) for at, column in enumerate(self.columns)]
+        return [(name, len(list(same))) for (name, _), same in groupby(keys)]
+
 
 def to_markdown(table: Table) -> str:
     """A pipe table under its caption, notes below."""
-    header = [", ".join(part for part in column if part) for column in table.columns]
-    lines = [f"**{_markdown(table.caption)}**", "", _pipe(header), _pipe(["---"] + ["---:"] * (len(header) - 1))]
-    lines += [_pipe(row) for row in table.rows]
+    header = [column.text for column in table.columns]
+    lines = [f"**{_markdown(table.caption)}**", "", pipe_table(header, table.rows)]
     if table.notes:
         lines += ["", *(f"- {_markdown(note)}" for note in table.notes)]
     return "\n".join(lines) + "\n"
 
 
+def pipe_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """The rows of a Markdown table alone: the first column flush left, the others flush right."""
+    return "\n".join(map(_pipe, [header, ["---"] + ["---:"] * (len(header) - 1), *rows]))
+
+
 def to_latex(table: Table) -> str:
     """A ``table*`` for a document that loads booktabs."""
     count = len(table.columns)
-    body = [" & ".join(map(latex, row)) + r" \\" for row in table.rows]
+    body = [_latex_row(row) for row in table.rows]
     for at in sorted(table.rules, reverse=True):
         body.insert(at, r"\midrule")
     notes = " ".join(latex(note) for note in table.notes)
@@ -102,18 +124,6 @@ def to_latex(table: Table) -> str:
     )
 
 
-def to_html(table: Table) -> str:
-    """A ``figure`` with a scrollable table; every cell of text is escaped."""
-    rows = [_html_row(row, " class=rule" if k in table.rules else "") for k, row in enumerate(table.rows)]
-    notes = "".join(f"<li>{html.escape(note)}</li>" for note in table.notes)
-    return (
-        f'<figure id="table-{table.name}"><figcaption>{html.escape(table.caption)}</figcaption>'
-        f"<div class=scroll><table><thead>{_html_header(table)}</thead><tbody>{''.join(rows)}</tbody></table></div>"
-        + (f"<ul class=notes>{notes}</ul>" if notes else "")
-        + "</figure>"
-    )
-
-
 def latex(text: str) -> str:
     """Plain text as LaTeX: specials escaped, known symbols in math mode, anything else as its nearest ASCII."""
     parts, at = [], 0
@@ -129,41 +139,27 @@ def _ascii(text: str) -> str:
 
 
 def _markdown(text: str) -> str:
-    return " ".join(text.replace("|", r"\|").replace("<", "&lt;").replace("−", "-").split())
+    return one_line(text.replace("|", r"\|").replace("<", "&lt;").replace("−", "-"))
 
 
 def _pipe(cells: Sequence[str]) -> str:
     return "| " + " | ".join(map(_markdown, cells)) + " |"
 
 
-def _groups(table: Table) -> list[tuple[str, int]]:
-    """Header's first line: every group and how many columns it spans; columns without one stand alone."""
-    keys = [(column.group, -1 if column.group else at) for at, column in enumerate(table.columns)]
-    return [(name, len(list(same))) for (name, _), same in groupby(keys)]
-
-
 def _latex_header(table: Table) -> list[str]:
-    labels = " & ".join(latex(column.label if table.grouped else column.group or column.label) for column in table.columns)
     if not table.grouped:
-        return [labels + r" \\"]
+        return [_latex_row(column.text for column in table.columns)]
+    labels = [_latex_row(column.label for column in table.columns)]
+    if any(column.unit for column in table.columns):  # a line of their own: narrow columns
+        labels.append(_latex_row(f"[{column.unit}]" if column.unit else "" for column in table.columns))
     cells, lines, at = [], [], 1
-    for name, span in _groups(table):
+    for name, span in table.groups:
         cells.append(latex(name) if span == 1 else rf"\multicolumn{{{span}}}{{c}}{{{latex(name)}}}")
         if span > 1:
             lines.append(rf"\cmidrule(lr){{{at}-{at + span - 1}}}")
         at += span
-    return [" & ".join(cells) + r" \\", *([" ".join(lines)] if lines else []), labels + r" \\"]
+    return [" & ".join(cells) + r" \\", *([" ".join(lines)] if lines else []), *labels]
 
 
-def _html_header(table: Table) -> str:
-    labels = [column.label if table.grouped else column.group or column.label for column in table.columns]
-    second = "<tr>" + "".join(f"<th scope=col>{html.escape(label)}</th>" for label in labels) + "</tr>"
-    if not table.grouped:
-        return second
-    first = [f"<th scope=colgroup colspan={span}>{html.escape(name)}</th>" for name, span in _groups(table)]
-    return f"<tr class=groups>{''.join(first)}</tr>{second}"
-
-
-def _html_row(row: Sequence[str], attribute: str) -> str:
-    cells = "".join(f"<td>{html.escape(cell)}</td>" for cell in row[1:])
-    return f"<tr{attribute}><th scope=row>{html.escape(row[0])}</th>{cells}</tr>"
+def _latex_row(cells: Iterable[str]) -> str:
+    return " & ".join(map(latex, cells)) + r" \\"

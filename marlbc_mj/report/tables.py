@@ -2,26 +2,25 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
-from marlbc_mj.report import findings, paper_values, printed
-from marlbc_mj.report.formats import COST_SCALE, DASH, FAILED, fixed
+from marlbc_mj.report import findings, paper_tables, paper_values
+from marlbc_mj.report.formats import DASH, FAILED, score_cell, score_column
+from marlbc_mj.report.paper_tables import failure_note, failures
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
-from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 
 
 def make_tables(results: Sequence[Result], scenario_name: str) -> list[Table]:
-    """Every table that these results fill; printed numbers appear for the paper's own scenario only."""
+    """Every table that these results fill; published numbers appear for the paper's own scenario only."""
     of_paper = scenario_name == paper_values.SCENARIO
-    supervisors = printed.by_supervisor(results)
-    controllers, supervisor = printed.by_controller(results)
+    supervisors = paper_tables.one_per_supervisor(results)
+    controllers, supervisor = paper_tables.one_per_controller(results)
     tables = [
         all_metrics(results),
-        printed.switches(supervisors, of_paper),
-        printed.decision_time(supervisors, of_paper),
-        printed.control_cost(controllers, supervisor, of_paper),
-        printed.control_input(controllers, supervisor, of_paper),
+        paper_tables.switches(supervisors, of_paper),
+        paper_tables.decision_time(supervisors, of_paper),
+        paper_tables.control_cost(controllers, supervisor, of_paper),
+        paper_tables.control_input(controllers, supervisor, of_paper),
         findings.orderings(results) if of_paper else None,
         findings.oracle_gap(results),
         findings.convergence(results),
@@ -41,21 +40,19 @@ def latex_document(tables: Sequence[Table], paragraph: str = "") -> str:
     return "\n\n".join(parts) + "\n"
 
 
+_COLUMNS = (
+    *("violation_time_worst", "clearance_min_worst", "agent_distance_min", "formation_error_mean", "effort_integral_sum"),
+    *("cost_integral_sum", "saturation_duty_worst", "rms_position_error_rms", "rms_velocity_error_rms"),
+)
+
+
 def all_metrics(results: Sequence[Result]) -> Table:
-    """Every method in one row, agents gathered as the second line of the header says."""
+    """Every method in one row; the second line of the header says how agents are aggregated."""
     columns = (
         Column("", "method"),
-        Column("return", "sum"),
+        score_column("return"),
         Column("switches", "each agent"),
-        Column("violation", "worst [s]"),
-        Column("clearance", "least [m]"),
-        Column("distance", "least [m]"),
-        Column("formation", "mean [m]"),
-        Column("effort", "sum [N s]"),
-        Column("cost", "sum [10⁴]"),
-        Column("at limit", "worst [%]"),
-        Column("‖e_p‖", "RMS [m]"),
-        Column("‖e_v‖", "RMS [m/s]"),
+        *map(score_column, _COLUMNS),
     )
     return Table(
         "all-metrics",
@@ -63,35 +60,21 @@ def all_metrics(results: Sequence[Result]) -> Table:
         columns,
         tuple(_metrics_row(result, len(columns)) for result in results),
         (
-            "Effort and cost: integrals over the episode, ∫ ‖u‖ dt and ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt, summed over agents.",
+            "Worst agent: the one with the longest violation, the least clearance, the most time at the limit. Sum, mean and RMS "
+            "are over all agents.",
+            "Effort and cost: integrals over the episode, ∫ ‖u‖ dt and ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt.",
             "Violation: time with a clearance of at most the safe distance d_OA; a negative clearance is inside an obstacle.",
-            "Distance: between two agents, which no behavior guards. Formation: distance from the slot relative to the centroid.",
-            "At limit: share of time with an axis of the force at its limit. Worst, least, mean and sum are over agents.",
-            *map(printed.failure_note, printed.failures(results)),
+            "Distance: between two agents, which no behavior guards. Formation error: distance from the slot relative to the "
+            "centroid.",
+            "At limit: share of time with an axis of the force at its limit.",
+            *map(failure_note, failures(results)),
         ),
     )
 
 
 def _metrics_row(result: Result, width: int) -> tuple[str, ...]:
-    if result.metrics is None:
+    metrics = result.metrics
+    if metrics is None:
         return (result.key, FAILED, *[DASH] * (width - 2))
-    metrics, team = result.metrics, result.metrics["team"]
-    return (
-        result.key,
-        fixed(team["return"], 0),
-        "/".join(str(agent["switches"]) for agent in metrics["agents"]),
-        fixed(_agents(metrics, "violation_time").max(), 2),
-        fixed(_agents(metrics, "clearance_min").min(), 2),
-        fixed(team["agent_distance_min"], 2),
-        fixed(team["formation_error"], 2),
-        fixed(_agents(metrics, "effort_integral").sum(), 0),
-        fixed(_agents(metrics, "cost_integral").sum() * COST_SCALE, 1),
-        fixed(100 * _agents(metrics, "saturation_duty").max(), 1),
-        fixed(np.sqrt((_agents(metrics, "rms_position_error") ** 2).mean()), 3),
-        fixed(np.sqrt((_agents(metrics, "rms_velocity_error") ** 2).mean()), 2),
-    )
-
-
-def _agents(metrics: Metrics, key: str) -> np.ndarray:
-    """(N,) one metric of all agents."""
-    return np.array([agent[key] for agent in metrics["agents"]], dtype=float)  # type: ignore[literal-required]
+    cells = (score_cell(name, metrics) for name in _COLUMNS)
+    return (result.key, score_cell("return", metrics), switches_text(metrics), *cells)

@@ -1,21 +1,22 @@
-"""Trajectory -> named scalars. Definitions are fixed: changing one changes every published number."""
+"""The metrics of an episode: named scalars of its trajectory. Changing a definition changes every published number."""
 
 from typing import TypedDict
 
 import numpy as np
 
 from marlbc_mj.core.cells import spacing
+from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.scenarios import Scenario
 
 
 class AgentMetrics(TypedDict):
-    """One agent's scalars."""
+    """The metrics of one agent."""
 
     switches: int  # mission steps at which its command differs from the one before
     clearance_min: float  # over all substeps [m]
     violation_time: float  # time with d <= d_OA [s]
-    force_max_inf: float  # max |u|_inf, what the paper's "max |u|" must be (erratum 15) [N]
+    force_max_inf: float  # max |u|_inf, which the paper's "max |u|" must mean (erratum 15) [N]
     force_max_2: float  # max |u|_2 [N]
     effort_integral: float  # integral of |u| dt [N s]
     effort_sum: float  # effort_integral over the mission step: a sum over samples (erratum 16) [N]
@@ -33,15 +34,15 @@ TeamMetrics = TypedDict(
         "return": float,  # sum of rewards over the episode
         "decision_ms_median": float,  # all agents, one mission step [ms]
         "decision_ms_p99": float,
-        "agent_distance_min": float,  # no behavior of the paper guards it [m]
-        "end_error": float,  # greatest distance from an agent's FM slot around the desired centroid, at the end [m]
+        "agent_distance_min": float,  # least distance between two agents; no behavior of the paper guards it [m]
+        "end_error": float,  # greatest distance of an agent from its FM slot around the desired centroid, at the end [m]
         "formation_error": float,  # mean distance from the FM slot, relative to the centroid [m]
     },
 )
 
 
 class Metrics(TypedDict):
-    """All scalars of one episode."""
+    """All metrics of one episode."""
 
     agents: list[AgentMetrics]
     team: TeamMetrics
@@ -50,7 +51,7 @@ class Metrics(TypedDict):
 def measure(trajectory: Trajectory) -> Metrics:
     """All metrics of one episode.
 
-    Errors and force are those at the start of each substep, weighted by its length; clearance is taken at its end.
+    Errors and force are those at the start of each substep, weighted by its length; clearance is that at its end.
     """
     return {
         "agents": [_agent(trajectory, i, clearance) for i, clearance in enumerate(trajectory.clearances().T)],
@@ -70,7 +71,7 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
     return {
         "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
         "clearance_min": float(clearance.min()),
-        "violation_time": float((clearance <= scenario.safe_distance).sum() * h),
+        "violation_time": float(violates(clearance, scenario.safe_distance).sum() * h),
         "force_max_inf": float(np.abs(force).max()),
         "force_max_2": float(size.max()),
         "effort_integral": float(size.sum() * h),
@@ -112,7 +113,7 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
 
 
 def _end_error(trajectory: Trajectory) -> float:
-    """Whether a mission was accomplished: how far from its place the worst agent ended [m]."""
+    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: was the mission accomplished?"""
     scenario = trajectory.scenario
     end = len(trajectory.time) * scenario.substep
     centroid = np.array(scenario.path_origin) + end * np.array(scenario.path_velocity)

@@ -1,14 +1,15 @@
-"""What became of a mission: whether the team reached the end in formation, and whom it came too near on the way."""
+"""The outcome of a mission: whether the team ended in formation, and what it came too close to on the way."""
 
 from typing import NamedTuple
 
 from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
 
-class Outcome(NamedTuple):
-    """One episode's verdict."""
+class MissionOutcome(NamedTuple):
+    """The outcome of one episode."""
 
     reached: bool  # at the end every agent is within the formation tolerance of its slot around the desired centroid
     violated: bool  # an agent came within the safe distance of an obstacle
@@ -21,18 +22,18 @@ class Outcome(NamedTuple):
         return self.reached and not (self.violated or self.struck or self.collided)
 
 
-FAILED = Outcome(False, True, True, True)
-"""A run that could not be finished counts against its method in every respect."""
+FAILED_MISSION = MissionOutcome(False, True, True, True)
+"""The outcome of a run that could not be finished: it counts against its method in every respect."""
 
 
-def outcome(metrics: Metrics | None, scenario: Scenario) -> Outcome:
-    """The verdict on an episode, from its metrics; None stands for a run that failed."""
+def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
+    """The outcome of an episode, from its metrics; None stands for a run that failed."""
     if metrics is None:
-        return FAILED
-    agents, team, radius = metrics["agents"], metrics["team"], make_robot(scenario.robot).radius
-    return Outcome(
+        return FAILED_MISSION
+    team, radius = metrics["team"], make_robot(scenario.robot).radius
+    return MissionOutcome(
         reached=team["end_error"] <= scenario.formation_tolerance,
-        violated=any(agent["violation_time"] > 0.0 for agent in agents),
-        struck=min(agent["clearance_min"] for agent in agents) <= radius,
+        violated=SCORES["violation_time_worst"].read(metrics) > 0.0,
+        struck=SCORES["clearance_min_worst"].read(metrics) <= radius,
         collided=team["agent_distance_min"] <= 2.0 * radius,
     )

@@ -2,43 +2,22 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seeds import MethodRuns, SeedResults
 from marlbc_mj.results.statistics import Estimate, Statistic, bootstrap, iqm, mean, median, paired_improvement, rate
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 
-
-class Score(NamedTuple):
-    """One number that sums up a whole team's episode."""
-
-    group: str  # first line of a header
-    label: str  # second line, with the unit
-    digits: int
-    read: Callable[[Metrics], float]
-
-
-SCORES = {
-    "return": Score("return", "sum", 0, lambda m: m["team"]["return"]),
-    "violation_time": Score("violation", "worst [s]", 2, lambda m: max(a["violation_time"] for a in m["agents"])),
-    "clearance": Score("clearance", "least [m]", 2, lambda m: min(a["clearance_min"] for a in m["agents"])),
-    "agent_distance": Score("distance", "least [m]", 2, lambda m: m["team"]["agent_distance_min"]),
-    "formation_error": Score("formation", "mean [m]", 2, lambda m: m["team"]["formation_error"]),
-    "effort": Score("effort", "sum [N s]", 0, lambda m: sum(a["effort_integral"] for a in m["agents"])),
-    "cost": Score("cost", "sum [10⁴]", 1, lambda m: 1e-4 * sum(a["cost_integral"] for a in m["agents"])),
-    "saturation_duty": Score("at limit", "worst [%]", 1, lambda m: 100 * max(a["saturation_duty"] for a in m["agents"])),
-}
-"""Worst, least, mean and sum are over agents."""
-
-_GROUP_SCORES = ("return", "violation_time")
+_GROUP_SCORES = ("return", "violation_time_worst")
 
 
 @dataclass(frozen=True)
 class MethodStatistics:
-    """What the tables, the files and the figure say about one method; estimates are over the runs that finished."""
+    """What tables, files and figure say about one method; estimates are over the runs that finished."""
 
     runs: MethodRuns
     agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS
@@ -46,18 +25,18 @@ class MethodStatistics:
     medians: Mapping[str, Estimate]  # of SCORES
     iqms: Mapping[str, Estimate]  # of SCORES
     violation: Estimate  # rate of runs with a violation or a failure, Wilson's interval
-    improvement: Estimate  # probability of a higher return than the reference's on the same draw; a failure loses
+    improvement: Estimate  # probability that its return exceeds the reference's on the same draw; a failure loses
 
 
 @dataclass(frozen=True)
 class GroupStatistics:
-    """One supervisor over all controllers, or the reverse: each method is a stratum, draws are common to all of them."""
+    """One supervisor over all its controllers, or the reverse: each method is a stratum, and draws are common to all of them."""
 
     name: str
     methods: int
     draws: int  # on which all of them finished
-    iqms: Mapping[str, Estimate]  # of return and violation_time
-    violation: Estimate  # rate over all their runs
+    iqms: Mapping[str, Estimate]  # of _GROUP_SCORES
+    violation: Estimate  # rate of runs with a violation or a failure
 
 
 def analyse(results: SeedResults) -> list[MethodStatistics]:
@@ -73,13 +52,21 @@ def _method_statistics(method: MethodRuns, agents: int, against: np.ndarray) -> 
 
     return MethodStatistics(
         method,
-        tuple({key: over(lambda m, i=i, key=key: m["agents"][i][key]) for key in AGENT_KEYS} for i in range(agents)),  # type: ignore[misc]
-        {key: over(lambda m, key=key: m["team"][key]) for key in TEAM_KEYS},  # type: ignore[misc]
+        tuple({key: over(_agent_metric(i, key)) for key in AGENT_KEYS} for i in range(agents)),
+        {key: over(_team_metric(key)) for key in TEAM_KEYS},
         {name: over(score.read) for name, score in SCORES.items()},
         {name: over(score.read, iqm) for name, score in SCORES.items()},
         rate([run.violated for run in method.runs]),
         paired_improvement(method.values(SCORES["return"].read, failure=-np.inf), against),
     )
+
+
+def _agent_metric(agent: int, key: str) -> Callable[[Metrics], Any]:
+    return lambda metrics: dict(metrics["agents"][agent])[key]
+
+
+def _team_metric(key: str) -> Callable[[Metrics], Any]:
+    return lambda metrics: dict(metrics["team"])[key]
 
 
 def group(results: SeedResults, by: Callable[[MethodRuns], str]) -> list[GroupStatistics]:
@@ -102,11 +89,11 @@ def _group_statistics(name: str, methods: Sequence[MethodRuns]) -> GroupStatisti
     )
 
 
-def by_supervisor(method: MethodRuns) -> str:
-    """For :func:`group`."""
+def supervisor_of(method: MethodRuns) -> str:
+    """The supervisor of a method, by which :func:`group` pools methods."""
     return method.supervisor
 
 
-def by_controller(method: MethodRuns) -> str:
-    """For :func:`group`."""
+def controller_of(method: MethodRuns) -> str:
+    """The controller of a method, by which :func:`group` pools methods."""
     return method.controller

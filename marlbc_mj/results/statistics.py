@@ -1,11 +1,10 @@
 """Statistics of few runs, after Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021).
 
 Medians and interquartile means with percentile-bootstrap intervals, the probability of improvement, and rates with Wilson's
-interval. NumPy only. A bootstrap interval of few runs (below about ten) is too narrow: read it as a lower bound of the spread.
+interval. A bootstrap interval of few runs (below about ten) is too narrow: read it as a lower bound of the spread.
 """
 
 from collections.abc import Callable, Sequence
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -16,11 +15,11 @@ LEVEL = 0.95
 RESAMPLES = 2000
 
 Statistic = Callable[[np.ndarray], np.ndarray]
-"""Maps (..., n) to (...): every statistic here works on the last axis."""
+"""Maps (..., n) to (...): every statistic works on the last axis."""
 
 
 class Estimate(NamedTuple):
-    """A value and the interval around it; NaN stands for what too few runs cannot tell."""
+    """A value and the interval around it; NaN where there are too few runs."""
 
     value: float
     low: float
@@ -56,17 +55,17 @@ def bootstrap(
 ) -> Estimate:
     """The statistic of all strata together, and its stratified percentile-bootstrap interval.
 
-    Runs are drawn with replacement within each stratum, so that every stratum keeps its weight. One stratum is the ordinary
-    bootstrap. Each call draws from its own stream, so that no interval depends on which others are computed.
+    Runs are drawn with replacement within each stratum, so that every stratum keeps its weight. With one stratum this is the
+    ordinary bootstrap. Each call has its own random stream, so that no interval depends on which others are computed.
 
     Args:
         strata: (n_k,) values of each stratum.
-        statistic: on the last axis of the concatenated strata.
-        level: probability that the interval is to cover.
-        resamples: bootstrap samples.
-        joint: the k-th runs of all strata share what chance decided (a perturbation draw) and are drawn together; independent
-            draws would understate the interval then.
-        seed: of the bootstrap's own stream.
+        statistic: of the last axis of the concatenated strata.
+        level: probability with which the interval should cover the true value.
+        resamples: number of bootstrap samples.
+        joint: the k-th runs of all strata belong to one perturbation draw and are drawn together. Independent draws would make
+            the interval too narrow then.
+        seed: random seed of this call's stream.
 
     Raises:
         ConfigurationError: no stratum, a level outside (0, 1), no resamples, or joint strata of different sizes.
@@ -82,7 +81,7 @@ def bootstrap(
     picks += [picks[0] if joint else rng.integers(len(stratum), size=(resamples, len(stratum))) for stratum in strata[1:]]
     drawn = [np.asarray(stratum, dtype=float)[pick] for stratum, pick in zip(strata, picks, strict=True)]
     samples = np.sort(statistic(np.concatenate(drawn, axis=-1)))
-    cut = round(resamples * (1.0 - level) / 2.0)  # order statistics, not interpolation: infinities stay what they are
+    cut = round(resamples * (1.0 - level) / 2.0)  # order statistics without interpolation, which infinities would not survive
     return Estimate(value, float(samples[cut]), float(samples[-1 - cut]))
 
 
@@ -102,20 +101,11 @@ def _check_level(level: float) -> None:
         raise ConfigurationError(f"level must lie between 0 and 1, got {level}")
 
 
-def probability_of_improvement(x: np.ndarray, y: np.ndarray) -> float:
-    """P(X > Y) + P(X = Y) / 2 over all pairs of runs, the Mann-Whitney form of Agarwal et al.; for unpaired samples.
-
-    Larger is better; -inf stands for a run that failed. 0.5 means no difference.
-    """
-    if not len(x) or not len(y):
-        return float("nan")
-    return float(_wins(np.asarray(x, dtype=float)[:, None], np.asarray(y, dtype=float)[None, :]).mean())
-
-
 def paired_improvement(x: np.ndarray, y: np.ndarray, *, level: float = LEVEL, resamples: int = RESAMPLES) -> Estimate:
-    """The same over pairs (x_k, y_k) of one draw each, with its bootstrap interval over draws.
+    """P(X > Y) + P(X = Y) / 2 over pairs (x_k, y_k) of one draw each, with its bootstrap interval over draws.
 
-    This is the form for methods that see the same draws: what a draw does to both cancels, as in a sign test.
+    The probability of improvement of Agarwal et al. for methods that see the same draws: what a draw does to both cancels, as in
+    a sign test. Larger is better; -inf stands for a run that failed. 0.5 means no difference.
 
     Raises:
         ConfigurationError: samples of different sizes.
@@ -131,25 +121,24 @@ def _wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def rate(events: Sequence[bool] | np.ndarray, *, level: float = LEVEL) -> Estimate:
-    """Share of runs in which something happened, a violation for example, with Wilson's score interval."""
+    """Share of runs in which something happened, a violation for example, with Wilson's score interval; NaN without runs."""
     return wilson(int(np.count_nonzero(events)), len(events), level=level)
 
 
 def wilson(successes: int, trials: int, *, level: float = LEVEL) -> Estimate:
-    """k / n and Wilson's interval, (k + z²/2 ± z sqrt(k (n - k) / n + z²/4)) / (n + z²); unlike a bootstrap's it is never empty
-    at 0 and 1.
+    """k / n and Wilson's interval, (k + z²/2 ± z sqrt(k (n - k) / n + z²/4)) / (n + z²).
+
+    Unlike a bootstrap interval it has a width at 0 and 1.
 
     Raises:
-        ConfigurationError: counts that are none, or a level outside (0, 1).
+        ConfigurationError: counts that are not 0 <= k <= n, or a level outside (0, 1).
     """
     _check_level(level)
     if not 0 <= successes <= trials:
         raise ConfigurationError(f"need 0 <= successes <= trials, got {successes} of {trials}")
     if trials == 0:
         return Estimate(np.nan, np.nan, np.nan)
-    z = NormalDist().inv_cdf(0.5 + level / 2.0)
-    centre = successes + z * z / 2.0
-    half = z * np.sqrt(successes * (trials - successes) / trials + z * z / 4.0)
-    low = 0.0 if successes == 0 else (centre - half) / (trials + z * z)
-    high = 1.0 if successes == trials else (centre + half) / (trials + z * z)
-    return Estimate(successes / trials, float(low), float(high))
+    from scipy.stats import binomtest  # here, as it takes longer to import than most commands take to answer
+
+    interval = binomtest(successes, trials).proportion_ci(level, method="wilson")
+    return Estimate(successes / trials, float(interval.low), float(interval.high))

@@ -1,17 +1,16 @@
-"""What one method left behind, and the two machine-readable files made from it: summary.json and episodes.csv."""
+"""The result of one method, and the two machine-readable files made from results: summary.json and episodes.csv."""
 
 import csv
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.results.metrics import AgentMetrics, Metrics, TeamMetrics, measure
+from marlbc_mj.results.scores import team_scores
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.provenance import plain_data
 from marlbc_mj.util.text import one_line
 
 SCHEMA = 1
@@ -32,7 +31,7 @@ class Result:
     trajectory: Trajectory | None = None
     metrics: Metrics | None = None
     failure: str | None = None
-    solver_share: float | None = None  # of the decision time, in a network or a solver; None: the supervisor does not tell
+    solver_share: float | None = None  # of the decision time, in a network or solver; None: the supervisor does not report it
 
     def __post_init__(self) -> None:
         if (self.metrics is None) == (self.failure is None):
@@ -60,7 +59,9 @@ def method_key(supervisor: str, controller: str) -> str:
 
 
 def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str, str]) -> dict[str, Any]:
-    """The content of summary.json, schema 1. Numbers that are not finite become null, a failed method its reason.
+    """The content of summary.json, schema 1: for each method its agents, its team and the scores made from them.
+
+    Numbers that are not finite become null; a failed method has its reason instead.
 
     Raises:
         ConfigurationError: two results of one method.
@@ -69,14 +70,19 @@ def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str
     for result in results:
         if result.key in methods:
             raise ConfigurationError(f"method {result.key!r} has more than one result")
-        methods[result.key] = {"failure": result.failure} if result.metrics is None else plain(result.metrics)
-        if result.solver_share is not None:
-            methods[result.key]["solver_share"] = plain(result.solver_share)
+        methods[result.key] = _entry(result)
     return {"schema": SCHEMA, "scenario": scenario_name, "versions": dict(versions), "methods": methods}
 
 
+def _entry(result: Result) -> dict[str, Any]:
+    if result.metrics is None:
+        return {"failure": result.failure}
+    share = {} if result.solver_share is None else {"solver_share": result.solver_share}
+    return dict(json_numbers({**result.metrics, "scores": team_scores(result.metrics), **share}))
+
+
 def write_csv(results: Sequence[Result], path: Path) -> Path:
-    """episodes.csv: one row per method and agent, the team's columns repeated; one row without agent for a failed method."""
+    """Write episodes.csv: a row per method and agent, the team's columns repeated; for a failed method one row without agent."""
     header = ("supervisor", "controller", "agent", "failure", *AGENT_KEYS, *(f"team_{key}" for key in TEAM_KEYS))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, header, restval="")
@@ -90,17 +96,11 @@ def _csv_rows(result: Result) -> list[dict[str, Any]]:
     method = {"supervisor": result.supervisor, "controller": result.controller}
     if result.metrics is None:
         return [{**method, "failure": one_line(result.failure)}]
-    numbers = plain(result.metrics)
+    numbers = json_numbers(result.metrics)
     team = {f"team_{key}": value for key, value in numbers["team"].items()}
     return [{**method, "agent": i + 1, **agent, **team} for i, agent in enumerate(numbers["agents"])]
 
 
-def plain(value: Any) -> Any:
-    """Nested containers and NumPy scalars as JSON's types; a number that is not finite as None."""
-    if isinstance(value, Mapping):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, np.generic):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def json_numbers(value: Any) -> Any:
+    """Nested containers as JSON data; a number that is not finite becomes None, as JSON has no infinity."""
+    return plain_data(value, not_finite=lambda _: None)

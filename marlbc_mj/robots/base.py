@@ -11,6 +11,7 @@ import numpy as np
 
 from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.text import one_line
 
 MODELS = Path(str(files("marlbc_mj") / "models"))
 """Folder of the MJCF files; in the repository a link to ``models/``."""
@@ -86,7 +87,7 @@ class Robot:
         try:
             spec = mujoco.MjSpec.from_file(str(self.mjcf))
         except (ValueError, FileNotFoundError) as error:
-            raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {_one_line(error)}") from error
+            raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {one_line(error)}") from error
         self.prepare(spec)
         return spec
 
@@ -117,7 +118,3 @@ class Robot:
                 raise ConfigurationError(
                     f"scenario {scenario.name!r}: {name} must be at most {most:g} for robot {self.name!r}, got {value:g}"
                 )
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())

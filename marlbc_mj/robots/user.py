@@ -18,6 +18,7 @@ from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.base import Robot
 from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError
+from marlbc_mj.util.text import one_line
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
@@ -85,12 +86,12 @@ def check_mjcf(path: Path) -> mujoco.MjModel:
     try:
         spec = mujoco.MjSpec.from_file(str(path))
     except (ValueError, FileNotFoundError) as error:
-        raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {' '.join(str(error).split())}") from error
+        raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {one_line(error)}") from error
     _check_files(path, spec)
     try:
         model = spec.compile()
     except ValueError as error:
-        raise ConfigurationError(f"{path} does not compile: {' '.join(str(error).split())}") from error
+        raise ConfigurationError(f"{path} does not compile: {one_line(error)}") from error
     if model.nu == 0:
         raise ConfigurationError(f"{path} has no actuators; a robot needs at least two to be driven in the plane")
     if model.nbody < 2 or not model.body_subtreemass[0] > 0:

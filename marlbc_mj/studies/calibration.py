@@ -13,7 +13,7 @@ import numpy as np
 from marlbc_mj.controllers import FiniteTime, FixedTime
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.report.paper_values import INPUT_MAX
+from marlbc_mj.report.paper_values import PUBLISHED_INPUT_MAX
 from marlbc_mj.scenarios import Scenario, paper
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
@@ -71,7 +71,7 @@ def calibrate(
     if not tolerance > 0.0:
         raise ConfigurationError(f"tolerance must be positive, got {tolerance}")
     scenario = scenario or paper()
-    law, printed = CALIBRATED[name], INPUT_MAX.values[name]
+    law, printed = CALIBRATED[name], PUBLISHED_INPUT_MAX.values[name]
     if scenario.agents != len(printed):
         raise ConfigurationError(f"Table 6 has {len(printed)} agents, the scenario {scenario.agents}")
     target = max(printed)

@@ -59,7 +59,7 @@ def study_table(rows: Sequence[Record]) -> Table:
         ("goal", "time [min]"),
         ("best", "return, median"),
     )
-    labels += ("best", "return, IQM"), ("best", "violation [s]"), ("best", "switches"), ("last", "return, IQM")
+    labels += ("best", "return, IQM"), ("best", "violation, worst agent [s]"), ("best", "switches"), ("last", "return, IQM")
     runs = by_variant(rows)
     groups = [VARIANTS[name].group for name in runs]
     budgets = " and ".join(grouped(b) for b in sorted({int(row["budget"]) for row in rows}))
@@ -147,7 +147,7 @@ def draw_curves(rows: Sequence[Record], curves: Sequence[Record]) -> Figure:
                 if key == "return":
                     axes.set_title(name, loc="left", fontsize=6.5)
                 if c == 0:
-                    axes.set_ylabel({"return": "return [10³]", "violation_time": "violation [s]"}[key])
+                    axes.set_ylabel({"return": "return [10³]", "violation_time": "violation, worst agent [s]"}[key])
                     axes.yaxis.set_label_coords(-0.34 / width, 0.5, transform=axes.transAxes)
     figure.supxlabel("mission steps [10⁶]", fontsize=8, y=0.0, va="bottom")
     pl.legend_above(figure, _handles(), columnspacing=1.0)

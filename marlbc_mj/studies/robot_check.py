@@ -14,6 +14,7 @@ from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.robots.user import check_mjcf
 from marlbc_mj.scenarios import Scenario, standard_behaviors
 from marlbc_mj.util.errors import MarlbcError
+from marlbc_mj.util.text import one_line
 
 DURATION = 8.0  # of the step test [s]
 SETTLED, OVERSHOOT = 0.1, 0.35  # of the robot's length unit: error at the end, excursion beyond the reference
@@ -48,7 +49,7 @@ def _guarded(check: Callable[[Robot], Item], robot: Robot) -> Item:
     try:
         return check(robot)
     except (MarlbcError, ValueError, KeyError) as error:
-        return Item(check.__name__.strip("_"), False, " ".join(str(error).split()))
+        return Item(check.__name__.strip("_"), False, one_line(error))
 
 
 def _compiled(robot: Robot) -> tuple[mujoco.MjModel, mujoco.MjData]:

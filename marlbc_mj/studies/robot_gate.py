@@ -12,7 +12,9 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, Trajectory, run_episode
 from marlbc_mj.recording.log import from_trajectory
 from marlbc_mj.recording.video import render_still, render_video
+from marlbc_mj.report.table import pipe_table
 from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import ROBOTS, Robot, make_robot
 from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
@@ -98,7 +100,7 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
         supervisor=supervisor,
         clearance=min(a["clearance_min"] for a in agents),
         safe_distance=scenario.safe_distance,
-        violation=max(a["violation_time"] for a in agents),
+        violation=SCORES["violation_time_worst"].read(measured),
         collisions=collisions,
         distance=measured["team"]["agent_distance_min"],
         error=max(a["rms_position_error"] for a in agents),
@@ -111,28 +113,25 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
 
 
 def gate_table(rows: Sequence[Row]) -> str:
-    """Markdown, one line a robot and supervisor."""
-    head = ("robot", "supervisor", "least clearance / safe", "violation", "contacts", "between agents", "tracking, RMS")
-    lines = [
-        "| " + " | ".join((*head, "saturated", "switches", "height, tilt")) + " |",
-        "|---|---|" + "---:|" * 5 + "---:|---|---|",
-    ]
-    for r in rows:
-        flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
-        cells = (
-            r.robot,
-            r.supervisor,
-            f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
-            f"{r.violation:.2f} s",
-            str(r.collisions),
-            f"{r.distance:.2f} m",
-            f"{1e3 * r.error:.0f} mm",
-            f"{100 * r.saturation:.1f} %",
-            "/".join(map(str, r.switches)),
-            flight,
-        )
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+    """A Markdown table with one row per robot and supervisor."""
+    head = ("robot", "supervisor", "least clearance / safe", "violation, worst agent", "contacts", "between agents")
+    return pipe_table((*head, "tracking, RMS", "saturated", "switches", "height, tilt"), list(map(_gate_cells, rows)))
+
+
+def _gate_cells(r: Row) -> tuple[str, ...]:
+    flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
+    return (
+        r.robot,
+        r.supervisor,
+        f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
+        f"{r.violation:.2f} s",
+        str(r.collisions),
+        f"{r.distance:.2f} m",
+        f"{1e3 * r.error:.0f} mm",
+        f"{100 * r.saturation:.1f} %",
+        "/".join(map(str, r.switches)),
+        flight,
+    )
 
 
 def run_gates(

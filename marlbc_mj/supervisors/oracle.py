@@ -20,6 +20,7 @@ import numpy as np
 
 from marlbc_mj.controllers import Controller, make_controller
 from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
 from marlbc_mj.scenarios.base import YOUNG
@@ -28,6 +29,7 @@ from marlbc_mj.supervisors.scripted import Scripted
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.provenance import config_hash, plain_data, versions
+from marlbc_mj.util.stretches import stretches
 
 POPULATION = 64  # candidates simulated at a time
 APART = 4.0  # [s] changes of command further apart than this are in different segments
@@ -197,7 +199,7 @@ def evaluate(world: World, tables: np.ndarray) -> Evaluation:
         assert step.record is not None, "evaluate needs World(record=True)"
         after = np.concatenate([step.record.position[:, 1:], step.observation.position[:, None]], axis=1)  # (B, substeps, N, 2)
         reward[:, k] = step.reward
-        violated[:, k] = (clearances(after, obstacles) <= scenario.safe_distance).any(axis=(1, 2))
+        violated[:, k] = violates(clearances(after, obstacles), scenario.safe_distance).any(axis=(1, 2))
     return Evaluation(reward, violated)
 
 
@@ -218,7 +220,7 @@ def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:
     default = scenario.orders.commands.index(scenario.formation_names[0])
     runs: dict[tuple[int, int, int], list[int]] = {}
     for i in range(scenario.agents):
-        for first, last, command in _runs(table[:, i]):
+        for first, last, command in stretches(table[:, i]):
             if command != default:
                 runs.setdefault((first, last, command), []).append(i)
     windows = []
@@ -237,12 +239,6 @@ def segments(table: np.ndarray, scenario: Scenario) -> list[slice]:
     firsts = [c for k, c in enumerate(changes) if k == 0 or c - changes[k - 1] > apart]
     cuts = [0, *(int(c) - lead for c in firsts if c > lead), len(table)]
     return [slice(a, b) for a, b in pairwise(cuts)]
-
-
-def _runs(commands: np.ndarray) -> list[tuple[int, int, int]]:
-    """(first, one past the last, command) of every stretch of equal commands (M,)."""
-    cuts = [0, *(np.flatnonzero(np.diff(commands)) + 1).tolist(), len(commands)]
-    return [(a, b, int(commands[a])) for a, b in pairwise(cuts)]
 
 
 def _score(result: Evaluation, b: int) -> tuple[float, float]:

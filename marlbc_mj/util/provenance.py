@@ -5,6 +5,8 @@ import hashlib
 import json
 import platform
 import subprocess
+from collections.abc import Callable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -66,19 +68,25 @@ def provenance() -> dict[str, Any]:
     return {"versions": versions(), "git_revision": git_revision(), "cpu": cpu(), "platform": platform.platform()}
 
 
-def plain_data(value: Any) -> Any:
-    """Dataclasses, tuples and arrays as JSON data; a dataclass keeps its type's name. Infinity becomes ``"inf"``."""
+def plain_data(value: Any, *, not_finite: Callable[[float], Any] = str) -> Any:
+    """Dataclasses, tuples and arrays as JSON data; a dataclass keeps its type's name.
+
+    Args:
+        value: what to convert, nested as deeply as it likes.
+        not_finite: what a number that is not finite becomes, for which JSON has no number; by default its name, ``"inf"``.
+    """
+    again = partial(plain_data, not_finite=not_finite)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: plain_data(getattr(value, f.name)) for f in dataclasses.fields(value)}
+        fields = {f.name: again(getattr(value, f.name)) for f in dataclasses.fields(value)}
         return {"type": type(value).__name__, **fields}
     if isinstance(value, dict):
-        return {str(key): plain_data(entry) for key, entry in value.items()}
+        return {str(key): again(entry) for key, entry in value.items()}
     if isinstance(value, np.ndarray):
-        return plain_data(value.tolist())
+        return again(value.tolist())
     if isinstance(value, (list, tuple)):
-        return [plain_data(entry) for entry in value]
+        return [again(entry) for entry in value]
     if isinstance(value, float) and not np.isfinite(value):
-        return str(value)
+        return not_finite(value)
     if isinstance(value, (str, int, float, bool)) or value is None:
         return value
     return str(value)

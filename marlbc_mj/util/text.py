@@ -2,5 +2,5 @@
 
 
 def one_line(text: object) -> str:
-    """``str(text)`` without line breaks."""
+    """``str(text)`` on one line: every run of white space becomes one space."""
     return " ".join(str(text).split())

@@ -4,12 +4,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
-
 from marlbc_mj.controllers import Controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.scores import team_scores
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -82,15 +81,15 @@ def run_study(study: Study, progress: Progress | None = None) -> list[Row]:
 def figures_of(trajectory: Trajectory) -> Figures:
     """The figures of one episode."""
     metrics = measure(trajectory)
-    agents = metrics["agents"]
+    scores = team_scores(metrics)
     return Figures(
-        total=metrics["team"]["return"],
-        switches=tuple(agent["switches"] for agent in agents),
-        violation_time=sum(agent["violation_time"] for agent in agents),
-        clearance=min(agent["clearance_min"] for agent in agents),
-        effort=sum(agent["effort_integral"] for agent in agents),
-        rms_velocity_error=float(np.sqrt(np.mean([agent["rms_velocity_error"] ** 2 for agent in agents]))),
-        rms_position_error=float(np.sqrt(np.mean([agent["rms_position_error"] ** 2 for agent in agents]))),
+        total=scores["return"],
+        switches=tuple(agent["switches"] for agent in metrics["agents"]),
+        violation_time=scores["violation_time_sum"],
+        clearance=scores["clearance_min_worst"],
+        effort=scores["effort_integral_sum"],
+        rms_velocity_error=scores["rms_velocity_error_rms"],
+        rms_position_error=scores["rms_position_error_rms"],
     )
 
 

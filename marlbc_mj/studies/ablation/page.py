@@ -1,24 +1,23 @@
 """The ablations' page: every study as a table with how to read it, in Markdown, CSV and HTML."""
 
 import csv
-import html
 from collections.abc import Callable, Mapping, Sequence
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 
-from marlbc_mj.report.table import Column, Table, to_html, to_markdown
+from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.report.templates import render
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.studies.ablation.measure import Figures, Row, Study
 
 TITLE = "Ablations"
 COLUMNS: dict[str, tuple[str, Callable[[Figures], str]]] = {
-    "total": ("return", lambda f: _signed(f"{f.total:.0f}")),
-    "switches": ("switches", lambda f: _slashed(f.switches)),
-    "violation_time": ("violation, s", lambda f: f"{f.violation_time:.2f}"),
-    "clearance": ("least clearance, m", lambda f: _signed(f"{f.clearance:.3f}")),
-    "effort": ("effort ∫‖u‖dt, N s", lambda f: f"{f.effort:.1f}"),
-    "velocity_error": ("RMS velocity error, m/s", lambda f: f"{f.rms_velocity_error:.4f}"),
-    "position_error": ("RMS position error, m", lambda f: f"{f.rms_position_error:.4f}"),
+    "total": (SCORES["return"].label, lambda f: _signed(f"{f.total:.0f}")),
+    "switches": ("switches, each agent", lambda f: _slashed(f.switches)),
+    "violation_time": (SCORES["violation_time_sum"].label, lambda f: f"{f.violation_time:.2f}"),
+    "clearance": (SCORES["clearance_min_worst"].label, lambda f: _signed(f"{f.clearance:.3f}")),
+    "effort": (SCORES["effort_integral_sum"].label, lambda f: f"{f.effort:.1f}"),
+    "velocity_error": (SCORES["rms_velocity_error_rms"].label, lambda f: f"{f.rms_velocity_error:.4f}"),
+    "position_error": (SCORES["rms_position_error_rms"].label, lambda f: f"{f.rms_position_error:.4f}"),
 }
 """Header and cell of a table's column by key; ``ratio``, which needs the whole row, is set in :func:`study_table`."""
 RATIO = "error, first / this"
@@ -54,12 +53,7 @@ def write_page(results: Mapping[str, tuple[Study, Sequence[Row]]], folder: Path,
     (folder / "ablation.md").write_text("\n".join(parts), encoding="utf-8")
     with open(folder / "ablation.csv", "w", newline="", encoding="utf-8") as stream:
         csv.writer(stream, lineterminator="\n").writerows(csv_rows(results))
-    page = Template(files(__package__).joinpath("page.html").read_text(encoding="utf-8")).substitute(
-        title=TITLE,
-        reading=html.escape(READING),
-        tables="".join(map(to_html, tables)),
-        facts="".join(f"<dt>{html.escape(name)}</dt><dd>{html.escape(value)}</dd>" for name, value in facts.items()),
-    )
+    page = render("page.html", str(__package__), title=TITLE, reading=READING, tables=tables, facts=facts.items())
     (folder / "index.html").write_text(page, encoding="utf-8")
 
 
