@@ -19,9 +19,10 @@ from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.policies.states import STATES, make_state
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.tasks.batch import FormationBatch, Starts
-from marlbc_mj.training.config import METHODS, PPO, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import TrainConfig, from_json, make_config
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss, log_probability
+from marlbc_mj.training.methods import METHODS, PPO
 from marlbc_mj.training.prioritised import ALPHA, BETA, LEAST_ERROR, PrioritisedReplay
 from marlbc_mj.training.replay import Batch
 from marlbc_mj.training.rivals import LEARNERS, QMIX, RLMS, VDN, Central, Mixer, learner_class, own_entries

@@ -20,12 +20,11 @@ from safetensors.numpy import load_file, save_file
 
 from marlbc_mj import World, paper, run_episode
 from marlbc_mj.cli import main
-from marlbc_mj.cli.training import with_settings
 from marlbc_mj.policies.checkpoint import read_arrays, read_policy, write_arrays
 from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.training.config import TrainConfig, make_config, with_settings
 from marlbc_mj.training.run import RESUME, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util import provenance

@@ -12,14 +12,16 @@ from hypothesis import strategies as st
 from marlbc_mj.policies.greedy import SLACK, Policy, admissible, greedy
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
-from marlbc_mj.training.config import METHODS, PRESETS, Shaping, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
 from marlbc_mj.training.exploration import Exploration, shares
 from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
+from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import RLMS, VDN
-from marlbc_mj.training.trainer import WARM_UP, Trainer, lost, shaped_reward
+from marlbc_mj.training.shaping import Shaping, lost, shaped_reward
+from marlbc_mj.training.trainer import WARM_UP, Trainer
 from marlbc_mj.util.errors import ConfigurationError
 
 N, S, A = 3, 5, 4

@@ -10,8 +10,9 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
-from marlbc_mj.training.config import Shaping, TrainConfig
+from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TeamNetwork
+from marlbc_mj.training.shaping import lost, shaped_reward
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -142,15 +143,3 @@ def prefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray
 def unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays that are under ``prefix.name``, by name."""
     return {name.removeprefix(f"{prefix}."): array for name, array in arrays.items() if name.startswith(f"{prefix}.")}
-
-
-def shaped_reward(outcome: Outcome, shaping: Shaping) -> np.ndarray:
-    """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says; see :func:`lost`."""
-    team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps
-    own = outcome.switches * (shaping.own_switch_cost + shaping.haste_cost * (outcome.age < shaping.dwell))
-    return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
-
-
-def lost(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
-    """(B, N) bool: agents that came too close."""
-    return np.asarray(outcome.clearance < safe_distance + shaping.margin)

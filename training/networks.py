@@ -102,7 +102,7 @@ def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[T
         y = torch.baddbmm(biases[0], x, weights[0]).relu_()
     else:
         weight, bias = first or side_by_side(weights[0], biases[0])
-        y = torch.addmm(bias, x, weight).relu_().view(len(x), len(weights[0]), -1).transpose(0, 1)
+        y = torch.addmm(bias, x, weight).relu_().view(x.shape[0], len(weights[0]), -1).transpose(0, 1)
     for weight, bias in zip(weights[1:-1], biases[1:-1], strict=True):
         y = torch.baddbmm(bias, y, weight).relu_()
     return torch.baddbmm(biases[-1], y, weights[-1])

@@ -7,7 +7,8 @@ from typing import Any
 
 from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.shipped import FOLDER
-from marlbc_mj.training.config import METHODS, flat_settings, make_config
+from marlbc_mj.training.config import flat_settings, make_config
+from marlbc_mj.training.methods import METHODS
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file, write_json
 from marlbc_mj.util.provenance import plain_data

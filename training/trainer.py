@@ -11,7 +11,7 @@ import torch
 
 from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.tasks.batch import Outcome
-from marlbc_mj.training.base import BaseTrainer, lost, prefixed, shaped_reward, unprefixed
+from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
@@ -20,8 +20,6 @@ from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.prioritised import PrioritisedReplay
 from marlbc_mj.training.replay import Replay
 from marlbc_mj.training.rivals import learner_class, own_entries
-
-__all__ = ["LATE_TEMPERATURE", "WARM_UP", "Trainer", "lost", "shaped_reward"]
 
 WARM_UP = 5_000
 """Transitions before the networks are updated, and the states hashed at the earliest."""
