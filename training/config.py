@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, is_dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
 
 from marlbc_mj.training.methods import METHODS, PPO, WITHOUT_RISKS
 from marlbc_mj.training.shaping import Shaping
@@ -20,9 +20,6 @@ from marlbc_mj.util.settings import (
     json_data,
     texts,
 )
-
-if TYPE_CHECKING:
-    from _typeshed import DataclassInstance
 
 MOST_BITS = 24
 _BITS = Rule(f"must be at most {MOST_BITS} (the tables have 2^bits rows per agent)", lambda bits: bits <= MOST_BITS)
@@ -255,7 +252,13 @@ def _without_types(data: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _without_types(value) if isinstance(value, dict) else value for name, value in data.items() if name != "type"}
 
 
-Settings = TypeVar("Settings", bound="DataclassInstance")
+class _Dataclass(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Settings = TypeVar("Settings", bound=_Dataclass)
 
 
 def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "") -> Settings:

@@ -158,12 +158,8 @@ def _choice(value: Any, hint: Any) -> Any:
 
 
 def _dataclass_hook(kind: type, converter: BaseConverter) -> Hook:
-    """For a table; :data:`Unlimited` fields have the annotation ``float`` there, so that their hook is named."""
-    hooks: dict[str, Any] = {
-        name: override(struct_hook=converter.get_structure_hook(Unlimited))
-        for name, hint in annotations(kind).items()
-        if hint is Unlimited
-    }
+    unlimited = override(struct_hook=converter.get_structure_hook(Unlimited))
+    hooks: dict[str, Any] = {name: unlimited for name, hint in annotations(kind).items() if hint is Unlimited}
     fill: Hook = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True, **hooks)
 
     def structure(value: Any, _: Any) -> Any:
