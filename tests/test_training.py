@@ -9,7 +9,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.policies.greedy import SLACK, Policy, admissible, greedy
+from marlbc_mj.policies.greedy import RISK_SLACK, Policy, admissible, greedy
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
@@ -314,7 +314,7 @@ def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
 def test_some_order_is_always_admissible(risks, limit):
     allowed = admissible(np.array(risks), np.array([min(risks)]), limit)
     assert allowed[np.argmin(risks)]
-    assert allowed.tolist() == [r <= limit or r <= min(risks) + SLACK for r in risks]
+    assert allowed.tolist() == [r <= limit or r <= min(risks) + RISK_SLACK for r in risks]
     both = (torch.tensor(x, dtype=torch.float64) for x in (risks, [min(risks)]))
     assert (admissible(*both, limit).numpy() == allowed).all()
 

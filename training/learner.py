@@ -1,16 +1,14 @@
 """Independent deep Q-learners of a team: dueling, averaged targets, lenient (17) or hysteretic about negative errors."""
 
 import copy
-import math
 from collections.abc import Iterable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.policies.greedy import admissible
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved, with_moments
+from marlbc_mj.training.networks import TargetRing, TeamNetwork, mask_risky, restore, saved, with_moments
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
@@ -125,9 +123,7 @@ class Learner:
         """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M)."""
         if not self.network.risk:
             return values, torch.zeros(values.shape[:-1], device=values.device)
-        least = risks.amin(dim=-1, keepdim=True)
-        allowed = admissible(risks, least, self.config.risk_limit)
-        return torch.where(allowed, values, torch.full((), -math.inf, device=values.device)), least[..., 0]
+        return mask_risky(values, risks, self.config.risk_limit)
 
     def risk_loss(self, batch: Batch, logits: Tensor, least: Tensor) -> Tensor:
         """Cross entropy of the risks of the chosen actions: 1 where the agent was lost, else risk_gamma min_b risk(s', b).

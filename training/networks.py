@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.policies.greedy import admissible, dueling_value
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -83,7 +84,19 @@ class TeamNetwork(nn.Module):
         if not self.dueling:
             return outputs[..., : self.actions], outputs[..., self.actions :]
         value, advantage, risk = outputs[..., :1], outputs[..., 1 : 1 + self.actions], outputs[..., 1 + self.actions :]
-        return value + advantage - advantage.mean(dim=-1, keepdim=True), risk
+        return dueling_value(value, advantage, advantage.mean(dim=-1, keepdim=True)), risk
+
+
+def mask_risky(values: Tensor, risks: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Values (..., A) with -inf for actions that are too risky, and the least risks (...).
+
+    Args:
+        values: (..., A).
+        risks: (..., A) in [0, 1].
+        limit: largest risk that is taken.
+    """
+    least = risks.amin(dim=-1, keepdim=True)
+    return torch.where(admissible(risks, least, limit), values, -math.inf), least[..., 0]
 
 
 def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

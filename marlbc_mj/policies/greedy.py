@@ -1,4 +1,8 @@
-"""A trained team without torch: states in, actions out."""
+"""A trained team without torch: states in, actions out.
+
+Three laws make the greedy policy: :func:`dueling_value`, :func:`admissible` and :func:`switches`. They work element by element on
+numbers in compiled code, on NumPy arrays and on torch tensors, so that learning, flying and the export share them.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,6 @@ from marlbc_mj.core.laws import compiled, inlined
 
 if TYPE_CHECKING:
     from torch import Tensor
-
-SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
-"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
 
 class Policy(NamedTuple):
@@ -48,12 +49,46 @@ class Policy(NamedTuple):
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
+RISK_SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
+"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
+
+
+@inlined
+def dueling_value(value: Array, advantage: Array, mean: Array) -> Array:
+    """Q(s, a) = V(s) + B(s, a) - mean_b B(s, b) (Wang et al. 2016).
+
+    Args:
+        value: (..., 1) V.
+        advantage: (..., A) B.
+        mean: (..., 1) of the advantages.
+    """
+    result: Array = value + advantage - mean
+    return result
 
 
 @inlined
 def admissible(risks: Array, least: Array, limit: float) -> Array:
-    """Bool (..., A): which actions may be taken, by their risks (..., A) and the least of these (..., 1)."""
-    return (risks <= limit) | (risks <= least + SLACK)
+    """Bool (..., A): which actions may be taken. Some always may.
+
+    Args:
+        risks: (..., A) of the actions.
+        least: (..., 1) the smallest of these.
+        limit: largest risk that is taken.
+    """
+    return (risks <= limit) | (risks <= least + RISK_SLACK)
+
+
+@inlined
+def switches(lead: Array, fresh: Array, margin: float) -> Array:
+    """Bool: whether the best action replaces the last one.
+
+    Args:
+        lead: how much higher the best action's value is.
+        fresh: whether there is no last action.
+        margin: lead that is needed.
+    """
+    result: Array = (lead > margin) | fresh
+    return result
 
 
 def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: float) -> np.ndarray:
@@ -86,8 +121,8 @@ def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
             if not 0 <= last[b, i] < values.shape[2]:
                 raise IndexError("a last action is no index into the action values")
             action = values[b, i].argmax()
-            leads = values[b, i, action] - values[b, i, last[b, i]] > margin
-            best[b, i] = action if leads or fresh[b] else last[b, i]
+            lead = values[b, i, action] - values[b, i, last[b, i]]
+            best[b, i] = action if switches(lead, fresh[b], margin) else last[b, i]
     return best
 
 
@@ -117,7 +152,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):  # ty
             if dueling:
                 mean = q.sum() / np.float32(actions)
                 for a in range(actions):
-                    q[a] = y[0] + q[a] - mean
+                    q[a] = dueling_value(y[0], q[a], mean)
             if limit > 0.0:
                 for a in range(actions):
                     risks[a] = one / (one + np.exp(-y[dueling + actions + a]))
