@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
-from marlbc_mj.policies.greedy import Policy, switches
+from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import TeamNetwork, mask_risky
 from marlbc_mj.util.errors import ConfigurationError
@@ -121,7 +121,7 @@ class TeamPolicy(nn.Module):
             kept = (kept * self.strides).sum(dim=-1, keepdim=True)
         best = values.argmax(dim=-1)
         lead = values.gather(-1, best[..., None]) - values.gather(-1, kept[..., None])
-        chosen = torch.where(switches(lead[..., 0], fresh, self.margin), best, kept)
+        chosen = torch.where(takes_best(lead[..., 0], fresh, self.margin), best, kept)
         return values, chosen if self.strides is None else chosen.div(self.strides, rounding_mode="floor") % self.each
 
 

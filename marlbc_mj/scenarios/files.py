@@ -28,11 +28,12 @@ from marlbc_mj.util.settings import annotations, choose, convert, misfit, tables
 
 SUFFIX = ".toml"
 MOST_BYTES = 1_000_000
+"""Largest size of a scenario file."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Custom(Mission):
-    """A mission given point by point."""
+    """A mission whose starts, slots and obstacles are given point by point."""
 
     starts: tuple[Point, ...]  # [m]
     slots: tuple[Point, ...]  # FM: offsets from the desired centroid [m]
@@ -42,7 +43,7 @@ class Custom(Mission):
     path_origin: Point = (0.0, 0.0)  # [m]
     path_velocity: Point = (1.0, 0.0)  # [m/s]
     obstacles: tuple[Obstacle, ...] = ()  # [x, y] or [x, y, radius] each [m]
-    motions: tuple[Motion, ...] = ()  # [vx, vy, ax, ay, period, phase] each, as many of them as are not zero
+    motions: tuple[Motion, ...] = ()  # [vx, vy, ax, ay, period, phase] each; zeros at the end may be left out
     schedule: tuple[Window, ...] = ()  # [start, end, agent, order] each
     duration: float = 60.0  # [s]
 
@@ -56,9 +57,13 @@ class Custom(Mission):
 def load_scenario(path: str | Path, **changes: Any) -> Scenario:
     """The scenario of a TOML file, with any of its fields changed.
 
+    Args:
+        path: the file.
+        **changes: fields of the family, or of the scenario where the family has none of that name.
+
     Raises:
-        ConfigurationError: no such file, no TOML, an unknown or mistyped key (named, with the valid ones), or values that cannot
-            be flown (with the reason).
+        ConfigurationError: no such file, no TOML, an unknown key or a value of another type (named, with the valid ones), or a
+            mission that cannot be flown (with the reason).
     """
     content = _read(Path(path))
     name = content.pop("family", None)
