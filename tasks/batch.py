@@ -18,6 +18,7 @@ from marlbc_mj.policies.states import OLD, make_state
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.seeding import stream
 
 TRIES = 20
 """Places along the route that are tried for an exploring start."""
@@ -299,11 +300,6 @@ class FormationBatch:
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
         """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
         return np.asarray(violates(clearances(positions, obstacles), self.scenario.safe_distance))
-
-
-def stream(seed: int, world: int) -> np.random.Generator:
-    """The random stream of one world, (seed, b)."""
-    return np.random.default_rng(np.random.SeedSequence([seed, world]))
 
 
 def happens(share: float, rng: np.random.Generator) -> bool:

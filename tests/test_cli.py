@@ -16,7 +16,8 @@ from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
 from marlbc_mj.studies.bench import Stopwatch, matrix
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
-from marlbc_mj.training.config import METHODS, PRESETS
+from marlbc_mj.training.config import PRESETS
+from marlbc_mj.training.methods import METHODS
 
 SHORT = ("--duration", "1.0")
 

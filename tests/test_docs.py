@@ -13,7 +13,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.studies.learners import VARIANTS
 from marlbc_mj.supervisors import SUPERVISORS
-from marlbc_mj.training.config import METHODS
+from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.rivals import LEARNERS
 
 DOCS = Path(__file__).parent.parent / "docs"

@@ -19,9 +19,10 @@ from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.policies.states import STATES, make_state
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.tasks.batch import FormationBatch, Starts
-from marlbc_mj.training.config import METHODS, PPO, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import TrainConfig, from_json, make_config
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss, log_probability
+from marlbc_mj.training.methods import METHODS, PPO
 from marlbc_mj.training.prioritised import ALPHA, BETA, LEAST_ERROR, PrioritisedReplay
 from marlbc_mj.training.replay import Batch
 from marlbc_mj.training.rivals import LEARNERS, QMIX, RLMS, VDN, Central, Mixer, learner_class, own_entries
@@ -56,7 +57,7 @@ def learner_of(kind, **changes):
 def both(learner, batch):
     """Values of the chosen actions and their targets."""
     return learner.estimates(
-        batch, learner.network(torch.from_numpy(batch.state)), learner.targets(torch.from_numpy(batch.next_state))
+        batch, learner.network(torch.from_numpy(batch.state)), learner.targets.heads(torch.from_numpy(batch.next_state))[0]
     )
 
 
@@ -64,7 +65,7 @@ def test_vdn_by_hand():
     learner, batch = learner_of(VDN), batch_of(seed=9)
     chosen, target = both(learner, batch)
     now = learner.values(batch.state)
-    ahead = learner.targets(torch.from_numpy(batch.next_state)).numpy()
+    ahead = learner.targets.heads(torch.from_numpy(batch.next_state))[0].numpy()
     for m in range(len(batch.state)):
         assert chosen[0, m].item() == pytest.approx(sum(now[m, i, batch.action[m, i]] for i in range(N)), rel=1e-4)
         expected = sum(batch.reward[m, i] + batch.discount[m, i] * ahead[i, m].max() for i in range(N))
@@ -89,7 +90,7 @@ def test_qmix_by_hand():
     learner, batch = learner_of(QMIX), batch_of(seed=9)
     chosen, target = both(learner, batch)
     now = learner.values(batch.state)
-    ahead = learner.targets(torch.from_numpy(batch.next_state)).numpy()
+    ahead = learner.targets.heads(torch.from_numpy(batch.next_state))[0].numpy()
     for m in range(len(batch.state)):
         own = np.array([now[m, i, batch.action[m, i]] for i in range(N)])
         assert chosen[0, m].item() == pytest.approx(mixed(learner.mixer, own, batch.state[m]), rel=1e-4)
@@ -130,7 +131,7 @@ def test_central_by_hand():
     learner, batch = learner_of(Central), batch_of(seed=9)
     chosen, target = both(learner, batch)
     now, present = learner.values(batch.state)[:, 0], learner.values(batch.next_state)[:, 0]
-    past = learner.targets(torch.from_numpy(batch.next_state)).numpy()[0]
+    past = learner.targets.heads(torch.from_numpy(batch.next_state))[0].numpy()[0]
     assert now.shape == (6, A**N)
     for m, (a, b, c) in enumerate(batch.action):
         assert chosen[0, m].item() == pytest.approx(now[m, (a * A + b) * A + c], rel=1e-5)
@@ -276,11 +277,11 @@ def test_an_agent_on_its_own_does_not_see_the_others():
     states = rng.normal(size=(4, S)).astype(np.float32)
     exported = learner.network.weights[0].detach().numpy()
     assert (exported[mask == 0] == 0).all() and (exported[mask == 1] != 0).all()
-    before, past = learner.values(states), learner.targets(torch.from_numpy(states))
+    before, past = learner.values(states), learner.targets.heads(torch.from_numpy(states))[0]
     for i in range(N):
         other = np.where(mask[i] == 1, states, 5.0).astype(np.float32)
         assert (learner.values(other)[:, i] == before[:, i]).all()
-        assert torch.equal(learner.targets(torch.from_numpy(other))[i], past[i])
+        assert torch.equal(learner.targets.heads(torch.from_numpy(other))[0][i], past[i])
         assert (learner.values(np.where(mask[i] == 0, states, 5.0))[:, i] != before[:, i]).all()
 
 

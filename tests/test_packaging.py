@@ -106,6 +106,32 @@ def test_public_names_exist() -> None:
     assert [name for name in names if not hasattr(marlbc_mj, name)] == []
 
 
+def _loaded_by(code: str) -> set[str]:
+    """Top-level modules that a fresh process has loaded after ``code``."""
+    report = f"import sys\n{code}\nprint(*{{name.split('.')[0] for name in sys.modules}})"
+    return set(subprocess.run([sys.executable, "-c", report], check=True, capture_output=True, text=True).stdout.split())
+
+
+def test_the_package_itself_loads_nothing_heavy() -> None:
+    """A renderer can still be chosen: its environment variable must be set before MuJoCo is imported."""
+    assert not {"mujoco", "numba", "numpy", "torch"} & _loaded_by("import marlbc_mj")
+
+
+@pytest.mark.parametrize("name", ["ConfigurationError", "laws", "paper", "World"])
+def test_a_public_name_needs_no_other(name: str) -> None:
+    """Classes, functions and a module, each the first that a process asks for."""
+    assert "marlbc_mj" in _loaded_by(f"from marlbc_mj import {name}")
+
+
+def test_what_does_not_learn_loads_no_torch() -> None:
+    """Supervisors with a trained policy, environments, reports and the command line; nor does any file outside training/."""
+    names = ("supervisors", "policies.checkpoint", "episode", "tasks.gymnasium_env", "report", "cli", "training.config")
+    loaded = _loaded_by("\n".join(f"import marlbc_mj.{name}" for name in names))
+    assert "mujoco" in loaded and "torch" not in loaded
+    learning = {path.parent.name for path in SOURCES if "torch" in _imports(path)}
+    assert learning == {"training", "policies"}  # policies/greedy.py names its types only
+
+
 @pytest.mark.parametrize("name", ["marlbc_mj.controllers", "marlbc_mj.scenarios", "marlbc_mj.supervisors", "marlbc_mj.tasks"])
 def test_public_names_of_subpackages_exist(name: str) -> None:
     """Each name of a subpackage's ``__all__`` can be had."""

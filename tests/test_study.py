@@ -29,7 +29,8 @@ from marlbc_mj.studies.learners import (
 )
 from marlbc_mj.studies.learners_report import WIDE, by_variant, rows_of_panels, study_table, write_report
 from marlbc_mj.training import run
-from marlbc_mj.training.config import CARE, TrainConfig
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.methods import CARE
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util.errors import ConfigurationError
 

@@ -16,17 +16,20 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+import torch
 from safetensors.numpy import load_file, save_file
 
 from marlbc_mj import World, paper, run_episode
 from marlbc_mj.cli import main
-from marlbc_mj.cli.training import with_settings
 from marlbc_mj.policies.checkpoint import read_arrays, read_policy, write_arrays
 from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.training.config import TrainConfig, make_config
-from marlbc_mj.training.run import RESUME, rank, resume, train
+from marlbc_mj.training.codes import StateHash
+from marlbc_mj.training.config import TrainConfig, make_config, with_settings
+from marlbc_mj.training.methods import METHODS
+from marlbc_mj.training.networks import TeamNetwork
+from marlbc_mj.training.run import RESUME, make_trainer, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util import provenance
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -88,6 +91,21 @@ def test_what_is_learned_does_not_depend_on_the_threads():
     two.replay.arrays["reward"][:] = np.nan
     with pytest.raises(ConfigurationError, match="diverged after"):
         two.advance()
+
+
+@pytest.mark.parametrize("method", ["marlms", "mappo"])
+def test_torch_has_one_thread_wherever_it_computes(method, monkeypatch):
+    """However many the worlds have, whose thread pool sets the number for torch too: sums must not depend on it."""
+    threads, changes = [], METHODS[method][0]
+    heads = TeamNetwork.heads
+    monkeypatch.setattr(TeamNetwork, "heads", lambda *inputs: (threads.append(torch.get_num_threads()), heads(*inputs))[1])
+    fit = StateHash.fit
+    monkeypatch.setattr(StateHash, "fit", lambda *inputs: (threads.append(torch.get_num_threads()), fit(*inputs))[1])
+    config = small(**{**changes, "method": method, "threads": numba.config.NUMBA_NUM_THREADS})
+    trainer = make_trainer(config)
+    for _ in range(45):  # past the fit of the hash
+        trainer.advance()
+    assert trainer.updates and set(threads) == {1}
 
 
 def test_seeds_differ_and_repeat():

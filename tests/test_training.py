@@ -9,17 +9,19 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.policies.greedy import SLACK, Policy, admissible, greedy
+from marlbc_mj.policies.greedy import RISK_SLACK, Policy, admissible, greedy
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.codes import StateHash
-from marlbc_mj.training.config import METHODS, PRESETS, Shaping, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
 from marlbc_mj.training.exploration import Exploration, shares
 from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
+from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.networks import TargetRing, TeamNetwork
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import RLMS, VDN
-from marlbc_mj.training.trainer import WARM_UP, Trainer, lost, shaped_reward
+from marlbc_mj.training.shaping import Shaping, lost, shaped_reward
+from marlbc_mj.training.trainer import WARM_UP, Trainer
 from marlbc_mj.util.errors import ConfigurationError
 
 N, S, A = 3, 5, 4
@@ -68,7 +70,7 @@ def test_the_mean_of_a_dueling_network_is_its_value():
 def test_averaged_targets_are_the_mean_over_the_last_copies():
     net, x = network(), torch.randn(6, S, generator=generator(2))
     ring = TargetRing(net, 3)
-    assert torch.allclose(ring(x), net(x), atol=1e-6)
+    assert torch.allclose(ring.heads(x)[0], net(x), atol=1e-6)
     past = [net(x).detach()] * 3
     for k in range(5):
         with torch.no_grad():
@@ -76,7 +78,7 @@ def test_averaged_targets_are_the_mean_over_the_last_copies():
                 p.add_(0.1 * torch.randn(p.shape, generator=generator(10 + k)))
         ring.push()
         past = [*past[1:], net(x).detach()]
-        assert torch.allclose(ring(x), torch.stack(past).mean(dim=0), atol=1e-5)
+        assert torch.allclose(ring.heads(x)[0], torch.stack(past).mean(dim=0), atol=1e-5)
 
 
 def test_a_policy_equals_the_network():
@@ -238,7 +240,7 @@ def test_one_update_by_hand(huber):
     discount = np.array([[0.9, 0.9], [0.0, 0.9]], dtype=np.float32)  # over for the first agent of the second transition
     batch = Batch(state, action, reward, discount, after, np.ones((2, 2), np.float32))
     q = learner.network(torch.from_numpy(state))
-    ahead = learner.targets(torch.from_numpy(after)).amax(dim=-1)
+    ahead = learner.targets.heads(torch.from_numpy(after))[0].amax(dim=-1)
     target = torch.from_numpy(reward.T) + torch.from_numpy(discount.T) * ahead
     chosen = torch.stack([torch.stack([q[i, m, action[m, i]] for m in range(2)]) for i in range(2)])
     error = (target - chosen).detach()
@@ -312,7 +314,7 @@ def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
 def test_some_order_is_always_admissible(risks, limit):
     allowed = admissible(np.array(risks), np.array([min(risks)]), limit)
     assert allowed[np.argmin(risks)]
-    assert allowed.tolist() == [r <= limit or r <= min(risks) + SLACK for r in risks]
+    assert allowed.tolist() == [r <= limit or r <= min(risks) + RISK_SLACK for r in risks]
     both = (torch.tensor(x, dtype=torch.float64) for x in (risks, [min(risks)]))
     assert (admissible(*both, limit).numpy() == allowed).all()
 

@@ -1,4 +1,4 @@
-"""What every training run has: worlds, a learner's reward, and a state that can be saved and gone back to bit for bit."""
+"""What every training run has: worlds, a learner's reward, and a state that can be saved and restored bit for bit."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -10,13 +10,17 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
-from marlbc_mj.training.config import Shaping, TrainConfig
+from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TeamNetwork
+from marlbc_mj.training.shaping import lost, shaped_reward
 from marlbc_mj.util.errors import ConfigurationError
 
 
 class BaseTrainer(ABC):
     """One run. :meth:`advance` makes a decision in every world and learns from it.
+
+    Args:
+        config: configuration of the run.
 
     Raises:
         ConfigurationError: a scenario, controller or device that cannot be used.
@@ -25,7 +29,6 @@ class BaseTrainer(ABC):
     def __init__(self, config: TrainConfig) -> None:
         if config.device == "cuda" and not torch.cuda.is_available():
             raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
-        torch.set_num_threads(1)  # the networks are small: a second thread gains nothing, and results would depend on it
         self.config = config
         self.scenario = make_scenario(config.scenario)
         self.batch = FormationBatch(
@@ -40,10 +43,11 @@ class BaseTrainer(ABC):
         )
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.state = self.batch.reset(config.seed)
-        self.steps = 0  # mission steps made
-        self.error = 0.0  # of the last update, mean |TD|
+        self.state = self.batch.reset(config.seed)  # (B, S)
+        self.steps = 0  # mission steps made, over all worlds
+        self.error = 0.0  # mean absolute TD error of the last update
         self.explored = 0.0  # share of the last actions that were not greedy
+        single_thread()
 
     @property
     def finished(self) -> bool:
@@ -53,12 +57,12 @@ class BaseTrainer(ABC):
     @property
     @abstractmethod
     def updates(self) -> int:
-        """Gradient steps made."""
+        """Number of gradient steps made."""
 
     @property
     @abstractmethod
     def temperature(self) -> float:
-        """How random the actions are meant to be, from 1 downwards."""
+        """How random the actions are meant to be; it falls from 1."""
 
     @property
     @abstractmethod
@@ -67,11 +71,20 @@ class BaseTrainer(ABC):
 
     @abstractmethod
     def advance(self) -> Outcome:
-        """One decision in every world, and what is learned then."""
+        """Make one decision in every world and learn from it."""
+
+    def step(self, actions: np.ndarray) -> Outcome:
+        """Make the decision ``actions`` (B, N) in every world."""
+        outcome = self.batch.step(actions)
+        single_thread()
+        return outcome
 
     def judge(self, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """(B, N) float32 rewards to learn from, and bool: the agent's return ends here, by the mission's end or its own loss;
-        the agent came too close.
+        """What a decision means for each agent.
+
+        Returns:
+            (B, N) float32 rewards to learn from; (B, N) bool, whether the agent's return ends here, by the end of the mission or
+            because the agent was lost at a cost; (B, N) bool, whether it was lost.
         """
         shaping = self.config.shaping
         gone = lost(outcome, shaping, self.scenario.safe_distance)
@@ -80,12 +93,12 @@ class BaseTrainer(ABC):
         return reward, outcome.terminal[:, None] | pays, gone
 
     def learning_rate(self, share: float) -> float:
-        """From the first to the final one, linear in the ``share`` of the budget that is spent."""
+        """Step size when a ``share`` of the budget is spent: linear from the first to the final one."""
         config = self.config
         return config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * max(0.0, 1.0 - share)
 
     def refuse_nonsense(self) -> None:
-        """Raise ConfigurationError where the last update's error is not a number."""
+        """Raise ConfigurationError if the last update's error is not finite."""
         if not np.isfinite(self.error):
             raise ConfigurationError(f"the networks diverged after {self.steps} mission steps; try a lower learning_rate")
 
@@ -114,7 +127,7 @@ class BaseTrainer(ABC):
         return arrays, scalars
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Go on from a :meth:`snapshot` of a run with the same configuration."""
+        """Return to a :meth:`snapshot` of a run with the same configuration."""
         self.batch.world.restore(unprefixed("world", arrays))
         for owner, name in self.plain_arrays():
             setattr(owner, name, arrays[name].copy())
@@ -125,12 +138,21 @@ class BaseTrainer(ABC):
         self.steps, self.error = scalars["steps"], scalars["error"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
-        """Arrays that are attributes, by owner and name."""
+        """Arrays that are attributes, as pairs of owner and name."""
         return [(self, "state"), *((self.batch, name) for name in ("cut", "last", "age"))]
 
 
+def single_thread() -> None:
+    """Have torch use one thread: the networks are small, so a second one gains nothing, and sums would depend on the number.
+
+    numba's thread pool shares OpenMP with torch and sets its number of threads at every parallel loop, so this must be said again
+    after each of them. Networks that learn aside have a thread, and so a number, of their own.
+    """
+    torch.set_num_threads(1)
+
+
 def make_starts(config: TrainConfig) -> Starts:
-    """Where a run's episodes begin."""
+    """Where the episodes of a run begin."""
     return Starts(config.exploring_starts, config.start_length, config.focus, turning=config.turning)
 
 
@@ -142,15 +164,3 @@ def prefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray
 def unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays that are under ``prefix.name``, by name."""
     return {name.removeprefix(f"{prefix}."): array for name, array in arrays.items() if name.startswith(f"{prefix}.")}
-
-
-def shaped_reward(outcome: Outcome, shaping: Shaping) -> np.ndarray:
-    """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says; see :func:`lost`."""
-    team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps
-    own = outcome.switches * (shaping.own_switch_cost + shaping.haste_cost * (outcome.age < shaping.dwell))
-    return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
-
-
-def lost(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
-    """(B, N) bool: agents that came too close."""
-    return np.asarray(outcome.clearance < safe_distance + shaping.margin)

@@ -1,23 +1,27 @@
-"""Hash codes of states: sign(A (z - mean z)) of an auto-encoder's code z, or of the state itself (Tang et al. 2017)."""
+"""Hash codes of states: the signs of A (z - mean z), z the code of an auto-encoder or the state itself (Tang et al. 2017)."""
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-CODE = 16  # width of the auto-encoder's code
+CODE = 16
+"""Width of the auto-encoder's code."""
 HIDDEN = 32
+"""Width of its hidden layers."""
 MINIBATCHES = 500
+"""Gradient steps of its training."""
 MINIBATCH = 256
+"""States per gradient step."""
 
 
 class StateHash:
-    """Maps states to integers below 2^bits; everything is 0 until :meth:`fit`.
+    """Maps states to integers below 2^bits; all codes are 0 before :meth:`fit`.
 
     Args:
-        size: S.
-        bits: of a hash code.
-        kind: ``"autoencoder"`` or ``"plain"``.
-        rng: of the projection A.
+        size: S, the size of a state.
+        bits: bits of a hash code.
+        kind: ``"autoencoder"``, or ``"plain"`` for z = the state.
+        rng: random numbers of the projection A.
     """
 
     def __init__(self, size: int, bits: int, kind: str, rng: np.random.Generator) -> None:
@@ -36,11 +40,16 @@ class StateHash:
 
     @property
     def fitted(self) -> bool:
-        """Whether codes tell states apart yet."""
+        """Whether the hash was fitted, so that codes tell states apart."""
         return bool(self.arrays["fitted"][0])
 
     def fit(self, states: np.ndarray, generator: torch.Generator) -> float:
-        """Train the auto-encoder on states (M, S), then keep it; returns the last reconstruction error (mean square)."""
+        """Train the auto-encoder once and for all; returns its last reconstruction error (mean square).
+
+        Args:
+            states: (M, S) float32, scaled.
+            generator: random numbers of the initial weights and of the minibatches.
+        """
         error = 0.0
         if self.kind == "autoencoder":
             error = self._train(torch.from_numpy(states), generator)
@@ -51,9 +60,8 @@ class StateHash:
     def _train(self, states: Tensor, generator: torch.Generator) -> float:
         size = states.shape[1]
         first, second = nn.Linear(size, HIDDEN), nn.Linear(HIDDEN, CODE)
-        coder = nn.Sequential(
-            first, nn.Tanh(), second, nn.Tanh(), nn.Linear(CODE, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, size)
-        )  # fmt: skip
+        decoder = nn.Linear(CODE, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, size)
+        coder = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), *decoder)
         for parameter in coder.parameters():
             bound = 1.0 / np.sqrt(parameter.shape[-1])
             parameter.data = (2.0 * torch.rand(parameter.shape, generator=generator) - 1.0) * bound
@@ -71,6 +79,7 @@ class StateHash:
         return float(error.detach())
 
     def _encode(self, states: np.ndarray) -> np.ndarray:
+        """Codes z (M, CODE) of states (M, S)."""
         if self.kind == "plain":
             return states
         a = self.arrays

@@ -1,4 +1,4 @@
-"""TensorBoard scalars of a training run, where the ``tensorboard`` extra is installed."""
+"""TensorBoard scalars of a training run, if the ``tensorboard`` extra is installed."""
 
 from collections.abc import Mapping
 from importlib.util import find_spec
@@ -8,13 +8,17 @@ from typing import Any
 from marlbc_mj.util.files import writing
 
 EVALUATION = ("return", "violation_time", "clearance_min", "switches")
+"""Beginnings of the names of scalars that belong to an evaluation."""
 
 
 class TensorBoard:
-    """Scalars under ``train/*`` and ``eval/*``; does nothing without TensorBoard.
+    """Writes scalars under ``train/*`` and ``eval/*``; does nothing without TensorBoard.
+
+    Args:
+        folder: folder of the event files.
 
     Raises:
-        ConfigurationError: the folder cannot be written; all methods do so.
+        ConfigurationError: the folder cannot be written; all methods raise it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -27,7 +31,12 @@ class TensorBoard:
                 self._writer = SummaryWriter(str(folder))
 
     def write(self, step: int, scalars: Mapping[str, float]) -> None:
-        """One value a name, at this many mission steps."""
+        """Write one value per name.
+
+        Args:
+            step: mission steps made.
+            scalars: the values by name.
+        """
         if self._writer is None:
             return
         with writing(self._folder):
@@ -37,7 +46,7 @@ class TensorBoard:
             self._writer.flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write what is buffered and close the files."""
         if self._writer is not None:
             with writing(self._folder):
                 self._writer.close()

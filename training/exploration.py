@@ -6,28 +6,28 @@ from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.leniency import ZETA
 
 BEGINNING = -1
-"""Decisions left of an order, where an episode has just begun."""
+"""Stands for the decisions left of a held order where an episode has just begun."""
 
 
 class Exploration:
-    """Replaces a share T^zeta of the greedy actions by random ones. With ``hold=1, together=0`` it does so as printed.
+    """Replaces a share T^zeta of the greedy actions by random ones. With ``hold=1, together=0`` it does so as published.
 
-    Every agent has random orders of its own, and the team has joint ones, which go before: while an agent takes part in a joint
-    exploration its own stands still. Each of these is busy for a share of the decisions, see :meth:`_hold`, independently of
-    the others, so that an agent's actions are random in exactly the share T^zeta of all decisions, the first of an episode as
-    well as the last, for any ``hold`` and ``together``. Beyond that share come :meth:`begin` and agreement; short of it falls
-    an agent to which the joint order is not allowed.
+    Every agent has random orders of its own, and the team has joint ones, which come first: while an agent takes part in a joint
+    exploration, its own stands still. Each of these is in force for a share of the decisions, see :meth:`_hold`, independently
+    of the others. So an agent's actions are random in exactly the share T^zeta of all decisions, the first of an episode as well
+    as the last, for any ``hold`` and ``together``. :meth:`begin` and agreement add to that share; an agent to which the joint
+    order is not allowed has less.
 
     Args:
-        config: hold, together and least_exploration of it are used.
+        config: its hold, together, agreement and least_exploration are used.
         agents: N.
-        actions: A.
+        actions: A, number of actions.
     """
 
     def __init__(self, config: TrainConfig, agents: int, actions: int) -> None:
         self.config = config
         self.actions = actions
-        shape = config.worlds, agents + 1  # one column an agent, the team's last
+        shape = config.worlds, agents + 1  # one column per agent, the team's last
         self.left = np.full(shape, BEGINNING, dtype=np.int64)  # decisions that a held order still lasts
         self.held = np.zeros(shape, dtype=np.int64)
         lengths = np.arange(config.hold, 0, -1.0)
@@ -47,10 +47,10 @@ class Exploration:
         Args:
             greedy: (B, N) the best actions.
             temperature: (B, N) each agent's mean temperature.
-            rng: of all draws.
+            rng: random numbers of all draws.
             last: (B, N) actions in force, by which a disagreement is told; without them there is none.
-            allowed: (B, N, A) bool; an agent stays out of what the team does jointly while the order is not allowed for it: what
-                the team would gain by endangering a member must not make the order look good to the others.
+            allowed: (B, N, A) bool. An agent stays out of what the team does jointly while the order is not allowed for it:
+                otherwise the team's gain from endangering a member would make the order look good to the others.
         """
         greedy = greedy if last is None else self._agree(greedy, last, allowed, rng)
         joint, alone = shares(self._share(temperature), self.config.together)
@@ -63,7 +63,7 @@ class Exploration:
         return np.where(inside, self.held[:, -1:], np.where(busy, self.held[:, :-1], greedy))
 
     def _agree(self, greedy: np.ndarray, last: np.ndarray, allowed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
-        """Where somebody wants to change its order and not all want the same, all may take one member's instead."""
+        """Where an agent wants to change its order and not all want the same, all may take one member's order instead."""
         if not self.config.agreement:
             return greedy
         torn = (greedy != greedy[:, :1]).any(axis=1) & (greedy != last).any(axis=1)
@@ -72,14 +72,21 @@ class Exploration:
         return np.where(agree[:, None] & _permits(allowed, order), order[:, None], greedy)
 
     def _share(self, temperature: np.ndarray) -> np.ndarray:
+        """(B, N) shares of random actions, T^ZETA."""
         return np.asarray(np.maximum(temperature**ZETA, self.config.least_exploration))
 
     def _hold(self, columns: slice, share: np.ndarray, runs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Bool: where a held order is in force; columns of those that do not ``run`` stand still.
+        """Bool: where a held order is in force. Columns that do not run stand still.
 
-        Orders last m = (hold + 1) / 2 decisions on average, so that one that begins in a free decision with probability
-        s / (s + m (1 - s)) is in force in the share s of all decisions. An episode begins amid that: with probability s an order
-        is under way, with the rest of its length left.
+        Orders last m = (hold + 1) / 2 decisions on average. One that begins in a free decision with probability
+        s / (s + m (1 - s)) is therefore in force in the share s of all decisions. An episode begins in the middle of that: with
+        probability s an order is under way, with the rest of its length left.
+
+        Args:
+            columns: of ``left`` and ``held``: the agents' or the team's.
+            share: s of each column.
+            runs: bool, whether a column runs.
+            rng: random numbers of the draws.
         """
         hold, shape = self.config.hold, share.shape
         first = self.left[:, columns] == BEGINNING
@@ -93,26 +100,34 @@ class Exploration:
         return np.asarray(busy)
 
     def begin(self, orders: np.ndarray, rng: np.random.Generator) -> None:
-        """Have whole teams take one order for 1 to ``hold`` decisions; ``orders`` (B,), -1 for teams that go on as they are."""
+        """Have whole teams take one order for 1 to ``hold`` decisions.
+
+        Args:
+            orders: (B,) the orders, -1 for teams that go on as they are.
+            rng: random numbers of the lengths.
+        """
         teams = orders >= 0
         self.held[teams, -1] = orders[teams]
         self.left[teams, -1] = rng.integers(1, self.config.hold + 1, size=int(teams.sum()))
 
     def forget(self, ended: np.ndarray) -> None:
-        """Drop held orders of worlds whose episode ended; ``ended`` (B,)."""
+        """Drop the held orders of worlds whose episode ``ended`` (B,)."""
         self.left[ended] = BEGINNING
 
 
 def _permits(allowed: np.ndarray | None, order: np.ndarray) -> np.ndarray | bool:
-    """(B, N) bool: to which agents each team's ``order`` (B,) is allowed."""
+    """(B, N) bool: the agents to which each team's ``order`` (B,) is allowed."""
     return True if allowed is None else np.asarray(allowed[np.arange(len(order)), :, order])
 
 
 def shares(share: np.ndarray, together: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of joint explorations (B,), and of agents' own (B, N) outside of these, that make up each agent's ``share`` (B, N).
+    """Shares of joint explorations (B,), and of the agents' own outside of these (B, N), that make up each agent's share.
 
-    j = together * (mean share), or the smallest share where agents differ so much that the joint orders alone would be too many
-    for one; then s = j + (1 - j) alone.
+    j = min(together mean_i s_i, min_i s_i), so that no agent explores more than its share, and s_i = j + (1 - j) alone_i.
+
+    Args:
+        share: (B, N) s, share of random actions of each agent.
+        together: wanted share of the explorations that are joint.
     """
     joint = np.minimum(together * share.mean(axis=1), share.min(axis=1))
     rest = 1.0 - joint[:, None]

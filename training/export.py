@@ -1,22 +1,30 @@
-"""A trained team as an ONNX file, for computers that have an ONNX runtime and no Python; needs the ``onnx`` extra."""
+"""A trained team as an ONNX file, for computers that have an ONNX runtime and no Python; needs the ``onnx`` extra.
+
+torch writes the graph from the networks that learn, so there is no second definition of a policy here.
+"""
 
 import json
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
-import numpy as np
+import torch
+from torch import Tensor, nn
 
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
-from marlbc_mj.policies.greedy import SLACK, Policy
+from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.training.networks import TeamNetwork, mask_risky
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import staged_file
+from marlbc_mj.util.files import check_target, staged_file
 
-OPSET = 17
-"""Of the operators: ONNX 1.12 (2022) and everything since run it."""
+OPSET = 18
+"""Version of the operators: ONNX 1.13 (2022) and everything since runs it. torch's exporter writes no older one."""
 IR = 8
 """Version of the file format that goes with it."""
 
@@ -34,9 +42,10 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     stands for), ``margin`` and ``risk``.
 
     Raises:
-        ConfigurationError: no ``onnx`` package, no checkpoint, or ``out`` is there already.
+        ConfigurationError: no ``onnx`` extra, no checkpoint, or ``out`` is there already.
     """
-    onnx = _onnx()
+    _need_packages()
+    check_target(out, overwrite=overwrite)
     policy, description = read_policy(checkpoint)
     try:
         signature, scenario = description["signature"], make_scenario(description["train"]["scenario"])
@@ -50,7 +59,7 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
         "margin": repr(policy.margin),
         "risk": repr(policy.risk),
     }
-    model = build(policy, agents, metadata, onnx)
+    model = build(policy, agents, metadata)
     with staged_file(out, overwrite=overwrite) as staging:
         staging.write_bytes(model.SerializeToString())
     networks, values = policy.weights[-1].shape[0], policy.columns
@@ -60,109 +69,97 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     )
 
 
-def _onnx() -> ModuleType:
-    """The optional package.
+def _need_packages() -> None:
+    """Raise ConfigurationError where the optional packages are not installed."""
+    for name in ("onnx", "onnxscript"):
+        try:
+            import_module(name)
+        except ImportError:
+            raise ConfigurationError(f"marlbc export needs the {name} package: pip install 'marlbc-mj[onnx]'") from None
 
-    Raises:
-        ConfigurationError: it is not installed.
+
+class TeamPolicy(nn.Module):
+    """``Policy.values`` and ``greedy`` of N agents in torch.
+
+    Args:
+        policy: whose networks these are.
+        agents: N; where there is one network for all, its actions are joint ones, in C order.
     """
+
+    def __init__(self, policy: Policy, agents: int) -> None:
+        super().__init__()
+        networks, hidden = len(policy.weights[0]), tuple(bias.shape[2] for bias in policy.biases[:-1])
+        self.network = TeamNetwork(
+            networks,
+            len(policy.scale),
+            policy.columns,
+            hidden,
+            torch.tensor(policy.scale),
+            dueling=policy.dueling,
+            risk=policy.risk > 0,
+        ).requires_grad_(False)
+        for own, trained in ((self.network.weights, policy.weights), (self.network.biases, policy.biases)):
+            for parameter, array in zip(own, trained, strict=True):
+                parameter.copy_(torch.tensor(array))
+        self.margin, self.risk = policy.margin, policy.risk
+        self.each = policy.columns if networks == agents else round(policy.columns ** (1 / agents))
+        self.strides: Tensor | None  # of the agents' actions in a joint one
+        strides = torch.tensor([self.each ** (agents - 1 - i) for i in range(agents)])
+        self.register_buffer("strides", None if networks == agents else strides)
+
+    def forward(self, state: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (B, N, A), or (B, 1, A^N), and chosen actions (B, N), from states (B, S) and last actions (B, N), negative for
+        none.
+        """
+        values, logits = self.network.heads(state)
+        if self.risk:
+            values, _ = mask_risky(values, torch.sigmoid(logits), self.risk)
+        values = values.transpose(0, 1)
+        fresh = last.amin(dim=-1, keepdim=True) < 0
+        kept = last.clamp(min=0)
+        if self.strides is not None:
+            kept = (kept * self.strides).sum(dim=-1, keepdim=True)
+        best = values.argmax(dim=-1)
+        lead = values.gather(-1, best[..., None]) - values.gather(-1, kept[..., None])
+        chosen = torch.where(takes_best(lead[..., 0], fresh, self.margin), best, kept)
+        return values, chosen if self.strides is None else chosen.div(self.strides, rounding_mode="floor") % self.each
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without what torch's exporter says about itself and about packages that it does not need here."""
+    logger = logging.getLogger("torch.onnx")
+    level = logger.level
+    logger.setLevel(logging.ERROR)
     try:
-        return import_module("onnx")
-    except ImportError:
-        raise ConfigurationError("marlbc export needs the onnx package: pip install 'marlbc-mj[onnx]'") from None
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)
 
 
-class _Graph:
-    """Nodes and constants in the making; every method returns the name of a result."""
-
-    def __init__(self, onnx: ModuleType) -> None:
-        self.onnx = onnx
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-
-    def constant(self, value: Any, kind: type = np.float32) -> str:
-        name = f"constant{len(self.constants)}"
-        self.constants.append(self.onnx.numpy_helper.from_array(np.ascontiguousarray(value, dtype=kind), name))
-        return name
-
-    def whole(self, *value: int) -> str:
-        return self.constant(np.array(value), np.int64)
-
-    def add(self, operator: str, *inputs: str, name: str = "", **attributes: Any) -> str:
-        name = name or f"{operator.lower()}{len(self.nodes)}"
-        self.nodes.append(self.onnx.helper.make_node(operator, list(inputs), [name], name=f"node_{name}", **attributes))
-        return name
-
-    def columns(self, x: str, first: int, end: int) -> str:
-        return self.add("Slice", x, self.whole(first), self.whole(end), self.whole(-1))
-
-
-def build(policy: Policy, agents: int, metadata: dict[str, str], onnx: ModuleType) -> Any:
+def build(policy: Policy, agents: int, metadata: dict[str, str]) -> Any:
     """The ``onnx.ModelProto`` of a policy of ``agents``, checked; see :func:`export_policy`."""
-    graph, helper, kinds = _Graph(onnx), onnx.helper, onnx.TensorProto
-    values = _values(graph, policy)
-    _greedy(graph, policy, values, agents)
-    networks = policy.weights[-1].shape[0]
-    made = helper.make_graph(
-        graph.nodes,
-        "policy",
-        [
-            helper.make_tensor_value_info("state", kinds.FLOAT, ["batch", len(policy.scale)]),
-            helper.make_tensor_value_info("last", kinds.INT64, ["batch", agents]),
-        ],
-        [
-            helper.make_tensor_value_info("values", kinds.FLOAT, ["batch", networks, policy.columns]),
-            helper.make_tensor_value_info("orders", kinds.INT64, ["batch", agents]),
-        ],
-        graph.constants,
-    )
-    model = helper.make_model(made, producer_name="marlbc_mj", opset_imports=[helper.make_opsetid("", OPSET)])
+    onnx: Any = import_module("onnx")
+    inputs = torch.zeros(2, len(policy.scale)), torch.zeros(2, agents, dtype=torch.int64)
+    batch = torch.export.Dim("batch")
+    with _quiet():
+        program = torch.onnx.export(
+            TeamPolicy(policy, agents),
+            inputs,
+            dynamo=True,
+            verbose=False,
+            opset_version=OPSET,
+            input_names=["state", "last"],
+            output_names=["values", "orders"],
+            dynamic_shapes=({0: batch}, {0: batch}),
+        )
+    assert program is not None
+    model = program.model_proto
     model.ir_version = IR
-    helper.set_model_props(model, metadata)
+    for entry in (model.graph, *model.graph.node, *model.graph.input, *model.graph.output, *model.graph.value_info):
+        entry.ClearField("metadata_props")  # traces of the source, with paths of this computer; newer than IR
+    onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     return model
-
-
-def _values(graph: _Graph, policy: Policy) -> str:
-    """:meth:`Policy.values`: (batch, N, A)."""
-    y = graph.add("Unsqueeze", graph.add("Div", "state", graph.constant(policy.scale)), graph.whole(0))
-    for k, (weight, bias) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        y = graph.add("Relu", y) if k else y
-        y = graph.add("Add", graph.add("MatMul", y, graph.constant(weight)), graph.constant(bias))
-    y = graph.add("Transpose", y, perm=[1, 0, 2])
-    actions, first = policy.columns, int(policy.dueling)
-    end = first + actions
-    values = graph.columns(y, first, end)
-    if policy.dueling:
-        mean = graph.add("ReduceMean", values, axes=[-1], keepdims=1)
-        values = graph.add("Sub", graph.add("Add", graph.columns(y, 0, 1), values), mean)
-    if not policy.risk:
-        return graph.add("Identity", values, name="values")
-    risks = graph.add("Sigmoid", graph.columns(y, end, end + actions))
-    least = graph.add("ReduceMin", risks, axes=[-1], keepdims=1)
-    low = graph.add("LessOrEqual", risks, graph.constant(policy.risk))
-    lowest = graph.add("LessOrEqual", risks, graph.add("Add", least, graph.constant(SLACK)))
-    return graph.add("Where", graph.add("Or", low, lowest), values, graph.constant(-np.inf), name="values")
-
-
-def _greedy(graph: _Graph, policy: Policy, values: str, agents: int) -> None:
-    """:func:`marlbc_mj.policies.greedy.greedy`: (batch, N) ``orders`` from ``values`` and ``last``."""
-    joint = policy.weights[-1].shape[0] != agents
-    fresh = graph.add("Less", graph.add("ReduceMin", "last", axes=[-1], keepdims=1), graph.whole(0))
-    kept = graph.add("Max", "last", graph.whole(0))
-    if joint:  # actions of the agents are digits of the joint one
-        each = round(policy.columns ** (1 / agents))
-        strides = graph.whole(*(each ** (agents - 1 - i) for i in range(agents)))
-        kept = graph.add("ReduceSum", graph.add("Mul", kept, strides), graph.whole(-1), keepdims=1)
-    best = graph.add("ArgMax", values, axis=-1, keepdims=1)
-    lead = graph.add(
-        "Sub",
-        graph.add("GatherElements", values, best, axis=2),
-        graph.add("GatherElements", values, graph.add("Unsqueeze", kept, graph.whole(2)), axis=2),
-    )
-    ahead = graph.add("Greater", graph.add("Squeeze", lead, graph.whole(2)), graph.constant(policy.margin))
-    chosen = graph.add("Squeeze", best, graph.whole(2))
-    chosen = graph.add("Where", graph.add("Or", ahead, fresh), chosen, kept)
-    if joint:
-        chosen = graph.add("Mod", graph.add("Div", chosen, strides), graph.whole(each))
-    graph.add("Identity", chosen, name="orders")

@@ -1,38 +1,38 @@
-"""Independent deep Q-learners of a team: dueling, averaged targets, lenient (17) or hysteretic about negative errors."""
+"""Independent deep Q-learners of a team: dueling networks, averaged targets, lenient (17) or hysteretic about negative errors."""
 
 import copy
-import math
 from collections.abc import Iterable
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.policies.greedy import admissible
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TargetRing, TeamNetwork, restore, saved, with_moments
+from marlbc_mj.training.networks import TargetRing, TeamNetwork, as_tensor, mask_risky, restore, saved, with_moments
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
 """Weight of a negative TD error of a hysteretic learner (Omidshafiei et al. 2017)."""
 LARGEST_GRADIENT = 10.0
-"""Norm that a gradient is scaled down to: of each network where they learn apart, of all parameters where one loss trains all."""
+"""Norm to which a larger gradient is scaled down: per network where they learn apart, over all parameters where one loss trains
+all."""
 
 
 class Learner:
     """The networks of N agents, their targets and their optimiser.
 
     Args:
-        config: of the run.
-        agents, actions: N, A.
-        scale: (S,) a state is divided by it.
-        generator: of initial weights and of the draws x of (17).
+        config: configuration of the run.
+        agents: N.
+        actions: A, number of actions per agent.
+        scale: (S,) divisor of a state.
+        generator: random numbers of the initial weights and of the draws x of (17).
         mask: (N, S) of 0 and 1, the entries of the state that each agent's network sees; all by default.
     """
 
     joint = False  # whether one loss trains all networks
-    own_state = False  # whether the networks want a mask of each agent's own entries
-    prioritised = False  # whether transitions are to be drawn by their TD errors
+    own_state = False  # whether each agent's network sees its own entries of the state only
+    prioritised = False  # whether transitions are drawn by their TD errors
 
     def __init__(
         self,
@@ -64,27 +64,30 @@ class Learner:
         self.errors = np.zeros((0, 0), dtype=np.float32)  # (K, M) absolute TD errors of the last update
 
     def shape(self, agents: int, actions: int) -> tuple[int, int]:
-        """Number of networks and of the values that each gives."""
+        """Number of networks, and number of values that each gives."""
         return agents, actions
 
     def optimise(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Make these the parameters that are trained, with a fresh optimiser."""
+        """Train these parameters, with a fresh optimiser."""
         self.parameters = list(parameters)
         self.optimiser = with_moments(self.make_optimiser())
 
     def make_optimiser(self) -> torch.optim.Optimizer:
-        """Of ``parameters``."""
+        """The optimiser of ``parameters``: Adam."""
         return torch.optim.Adam(self.parameters, lr=self.config.learning_rate, eps=1e-5, fused=True)
 
     @torch.no_grad()
     def values(self, state: np.ndarray) -> np.ndarray:
-        """(B, N, A) action values of states (B, S); -inf for actions that are too risky."""
+        """(B, N, A) action values in states (B, S); -inf for actions that are too risky."""
         q, logits = self.network.heads(self.tensor(state))
         q = self._masked(q, torch.sigmoid(logits))[0]
         return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
 
     def update(self, batch: Batch, learning_rate: float) -> float:
-        """One gradient step; returns the mean absolute TD error."""
+        """Make one gradient step and return the mean absolute TD error.
+
+        The loss is the sum over networks of the mean Huber loss of the TD errors, each weighted by :func:`td_weight`.
+        """
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
         now, logits = self.network.heads(self.tensor(batch.state))
@@ -122,18 +125,22 @@ class Learner:
         torch._foreach_lerp_(list(self.smooth.parameters()), list(self.network.parameters()), share)
 
     def _masked(self, values: Tensor, risks: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M)."""
+        """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M), 0 without risks."""
         if not self.network.risk:
             return values, torch.zeros(values.shape[:-1], device=values.device)
-        least = risks.amin(dim=-1, keepdim=True)
-        allowed = admissible(risks, least, self.config.risk_limit)
-        return torch.where(allowed, values, torch.full((), -math.inf, device=values.device)), least[..., 0]
+        return mask_risky(values, risks, self.config.risk_limit)
 
     def risk_loss(self, batch: Batch, logits: Tensor, least: Tensor) -> Tensor:
-        """Cross entropy of the risks of the chosen actions: 1 where the agent was lost, else risk_gamma min_b risk(s', b).
+        """Cross entropy of the chosen actions' risks with their targets: 1 where the agent was lost, else
+        risk_gamma min_b risk(s', b).
 
-        The risk of an action is so the discounted chance that coming too close can no longer be avoided (Bharadhwaj et al.,
-        ICLR 2021, learn a safety critic alike). ``batch`` must be of single decisions; ``logits`` (N, M, A), ``least`` (N, M).
+        The risk of an action thus becomes the discounted chance that coming too close can no longer be avoided. Bharadhwaj et
+        al. (ICLR 2021) learn a safety critic in this way.
+
+        Args:
+            batch: M transitions of single decisions.
+            logits: (N, M, A) of the risks in ``batch.state``.
+            least: (N, M) smallest risks in ``batch.next_state``.
         """
         goes_on = self.tensor(batch.discount.T) > 0
         assert batch.lost is not None
@@ -142,11 +149,13 @@ class Learner:
         return nn.functional.binary_cross_entropy_with_logits(chosen, target, reduction="none").sum(dim=0).mean()
 
     def push(self) -> None:
-        """The present networks join those that targets are made of."""
+        """Add the present networks to those that targets are averaged over."""
         self.targets.push()
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row an agent, K = N.
+        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row per agent, K = N.
+
+        Target: r + discount max_b Q(s', b), Q averaged over the past networks.
 
         Args:
             batch: M transitions.
@@ -162,7 +171,7 @@ class Learner:
         return values.gather(-1, actions[..., None]).squeeze(-1)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Copies of the networks, the past networks and Adam's moments, by name."""
+        """Copies of the networks, the past networks and the optimiser's moments, by name."""
         tensors = saved(self.parameters, self.optimiser) | {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
         tensors |= {f"smooth{k}": p for k, p in enumerate(self.smooth.parameters())}
         return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
@@ -175,15 +184,15 @@ class Learner:
             p.copy_(torch.from_numpy(arrays[f"smooth{k}"]))
 
     def tensor(self, array: np.ndarray) -> Tensor:
-        """float32, on the device of the networks."""
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
+        """A float32 tensor of an array, on the device of the networks."""
+        return as_tensor(array, self.config.device)
 
 
 @torch.no_grad()
 def clip_each(parameters: Iterable[nn.Parameter], largest: float) -> None:
-    """Scale every network's gradient down to the norm ``largest``; parameters (N, ., .) hold network i at index i.
+    """Scale each network's gradient down to the norm ``largest``; parameters (N, ., .) hold network i at index i.
 
-    The networks of agents that learn apart so stay apart: one's large error leaves the others' steps alone.
+    Networks that learn apart stay apart: a large error of one leaves the steps of the others unchanged.
     """
     gradients = [p.grad for p in parameters if p.grad is not None]
     norm = torch.stack([g.square().sum(dim=(1, 2)) for g in gradients]).sum(dim=0).sqrt()  # (N,)
@@ -193,12 +202,13 @@ def clip_each(parameters: Iterable[nn.Parameter], largest: float) -> None:
 
 
 def td_weight(error: Tensor, leniency: Tensor, kind: str, generator: torch.Generator) -> Tensor:
-    """What each TD error counts (17): 1 where it is positive or x > L, x uniform in (0, 1), else 0.
+    """(N, M) weights of TD errors in the loss (17): 1 where the error is positive or x > L, x uniform in (0, 1), else 0.
 
     Args:
-        error, leniency: (N, M).
-        kind: lenient; hysteretic takes ``HYSTERESIS`` instead of 0 and needs no L; plain is 1 throughout.
-        generator: of x.
+        error: (N, M) TD errors.
+        leniency: (N, M) L.
+        kind: ``lenient`` as above; ``hysteretic`` has ``HYSTERESIS`` for negative errors and needs no L; ``plain`` has 1 for all.
+        generator: random numbers x.
     """
     if kind == "plain":
         return torch.ones_like(error)

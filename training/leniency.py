@@ -1,4 +1,6 @@
-"""Leniency (16): temperatures of hashed states that cool as they are visited, and what may be overlooked while they are warm."""
+"""Leniency (16): temperatures of hashed states, which cool with every visit, and the share of negative TD errors that is
+overlooked while they are warm.
+"""
 
 import numpy as np
 
@@ -7,9 +9,11 @@ from marlbc_mj.core.laws import compiled
 KAPPA = 2.0
 """Leniency moderation: L = 1 - exp(-KAPPA T)."""
 RHO = -0.01
+"""Published exponent of the cooling at the last decision of an episode (16)."""
 DECAY = 0.95
+"""Published decay of that exponent per decision, backwards (16)."""
 ZETA = 0.999
-"""Printed constants of (16) and of the exploration."""
+"""Published exponent of the exploration T^ZETA."""
 
 
 class Temperatures:
@@ -18,11 +22,11 @@ class Temperatures:
     Args:
         agents: N.
         codes: number of hash codes.
-        actions: A.
+        actions: A, number of actions.
     """
 
     def __init__(self, agents: int, codes: int, actions: int) -> None:
-        self.table = np.full((agents, codes, actions), np.inf, dtype=np.float32)  # inf: not seen, read as nu
+        self.table = np.full((agents, codes, actions), np.inf, dtype=np.float32)  # inf: not visited, read as nu
         self.nu = 1.0
 
     def read(self, codes: np.ndarray) -> np.ndarray:
@@ -31,13 +35,14 @@ class Temperatures:
         return np.where(np.isinf(values), np.float32(self.nu), values)
 
     def cool(self, codes: np.ndarray, actions: np.ndarray, world: int, first: int, last: int) -> None:
-        """Walk one ended episode backwards: T <- min(exp(RHO DECAY^m) T, nu), m = 0 at its last decision.
+        """Cool what one ended episode visited, backwards: T <- min(exp(RHO DECAY^m) T, nu), m = 0 at its last decision.
 
         Args:
-            codes: (T, B) ring of hash codes, one row a decision.
+            codes: (T, B) ring of hash codes, one row per decision.
             actions: (T, B, N) ring of actions.
-            world: the episode's.
-            first, last: its first and last decision, counted from the start of the run; rows are these modulo T.
+            world: the world that the episode ran in.
+            first: first decision of the episode, counted from the start of the run; its row is this modulo T.
+            last: last decision of the episode, likewise.
         """
         _cool(self.table, self.nu, codes, actions, world, first, last)
 

@@ -1,4 +1,4 @@
-"""Multi-agent PPO (Yu et al., NeurIPS 2022): an actor for each agent, one critic on the state, trained on fresh rollouts."""
+"""Multi-agent PPO (Yu et al., NeurIPS 2022): an actor per agent, one critic on the state, trained on fresh rollouts."""
 
 from typing import Any
 
@@ -9,21 +9,25 @@ from torch import Tensor, nn
 from marlbc_mj.tasks.batch import Outcome
 from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TeamNetwork, restore, saved, with_moments
+from marlbc_mj.training.learner import LARGEST_GRADIENT
+from marlbc_mj.training.networks import TeamNetwork, as_tensor, restore, saved, with_moments
 
 LAST_LAYER = 0.01
-"""An actor's last layer starts this much smaller, so that all actions are about equally likely."""
-LARGEST_GRADIENT = 10.0  # norm, of actors and critic each
+"""Factor of the initial weights of an actor's last layer, so that all actions are about equally likely."""
 HUBER = 10.0
 """Normalised value errors beyond it count linearly."""
-MEMORY = 0.99999
-"""What the running mean and square of the returns keep at a rollout; debiased, so at first they are plain means."""
+RETURNS_MEMORY = 0.99999
+"""Share of the running mean and square of the returns that a rollout leaves; debiased, so at first they are plain means."""
 
 
 class MAPPO(BaseTrainer):
-    """One run of MAPPO. Every ``ppo.rollout`` decisions the rollout is learned from and forgotten.
+    """One run of MAPPO. Every ``ppo.rollout`` decisions it learns from the rollout and forgets it.
 
-    Rewards are per agent, the team's and own costs, so the critic has one value for each, of which the returns end on their own.
+    Rewards are per agent: the team's less its own costs. So the critic gives one value per agent, whose return may end before the
+    others'.
+
+    Args:
+        config: configuration of the run.
 
     Raises:
         ConfigurationError: a scenario, controller or device that cannot be used.
@@ -34,10 +38,9 @@ class MAPPO(BaseTrainer):
         agents, read = self.scenario.agents, self.batch.read
 
         def network(networks: int, outputs: int) -> TeamNetwork:
-            return TeamNetwork(
-                networks, read.size, outputs, config.hidden, torch.from_numpy(read.scale),
-                dueling=False, generator=self.generator,
-            ).to(config.device)  # fmt: skip
+            scale = torch.from_numpy(read.scale)
+            plain = TeamNetwork(networks, read.size, outputs, config.hidden, scale, dueling=False, generator=self.generator)
+            return plain.to(config.device)
 
         self.actors = network(agents, self.batch.actions)
         self.actors.weights[-1].data *= LAST_LAYER
@@ -54,13 +57,13 @@ class MAPPO(BaseTrainer):
             "over": np.zeros((rows, worlds, agents), dtype=bool),
             "ended": np.zeros((rows, worlds), dtype=bool),
         }
-        self.row = 0  # of the present rollout
+        self.row = 0  # rows of the rollout that are filled
         self.made = 0  # gradient steps
-        self.surprise = 1.0  # mean entropy of the last update's actions, 1 at the most
+        self.surprise = 1.0  # mean entropy of the last update's actions, 1 at most
 
     @property
     def updates(self) -> int:
-        """Gradient steps made."""
+        """Number of gradient steps made."""
         return self.made
 
     @property
@@ -74,14 +77,14 @@ class MAPPO(BaseTrainer):
         return self.actors
 
     def advance(self) -> Outcome:
-        """One sampled decision in every world; at the end of a rollout the updates that follow it."""
+        """Make one sampled decision in every world; at the end of a rollout, learn from it."""
         config = self.config
         share = self.steps / config.budget
         with torch.no_grad():
-            logits = self.actors(self._tensor(self.state)).transpose(0, 1).cpu().numpy()
+            logits = self.actors(as_tensor(self.state, config.device)).transpose(0, 1).cpu().numpy()
         actions = (logits + self.rng.gumbel(size=logits.shape)).argmax(axis=-1)  # a draw from the softmax
         self.explored = float((actions != logits.argmax(axis=-1)).mean())
-        outcome = self.batch.step(actions)
+        outcome = self.step(actions)
         reward, over, _ = self.judge(outcome)
         values = (self.state, outcome.final_state, actions, reward, over, outcome.ended)
         for array, value in zip(self.rows.values(), values, strict=True):
@@ -97,22 +100,22 @@ class MAPPO(BaseTrainer):
     @torch.no_grad()
     def _assess(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
         """State (T B, S), actions, old log-probabilities, advantages and normalised returns (N, T B) of the rollout."""
-        rows = self.rows
+        rows, device = self.rows, self.config.device
         flat = {name: array.reshape(-1, *array.shape[2:]) for name, array in rows.items()}
-        state, shape = self._tensor(flat["state"]), rows["reward"].shape
-        now, ahead = (
-            self.scaling.undo(self.critic(s)[0].cpu().numpy()).reshape(shape) for s in (state, self._tensor(flat["final"]))
-        )
+        state, final = (as_tensor(flat[name], device) for name in ("state", "final"))
+        shape = rows["reward"].shape
+        now, ahead = (self.scaling.undo(self.critic(s)[0].cpu().numpy()).reshape(shape) for s in (state, final))
         advantage = advantages(rows["reward"], now, ahead, rows["over"], rows["ended"], self.config.gamma, self.config.ppo.trace)
         returns = (advantage + now).reshape(-1, shape[-1])
         self.scaling.take(returns)
-        action = torch.from_numpy(np.ascontiguousarray(flat["action"].T)).to(self.config.device)
+        action = torch.from_numpy(np.ascontiguousarray(flat["action"].T)).to(device)
         old, _ = log_probability(self.actors(state), action)
         gain = advantage.reshape(-1, shape[-1])
         gain = (gain - gain.mean(axis=0)) / (gain.std(axis=0) + 1e-5)
-        return state, action, old, self._tensor(gain.T), self._tensor(self.scaling(returns).T)
+        return state, action, old, as_tensor(gain.T, device), as_tensor(self.scaling(returns).T, device)
 
     def _learn(self, rate: float) -> None:
+        """``ppo.epochs`` passes over the rollout with the step size ``rate``."""
         config, ppo = self.config, self.config.ppo
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -146,7 +149,7 @@ class MAPPO(BaseTrainer):
         return arrays, scalars | {"row": self.row, "updates": self.made, "entropy": self.surprise}
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Go on from a :meth:`snapshot` of a run with the same configuration."""
+        """Return to a :meth:`snapshot` of a run with the same configuration."""
         super().restore(arrays, scalars)
         restore(unprefixed("learner", arrays), self.parameters, self.optimiser)
         for name, array in self.rows.items():
@@ -154,20 +157,17 @@ class MAPPO(BaseTrainer):
         self.scaling.sums[:] = arrays["returns"]
         self.row, self.made, self.surprise = scalars["row"], scalars["updates"], scalars["entropy"]
 
-    def _tensor(self, array: np.ndarray) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(self.config.device)
-
 
 class ValueScale:
-    """Running mean and deviation of the returns of N agents, by which the critic's targets are normalised."""
+    """Running mean and standard deviation of the returns of N agents, by which the critic's targets are normalised."""
 
     def __init__(self, agents: int) -> None:
-        self.sums = np.zeros((3, agents))  # of the weights, returns and squares
+        self.sums = np.zeros((3, agents))  # weights, returns and squared returns
 
     def take(self, returns: np.ndarray) -> None:
-        """Count returns (M, N) in."""
+        """Include the returns (M, N) of a rollout."""
         moments = np.stack([np.ones(returns.shape[1]), returns.mean(axis=0), (returns**2.0).mean(axis=0)])
-        self.sums = MEMORY * self.sums + (1.0 - MEMORY) * moments
+        self.sums = RETURNS_MEMORY * self.sums + (1.0 - RETURNS_MEMORY) * moments
 
     def _moments(self) -> tuple[np.ndarray, np.ndarray]:
         weight, total, square = self.sums
@@ -177,12 +177,12 @@ class ValueScale:
         return mean, np.sqrt(np.maximum(square / weight - mean**2, 1e-2))
 
     def __call__(self, returns: np.ndarray) -> np.ndarray:
-        """Returns (M, N) with mean 0 and deviation 1."""
+        """Returns (M, N) normalised to mean 0 and deviation 1."""
         mean, deviation = self._moments()
         return np.asarray((returns - mean) / deviation)
 
     def undo(self, values: np.ndarray) -> np.ndarray:
-        """Values (M, N) as the critic gives them, back as returns."""
+        """Returns (M, N) from normalised values, as the critic gives them."""
         mean, deviation = self._moments()
         return np.asarray(values * deviation + mean)
 
@@ -196,14 +196,16 @@ def advantages(
     gamma: float,
     trace: float,
 ) -> np.ndarray:
-    """(T, B, N) generalised advantage estimates (Schulman et al., ICLR 2016), A = d + gamma trace A' with
-    d = r + gamma V(s') - V(s); nothing is ahead of an agent whose return is over, and no trace crosses an episode's end.
+    """(T, B, N) generalised advantage estimates A = d + gamma trace A', d = r + gamma V(s') - V(s) (Schulman et al., ICLR 2016).
+
+    V(s') is 0 for an agent whose return is over, and no trace crosses the end of an episode.
 
     Args:
-        reward, value: (T, B, N) rewards and values of the states they were got in.
-        ahead: (T, B, N) values of the true successors.
-        over: (T, B, N) bool, the agent's return ends here.
-        ended: (T, B) bool, an episode ends here.
+        reward: (T, B, N) r.
+        value: (T, B, N) V(s).
+        ahead: (T, B, N) V(s') of the true successors.
+        over: (T, B, N) bool, whether the agent's return ends here.
+        ended: (T, B) bool, whether the episode ends here.
         gamma: discount factor.
         trace: lambda.
     """
@@ -217,13 +219,25 @@ def advantages(
 
 
 def log_probability(logits: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-    """(N, M) log-probabilities of actions (N, M) under the softmax of logits (N, M, A), and its entropies."""
+    """Softmax policies: log-probabilities (N, M) of the actions, and entropies (N, M).
+
+    Args:
+        logits: (N, M, A).
+        action: (N, M).
+    """
     every = torch.log_softmax(logits, dim=-1)
     return every.gather(-1, action[..., None]).squeeze(-1), -(every.exp() * every).sum(dim=-1)
 
 
 def clipped_loss(new: Tensor, old: Tensor, gain: Tensor, clip: float) -> Tensor:
-    """(N, M) -min(q A, clip(q, 1 - clip, 1 + clip) A), q = exp(new - old) the ratio of probabilities (Schulman et al. 2017)."""
+    """(N, M) loss -min(q A, clip(q, 1 - clip, 1 + clip) A) with the ratio q = exp(new - old) (Schulman et al. 2017).
+
+    Args:
+        new: (N, M) log-probabilities of the actions under the present policy.
+        old: (N, M) under the policy that acted.
+        gain: (N, M) advantages A.
+        clip: largest change of the ratio that pays.
+    """
     ratio = (new - old).exp()
     gained: Tensor = torch.minimum(ratio * gain, ratio.clamp(1.0 - clip, 1.0 + clip) * gain)
     return -gained

@@ -1,4 +1,6 @@
-"""Dueling networks of a whole team as one stack of matrices, and the ring of past weights that averaged targets are made of."""
+"""Dueling networks of a whole team as one stack of matrices, the past weights that targets are averaged over, and how networks
+and optimisers are saved.
+"""
 
 import itertools
 import math
@@ -8,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.policies.greedy import admissible, dueling_value
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -19,10 +22,10 @@ class TeamNetwork(nn.Module):
         state: S, the size of the state.
         actions: A.
         hidden: widths of the ReLU layers, at least one.
-        scale: (S,) the state is divided by it.
+        scale: (S,) divisor of the state.
         dueling: False makes the last layer give Q itself.
-        risk: the last layer gives the logit of a risk for every action, too.
-        generator: of the initial weights.
+        risk: whether the last layer also gives the logit of a risk for every action.
+        generator: random numbers of the initial weights.
         mask: (N, S) of 0 and 1, the entries that each agent's network sees; all by default. The others' weights in the first
             layer are 0 and stay 0.
 
@@ -65,7 +68,7 @@ class TeamNetwork(nn.Module):
             self.weights[0].data *= self.mask
 
     def forget_unseen(self) -> None:
-        """Take the masked weights out of the gradient; call it between ``backward`` and the step."""
+        """Remove the masked weights from the gradient; call it between ``backward`` and the step."""
         gradient = self.weights[0].grad
         if self.mask is not None and gradient is not None:
             gradient *= self.mask
@@ -75,56 +78,89 @@ class TeamNetwork(nn.Module):
         return self.heads(state)[0]
 
     def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Action values, and logits of the risks (no columns without them), both (N, B, A)."""
+        """Action values and logits of the risks, both (N, B, A); networks without risks give no columns of these."""
         return self.split(apply(list(self.weights), list(self.biases), state / self.scale))
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Outputs (..., O) of the last layer as action values and logits of the risks."""
+        """Action values (..., A) and logits of the risks (..., A) from outputs (..., O) of the last layer."""
         if not self.dueling:
             return outputs[..., : self.actions], outputs[..., self.actions :]
         value, advantage, risk = outputs[..., :1], outputs[..., 1 : 1 + self.actions], outputs[..., 1 + self.actions :]
-        return value + advantage - advantage.mean(dim=-1, keepdim=True), risk
+        return dueling_value(value, advantage, advantage.mean(dim=-1, keepdim=True)), risk
+
+
+def as_tensor(array: np.ndarray, device: str) -> Tensor:
+    """A float32 tensor of an array on the device of the networks."""
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
+
+
+def mask_risky(values: Tensor, risks: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+    """Values (..., A) with -inf for actions that are too risky, and the least risks (...).
+
+    Args:
+        values: (..., A).
+        risks: (..., A) in [0, 1].
+        limit: largest risk that is taken.
+    """
+    least = risks.amin(dim=-1, keepdim=True)
+    return torch.where(admissible(risks, least, limit), values, -math.inf), least[..., 0]
 
 
 def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """Weights (N, in, out) and biases (N, 1, out) of N layers with the same input as one layer's, (in, N out) and (N out,)."""
+    """One layer that computes N layers with the same input.
+
+    Args:
+        weight: (N, in, out).
+        bias: (N, 1, out).
+
+    Returns:
+        Its weight (in, N out) and bias (N out,).
+    """
     networks, inputs, width = weight.shape
     return weight.permute(1, 0, 2).reshape(inputs, networks * width), bias.reshape(-1)
 
 
 def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[Tensor, Tensor] | None = None) -> Tensor:
-    """(N, B, O) outputs from two or more layers of stacked weights (N, in, out), biases (N, 1, out) and inputs (B, in) or
-    (N, B, in).
+    """(N, B, O) outputs of N networks of two or more layers, with ReLU in between.
 
-    ``first`` is the first layer :func:`side_by_side`, where it is at hand; it saves time with inputs (B, in) and changes nothing.
+    Args:
+        weights: (N, in, out) of each layer.
+        biases: (N, 1, out) of each layer.
+        x: (B, in) inputs of all networks, or (N, B, in) of each.
+        first: the first layer :func:`side_by_side`, where the caller has it; saves time for inputs (B, in).
     """
     if x.ndim == 3:
         y = torch.baddbmm(biases[0], x, weights[0]).relu_()
     else:
         weight, bias = first or side_by_side(weights[0], biases[0])
-        y = torch.addmm(bias, x, weight).relu_().view(len(x), len(weights[0]), -1).transpose(0, 1)
+        y = torch.addmm(bias, x, weight).relu_().view(x.shape[0], len(weights[0]), -1).transpose(0, 1)
     for weight, bias in zip(weights[1:-1], biases[1:-1], strict=True):
         y = torch.baddbmm(bias, y, weight).relu_()
     return torch.baddbmm(biases[-1], y, weights[-1])
 
 
 class TargetRing:
-    """The last ``copies`` weights of a network; values and risks are means over them (Anschel et al. 2017)."""
+    """The last ``copies`` weights of a network; values and risks are means over them (Anschel et al. 2017).
+
+    Args:
+        network: whose weights are copied.
+        copies: number of copies; all are the present weights at first.
+    """
 
     def __init__(self, network: TeamNetwork, copies: int) -> None:
         self.network = network
         self.copies = copies
         self.agents = network.weights[0].shape[0]
         self.tensors = [p.detach().repeat(copies, 1, 1) for p in self._parameters()]  # (copies N, ., .)
-        self.next = 0
-        self.first_layer: tuple[Tensor, Tensor] | None = None  # the copies' side by side, until they change
+        self.next = 0  # the copy that is replaced next
+        self.first_layer: tuple[Tensor, Tensor] | None = None  # the copies' side by side; None after they changed
 
     def _parameters(self) -> Iterator[Tensor]:
         yield from self.network.weights
         yield from self.network.biases
 
     def push(self) -> None:
-        """The oldest copy becomes the network's present weights."""
+        """Replace the oldest copy by the network's present weights."""
         rows = slice(self.next * self.agents, (self.next + 1) * self.agents)
         for copy, parameter in zip(self.tensors, self._parameters(), strict=True):
             copy[rows] = parameter.detach()
@@ -132,18 +168,18 @@ class TargetRing:
         self.first_layer = None
 
     def restore(self, tensors: Sequence[Tensor]) -> None:
-        """Copy the ``tensors`` of another ring; ``next`` is set apart."""
+        """Take over the ``tensors`` of another ring; ``next`` is not among them."""
         for copy, tensor in zip(self.tensors, tensors, strict=True):
             copy.copy_(tensor)
         self.first_layer = None
 
-    def __call__(self, state: Tensor) -> Tensor:
-        """(N, B, A) averaged action values of states (B, S), or of (N, B, S) where every agent has its own."""
-        return self.heads(state)[0]
-
     @torch.no_grad()
     def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Averaged action values and averaged risks in [0, 1] (no columns without them), both (N, B, A)."""
+        """Averaged action values and averaged risks in [0, 1] (no columns without them), both (N, B, A).
+
+        Args:
+            state: (B, S), or (N, B, S) where every agent has its own.
+        """
         layers = len(self.network.weights)
         if state.ndim == 3:
             state = state.repeat(self.copies, 1, 1)
@@ -156,7 +192,7 @@ class TargetRing:
 
 
 def with_moments(optimiser: torch.optim.Optimizer) -> torch.optim.Optimizer:
-    """The optimiser as it is before its first step, but with its moments in place, so that it is always saved whole."""
+    """An optimiser before its first step whose moments exist already, so that it can always be saved whole."""
     for parameter in (p for group in optimiser.param_groups for p in group["params"]):
         parameter.grad = torch.zeros_like(parameter)
     optimiser.step()  # by nothing
@@ -167,7 +203,7 @@ def with_moments(optimiser: torch.optim.Optimizer) -> torch.optim.Optimizer:
 
 
 def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Parameters and the optimiser's moments by name, not copied; ``adam`` is in the names whatever the optimiser is."""
+    """Parameters and the optimiser's moments by name, not copied; the names say ``adam`` for every optimiser."""
     tensors = {f"network{k}": p.detach() for k, p in enumerate(parameters)}
     for k, p in enumerate(parameters):
         tensors |= {f"adam{k}.{name}": value for name, value in optimiser.state[p].items()}
@@ -175,7 +211,7 @@ def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) 
 
 
 def restore(arrays: Mapping[str, np.ndarray], parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
-    """Write what :func:`saved` gave back in place."""
+    """Set parameters and moments to what :func:`saved` gave, in place."""
     for k, p in enumerate(parameters):
         p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
         prefix = f"adam{k}."

@@ -7,16 +7,22 @@ from marlbc_mj.training.replay import Batch, Replay
 ALPHA = 0.6
 """Priorities are |TD error|^ALPHA."""
 BETA = 0.4
-"""Exponent of the importance weights at the start; 1 at the end of the budget, linear in between."""
+"""Exponent of the importance weights at the start of the budget; 1 at the end, linear in between."""
 LEAST_ERROR = 1e-3
 """Added to every |TD error|, so that no transition is lost for good."""
 
 
 class PrioritisedReplay(Replay):
-    """A ring of rows with a priority for every agent, because agents that learn alone have errors of their own.
+    """A ring of rows with one priority per agent, because agents that learn alone have errors of their own.
 
-    A new transition has the largest priority that the agent has in the buffer, 1 where it is empty. ``arrays["priority"]``
-    (rows, B, N) are the priorities with the exponent in.
+    A new transition gets the largest priority that the agent has in the buffer, 1 in an empty one. ``arrays["priority"]``
+    (rows, B, N) holds the priorities |TD error|^ALPHA.
+
+    Args:
+        rows: decisions kept.
+        worlds: B.
+        agents: N.
+        state: S, size of a state.
     """
 
     def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
@@ -35,11 +41,11 @@ class PrioritisedReplay(Replay):
         P(j) = p_j / sum p, weights (n P(j))^-beta over the largest of the n transitions' weights.
 
         Args:
-            size: M.
+            size: M, transitions per agent.
             steps: decisions whose rewards are summed.
-            gamma: discount factor of a decision.
-            rng: of the draws.
-            share: of the budget that is spent; beta goes from ``BETA`` to 1 with it.
+            gamma: discount factor per decision.
+            rng: random numbers of the draws.
+            share: share of the budget that is spent; beta rises with it from ``BETA`` to 1.
         """
         priority = self.arrays["priority"]
         rows, worlds, agents = priority.shape
@@ -57,7 +63,7 @@ class PrioritisedReplay(Replay):
 
     @staticmethod
     def _own(batch: Batch, weight: np.ndarray, place: np.ndarray) -> Batch:
-        """Of transitions drawn for every agent (M N of them), each agent's part of its own."""
+        """Each agent's part of its own transitions, from a batch of M N that holds every agent's draws one after the other."""
         size, agents = place.shape
         own = np.arange(agents)
 
@@ -79,7 +85,7 @@ class PrioritisedReplay(Replay):
         )
 
     def learnt(self, batch: Batch, errors: np.ndarray) -> None:
-        """Give the drawn transitions the priorities of their errors (N, M)."""
+        """Set the priorities of the drawn transitions by their absolute TD errors (N, M)."""
         priority = self.arrays["priority"]
         flat = priority.reshape(-1, priority.shape[2])  # a view
         assert batch.place is not None

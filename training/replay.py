@@ -1,4 +1,4 @@
-"""Replay buffer of decisions of B worlds in the order of time, from which n-step transitions are drawn."""
+"""Replay buffer of the decisions of B worlds in their order, from which n-step transitions are drawn."""
 
 from typing import NamedTuple
 
@@ -6,15 +6,15 @@ import numpy as np
 
 
 class Batch(NamedTuple):
-    """M transitions over up to n decisions; from a prioritised replay, M of each agent's own."""
+    """M transitions over up to n decisions; from a prioritised replay, M for each agent."""
 
-    state: np.ndarray  # (M, S), or (N, M, S) of each agent's own
+    state: np.ndarray  # (M, S), or (N, M, S) where each agent has its own
     action: np.ndarray  # (M, N)
     reward: np.ndarray  # (M, N) discounted sum of up to n rewards
-    discount: np.ndarray  # (M, N) of the bootstrap: gamma^n, 0 where the mission ended for the agent
+    discount: np.ndarray  # (M, N) discount of the bootstrap: gamma^n, 0 where the mission ended for the agent
     next_state: np.ndarray  # (M, S) or (N, M, S) to bootstrap from
-    leniency: np.ndarray  # (M, N)
-    weight: np.ndarray | None = None  # (M, N) what a TD error counts; 1 by default
+    leniency: np.ndarray  # (M, N) L of (16)
+    weight: np.ndarray | None = None  # (M, N) importance weights of the TD errors; 1 by default
     place: np.ndarray | None = None  # (M, N) where the transitions begin in the buffer: row times B plus world
     lost: np.ndarray | None = None  # (M, N) bool, the agent came too close in the first of the decisions
 
@@ -24,7 +24,9 @@ class Replay:
 
     Args:
         rows: decisions kept.
-        worlds, agents, state: B, N and the size of a state.
+        worlds: B.
+        agents: N.
+        state: S, size of a state.
     """
 
     def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
@@ -49,19 +51,31 @@ class Replay:
         self.count += 1
 
     def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
-        """``size`` transitions of up to ``steps`` decisions, uniformly; shorter where an episode ended.
+        """Draw ``size`` transitions uniformly.
 
-        ``share`` of the budget is spent, which concerns prioritised replays only.
+        Args:
+            size: M.
+            steps: decisions whose rewards are summed; fewer where an episode ended.
+            gamma: discount factor per decision.
+            rng: random numbers of the draws.
+            share: share of the budget that is spent; for prioritised replays only.
         """
         first = rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
         world = rng.integers(self.arrays["ended"].shape[1], size=size)
         return self.gather(first, world, steps, gamma)
 
     def learnt(self, batch: Batch, errors: np.ndarray) -> None:
-        """Hear of an update with ``batch``, its absolute TD errors (K, M); nothing follows from it here."""
+        """Take note of the absolute TD errors (K, M) of an update with ``batch``; only a prioritised replay uses them."""
 
     def gather(self, first: np.ndarray, world: np.ndarray, steps: int, gamma: float) -> Batch:
-        """The transitions of up to ``steps`` decisions that begin at rows ``first`` (M,), modulo the ring, of ``world`` (M,)."""
+        """The transitions that begin at given decisions.
+
+        Args:
+            first: (M,) rows, counted from the start of the run.
+            world: (M,) worlds.
+            steps: decisions whose rewards are summed; fewer where an episode ended.
+            gamma: discount factor per decision.
+        """
         a, size = self.arrays, len(first)
         row = first % self.rows
         reward = np.zeros((size, a["reward"].shape[2]), dtype=np.float32)

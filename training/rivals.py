@@ -1,4 +1,4 @@
-"""Rivals in learning from a replay buffer: VDN, QMIX, a central Q-network over joint orders, and RLMS, which learns alone."""
+"""Baselines that learn from a replay buffer: VDN, QMIX, a central Q-network over joint orders, and RLMS, alone per agent."""
 
 import copy
 
@@ -25,20 +25,20 @@ class VDN(Learner):
     joint = True
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, M) value of the team's action and its target."""
+        """(1, M) values of the team's actions and their targets."""
         chosen, target = super().estimates(batch, now, ahead)
         return chosen.sum(dim=0, keepdim=True), target.sum(dim=0, keepdim=True)
 
 
 class Mixer(nn.Module):
-    """Q_tot = w2(s) . elu(W1(s) Q + b1(s)) + b2(s), with W1 and w2 >= 0, so that Q_tot never falls with any Q_i.
+    """Q_tot = w2(s) . elu(W1(s) Q + b1(s)) + b2(s), with W1 and w2 >= 0, so that Q_tot never falls when a Q_i rises.
 
-    Weights are linear in the state and taken absolute; b2 has a hidden ReLU layer (Rashid et al., ICML 2018).
+    W1 and w2 are absolute values of linear functions of the state; b2 has a hidden ReLU layer (Rashid et al., ICML 2018).
 
     Args:
         agents: N.
-        scale: (S,) the state is divided by it.
-        generator: of the initial weights.
+        scale: (S,) divisor of the state.
+        generator: random numbers of the initial weights.
     """
 
     def __init__(self, agents: int, scale: Tensor, generator: torch.Generator) -> None:
@@ -53,7 +53,7 @@ class Mixer(nn.Module):
         self.bias2 = nn.Sequential(_linear(size, EMBEDDING, generator), nn.ReLU(), _linear(EMBEDDING, 1, generator))
 
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
-        """(1, M) team values from the agents' values (N, M) in states (M, S)."""
+        """(1, M) values of the team from the agents' values (N, M) in states (M, S)."""
         x = state / self.scale
         weight = self.weight1(x).abs().view(len(x), self.agents, EMBEDDING)
         hidden = nn.functional.elu(torch.einsum("nm,mne->me", values, weight) + self.bias1(x))
@@ -73,7 +73,7 @@ class QMIX(Learner):
     """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
 
     The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
-    max_b Q_i(s', b), averaged over past networks, by a mixer that is copied whenever a network joins the past ones.
+    max_b Q_i(s', b), Q_i averaged over the past networks. The mixer of targets is copied whenever a network joins the past ones.
     """
 
     joint = True
@@ -93,19 +93,19 @@ class QMIX(Learner):
         self.optimise([*self.network.parameters(), *self.mixer.parameters()])
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, M) value of the team's action and its target."""
+        """(1, M) values of the team's actions and their targets."""
         reward, discount = team_return(batch)
         mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
         target = self.tensor(reward) + self.tensor(discount) * mixed
         return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
 
     def push(self) -> None:
-        """Network and mixer join those that targets are made of."""
+        """Add the present networks to those that targets are averaged over, and copy the mixer."""
         super().push()
         self.target_mixer.load_state_dict(self.mixer.state_dict())
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Copies of all that training changes, by name."""
+        """Copies of everything that training changes, by name."""
         past = {f"past_mixer{k}": p.cpu().numpy().copy() for k, p in enumerate(self.target_mixer.parameters())}
         return super().snapshot() | past
 
@@ -119,8 +119,8 @@ class QMIX(Learner):
 class Central(Learner):
     """One dueling network whose actions are the A^N joint actions in C order, with double Q-learning (van Hasselt et al. 2016).
 
-    Target: r + gamma Q(s', argmax_b Q(s', b)), the argmax by the present network, its value by the averaged past ones; reward
-    and end of the team's return as in :class:`QMIX`.
+    Target: r + gamma Q(s', argmax_b Q(s', b)), with the argmax by the present network and its value by the averaged past ones;
+    reward and end of the team's return as in :class:`QMIX`.
     """
 
     joint = True
@@ -138,11 +138,11 @@ class Central(Learner):
         super().__init__(config, agents, actions, scale, generator, mask)
 
     def shape(self, agents: int, actions: int) -> tuple[int, int]:
-        """One network with A^N values."""
+        """One network, with A^N values."""
         return 1, actions**agents
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, M) value of the joint action and its target."""
+        """(1, M) values of the joint actions and their targets."""
         reward, discount = team_return(batch)
         best = self.network(self.tensor(batch.next_state)).detach().argmax(dim=-1, keepdim=True)
         target = self.tensor(reward) + self.tensor(discount) * ahead.gather(-1, best).squeeze(-1)
@@ -157,7 +157,7 @@ class RLMS(Learner):
     prioritised = True
 
     def make_optimiser(self) -> torch.optim.Optimizer:
-        """RMSProp of ``parameters``."""
+        """The optimiser of ``parameters``: RMSProp."""
         return torch.optim.RMSprop(self.parameters, lr=self.config.learning_rate)
 
 
@@ -170,7 +170,7 @@ LEARNERS: dict[str, type[Learner]] = {
     "central": Central,
     "rlms": RLMS,
 }
-"""Class by name of the method."""
+"""Learner class by method."""
 
 
 def learner_class(method: str) -> type[Learner]:
@@ -185,14 +185,18 @@ def learner_class(method: str) -> type[Learner]:
 
 
 def team_return(batch: Batch) -> tuple[np.ndarray, np.ndarray]:
-    """(1, M) rewards summed over the agents, and discounts of the bootstrap: the smallest, 0 once an agent is lost."""
+    """The team's rewards (1, M), summed over the agents, and discounts of the bootstrap (1, M), 0 once an agent is lost."""
     return batch.reward.sum(axis=1)[None], batch.discount.min(axis=1)[None]
 
 
 def own_entries(state: State, agents: int) -> np.ndarray:
-    """(N, S) float32 of 0 and 1: which entries of a state are about agent i alone. G, which is the team's, is nobody's.
+    """(N, S) float32 of 0 and 1: the entries of a state that describe agent i. G describes the team, so it is nobody's.
 
-    The slot errors of the extended state are about the measured centroid, so agent i's entries still depend on the others.
+    The slot errors of the extended state are relative to the measured centroid, so agent i's entries still depend on the others.
+
+    Args:
+        state: the kind of state.
+        agents: N.
     """
     mask = np.zeros((agents, state.size), dtype=np.float32)
     printed = isinstance(state, PrintedState)

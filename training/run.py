@@ -1,4 +1,4 @@
-"""A training run on disk: evaluations, curves, best and last checkpoints, and what ``--resume`` continues from."""
+"""A training run on disk: evaluations, curves, best and last checkpoints, and the state that ``--resume`` continues from."""
 
 import csv
 import shutil
@@ -32,18 +32,21 @@ from marlbc_mj.util.provenance import provenance
 RESUME = "resume.safetensors"
 TABLES = ("eval.csv", "progress.csv")
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
-Row = dict[str, float]
+TrainingScores = dict[str, float]
+"""A line of eval.csv or progress.csv."""
+TrainingProgress = Callable[[BaseTrainer, TrainingScores], None]
+"""What a run calls after every decision, with its last evaluation."""
 
 
 @dataclass(frozen=True)
 class Interrupted:
-    """A run that was asked to stop and has saved itself."""
+    """A run that a signal asked to stop and that has saved itself."""
 
-    signal: int
+    signal: int  # number of the signal
 
 
 class Stopper:
-    """Notes SIGINT and SIGTERM; the run saves itself at the next decision."""
+    """Signal handler that takes note of SIGINT or SIGTERM; the run then saves itself after the present decision."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -54,7 +57,7 @@ class Stopper:
 
 @contextmanager
 def stopper() -> Iterator[Stopper]:
-    """Signals are noted instead of acted on inside the block."""
+    """A block inside which SIGINT and SIGTERM are noted instead of obeyed."""
     stop = Stopper()
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -74,16 +77,22 @@ def make_trainer(config: TrainConfig) -> BaseTrainer:
 
 
 def train(
-    config: TrainConfig, out: Path, *, overwrite: bool = False, progress: Callable[[BaseTrainer, Row], None] | None = None
-) -> Interrupted | list[Row]:
-    """Train from scratch into ``out``; returns the evaluations, or what interrupted the run.
+    config: TrainConfig, out: Path, *, overwrite: bool = False, progress: TrainingProgress | None = None
+) -> Interrupted | list[TrainingScores]:
+    """Train from scratch; returns the evaluations, or what interrupted the run.
+
+    Args:
+        config: configuration of the run.
+        out: folder of the run.
+        overwrite: whether ``out`` may hold something.
+        progress: called after every decision.
 
     Raises:
-        ConfigurationError: a setting, or ``out`` is not empty.
+        ConfigurationError: a setting that cannot be run, or ``out`` is not empty.
         SimulationError: a world diverged.
     """
     check_folder(out, overwrite=overwrite)
-    run = Run(make_trainer(config), out)
+    run = TrainingRun(make_trainer(config), out)
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         remove_run(out)
@@ -92,7 +101,7 @@ def train(
 
 
 def remove_run(out: Path) -> None:
-    """Remove what a run leaves in its folder, first of all what a later :func:`resume` would take for the new run's."""
+    """Remove what a run left in its folder, beginning with what :func:`resume` would take for a new run's."""
     for name in (RESUME, CONFIG, *TABLES):
         (out / name).unlink(missing_ok=True)
     for name in (CHECKPOINT, TENSORBOARD):
@@ -101,18 +110,24 @@ def remove_run(out: Path) -> None:
     remove_leftovers(out)
 
 
-def resume(out: Path, *, progress: Callable[[BaseTrainer, Row], None] | None = None) -> Interrupted | list[Row]:
-    """Continue the run in ``out`` where it was last saved, bit for bit.
+def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupted | list[TrainingScores]:
+    """Continue a run where it was last saved, bit for bit; returns the evaluations, or what interrupted the run.
+
+    Args:
+        out: folder of the run.
+        progress: called after every decision.
 
     Raises:
-        ConfigurationError: no run to continue there, torn, not of this code, or not of the configuration beside it.
+        ConfigurationError: ``out`` holds no run; or its saved state is damaged, of other versions of the code, or of another
+            configuration than the one beside it.
+        SimulationError: a world diverged.
     """
     path = out / RESUME
     if not path.is_file():
         raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
     arrays, description = read_arrays(path)
     check_origin(path, description)
-    run = Run(make_trainer(saved_config(path, description["train"])), out)
+    run = TrainingRun(make_trainer(saved_config(path, description["train"])), out)
     check_snapshot(path, (arrays, description["scalars"]), run.trainer.snapshot())
     try:
         run.trainer.restore(arrays, description["scalars"])
@@ -126,7 +141,7 @@ def resume(out: Path, *, progress: Callable[[BaseTrainer, Row], None] | None = N
 
 
 def resumable(out: Path) -> bool:
-    """Whether ``out`` holds a whole saved run of this code; of any other, a study begins anew."""
+    """Whether ``out`` holds a whole saved run of this version of the code, so that :func:`resume` continues it."""
     try:
         check_origin(out / RESUME, read_arrays(out / RESUME)[1])
     except ConfigurationError:
@@ -134,34 +149,37 @@ def resumable(out: Path) -> bool:
     return True
 
 
-class Run:
-    """A trainer with its folder: evaluates, logs and saves at set intervals."""
+class TrainingRun:
+    """A trainer with its folder: evaluates, logs and saves at set intervals.
+
+    Args:
+        trainer: what learns.
+        out: folder of the run.
+    """
 
     def __init__(self, trainer: BaseTrainer, out: Path) -> None:
         self.trainer = trainer
         self.config = trainer.config
         self.out = out
         self.origin = provenance()
-        self.evaluations: list[Row] = []
-        self.curve: list[Row] = []
-        self.wall = 0.0  # seconds of training before this process
+        self.evaluations: list[TrainingScores] = []
+        self.curve: list[TrainingScores] = []
+        self.wall = 0.0  # time of training so far, in all processes [s]
         self.world = World(trainer.scenario, make_controller(self.config.controller), record=True)
 
-    def go(self, progress: Callable[[BaseTrainer, Row], None] | None = None) -> Interrupted | list[Row]:
-        """Run to the end of the budget, or until a signal."""
+    def go(self, progress: TrainingProgress | None = None) -> Interrupted | list[TrainingScores]:
+        """Train to the end of the budget, or until a signal arrives."""
         config, trainer = self.config, self.trainer
         began, saved = monotonic() - self.wall, monotonic()
         board = TensorBoard(self.out / TENSORBOARD)
         with stopper() as stop:
             while not trainer.finished:
-                outcome = trainer.advance()
+                trainer.advance()
                 self.wall = monotonic() - began
                 if trainer.steps // config.evaluate_every >= len(self.evaluations) or trainer.finished:
-                    row = self.evaluate()
-                    board.write(trainer.steps, {**self.curve[-1], **row})
-                    if progress:
-                        progress(trainer, row)
-                elif progress:
+                    self.evaluate()
+                    board.write(trainer.steps, {**self.curve[-1], **self.evaluations[-1]})
+                if progress:
                     progress(trainer, self.evaluations[-1])
                 number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
                 if number or monotonic() - saved > config.save_every:
@@ -169,56 +187,57 @@ class Run:
                     saved = monotonic()
                 if number:
                     return Interrupted(number)
-                del outcome
         self.save()
         board.close()
         return self.evaluations
 
-    def evaluate(self) -> Row:
-        """One deterministic episode of the greedy policy; writes the curves, the last checkpoint and perhaps the best."""
+    def evaluate(self) -> None:
+        """Fly one deterministic episode with the greedy policy; write the tables, the last checkpoint and perhaps the best."""
         trainer = self.trainer
         policy = trainer.policy()
-        row = {"wall_s": self.wall, "mission_steps": float(trainer.steps), **scores(self.measure(policy))}
+        row = {"wall_s": self.wall, "mission_steps": float(trainer.steps), **episode_scores(self.measure(policy))}
         best = max((rank(r) for r in self.evaluations), default=None)
         self.evaluations.append(row)
-        self.curve.append(
-            {
-                "wall_s": self.wall,
-                "mission_steps": float(trainer.steps),
-                "updates": float(trainer.updates),
-                "td_error": trainer.error,
-                "temperature": trainer.temperature,
-                "exploration": trainer.explored,
-                "steps_per_s": trainer.steps / max(self.wall, 1e-9),
-            }
-        )
+        self.curve.append(self.progress())
         self.write_rows()
         description = self.describe(row)
         write_policy(self.out / CHECKPOINT / "last.safetensors", policy, description)
         if best is None or rank(row) > best:
             write_policy(self.out / CHECKPOINT / "best.safetensors", policy, description)
-        return row
+
+    def progress(self) -> TrainingScores:
+        """The next line of progress.csv."""
+        trainer = self.trainer
+        return {
+            "wall_s": self.wall,
+            "mission_steps": float(trainer.steps),
+            "updates": float(trainer.updates),
+            "td_error": trainer.error,
+            "temperature": trainer.temperature,
+            "exploration": trainer.explored,
+            "steps_per_s": trainer.steps / max(self.wall, 1e-9),
+        }
 
     def measure(self, policy: Policy) -> Metrics:
-        """Metrics of the policy on the scenario, seed 0."""
+        """Metrics of one episode of the policy on the scenario, seed 0."""
         return measure(run_episode(self.world, Learned(policy, self.signature(), self.out)))
 
     def signature(self) -> dict[str, Any]:
-        """What the policy is tied to."""
+        """The signature of the run's policies."""
         config = self.config
         return signature(self.trainer.scenario, config.state, config.actions, config.interval)
 
-    def describe(self, row: Row) -> dict[str, Any]:
-        """What a checkpoint says of itself."""
+    def describe(self, row: TrainingScores) -> dict[str, Any]:
+        """The description in a checkpoint's header."""
         return {**self.origin, "signature": self.signature(), "train": self.config, "evaluation": row}
 
     def write_rows(self) -> None:
-        """eval.csv and progress.csv, each replaced by a whole one."""
+        """Write eval.csv and progress.csv anew."""
         for name, rows in zip(TABLES, (self.evaluations, self.curve), strict=True):
             write_table(self.out / name, rows)
 
     def save(self) -> None:
-        """What :func:`resume` continues from."""
+        """Write the state that :func:`resume` continues from."""
         arrays, scalars = self.trainer.snapshot()
         description = {
             **self.origin,
@@ -231,8 +250,8 @@ class Run:
         write_arrays(self.out / RESUME, arrays, description)
 
 
-def scores(metrics: Metrics) -> Row:
-    """The columns of eval.csv behind wall_s and mission_steps."""
+def episode_scores(metrics: Metrics) -> TrainingScores:
+    """The columns of eval.csv after wall_s and mission_steps: violation and clearance are those of the worst agent."""
     agents = metrics["agents"]
     return {
         "return": metrics["team"]["return"],
@@ -242,14 +261,14 @@ def scores(metrics: Metrics) -> Row:
     }
 
 
-def rank(row: Row) -> tuple[float, float]:
-    """What makes one evaluation better than another: less violation first, then return less 100 a switch."""
+def rank(row: TrainingScores) -> tuple[float, float]:
+    """Sort key of evaluations, best last: by violation of the worst agent first, then by the return minus 100 per switch."""
     switches = sum(value for name, value in row.items() if name.startswith("switches_"))
     return -row["violation_time"], row["return"] - 100.0 * switches
 
 
-def write_table(path: Path, rows: Sequence[Row]) -> None:
-    """Rows as CSV, one column a key of the first."""
+def write_table(path: Path, rows: Sequence[TrainingScores]) -> None:
+    """Write rows as CSV, with one column per key of the first."""
     with staged_file(path, overwrite=True) as staging, staging.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()

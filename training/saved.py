@@ -1,4 +1,4 @@
-"""What a saved run must be before it goes on: of the same code, whole, and made of what a new run is made of."""
+"""Checks of a saved run before it continues: same version of the code, whole, and with the contents of a new run."""
 
 import json
 import math
@@ -13,8 +13,8 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import UNKNOWN, plain_data, provenance
 
 SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
-"""A run continues bit for bit only under the same versions of these, and the same revision where there is one."""
-KINDS: dict[str, type | tuple[type, ...]] = {
+"""Packages of which a run needs the same versions to continue bit for bit; it needs the same revision, too, if one is known."""
+SAVED_KINDS: dict[str, type | tuple[type, ...]] = {
     "versions": dict,
     "git_revision": str,
     "train": dict,
@@ -23,7 +23,7 @@ KINDS: dict[str, type | tuple[type, ...]] = {
     "curve": list,
     "wall_s": (int, float),
 }
-"""Types of what a saved run says of itself, by name."""
+"""Types of the entries of a saved run's description."""
 CONFIG = "config.json"
 
 Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
@@ -31,8 +31,8 @@ Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 def check_origin(path: Path, description: Mapping[str, Any]) -> None:
-    """Raise ConfigurationError where a file is no saved run, or one of other versions or another revision of the code."""
-    for name, kind in KINDS.items():
+    """Raise ConfigurationError if a description is not a saved run's, or of other versions or another revision of the code."""
+    for name, kind in SAVED_KINDS.items():
         if not isinstance(description.get(name), kind):
             raise ConfigurationError(f"{path} is not a saved run: it says no {name}")
     here = provenance()
@@ -49,6 +49,10 @@ def check_origin(path: Path, description: Mapping[str, Any]) -> None:
 
 def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
     """The configuration that a run was saved with.
+
+    Args:
+        path: file of the saved run.
+        train: JSON data of the configuration in it.
 
     Raises:
         ConfigurationError: it has other settings than runs of this version, or other values than ``config.json`` beside it.
@@ -70,10 +74,10 @@ def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
 
 
 def saved_rows(path: Path, rows: list[Any]) -> list[dict[str, float]]:
-    """Lines of a run's tables.
+    """The lines of a run's table, from JSON data.
 
     Raises:
-        ConfigurationError: they are none.
+        ConfigurationError: the data are not such lines.
     """
     try:
         return [{str(name): float(value) for name, value in row.items()} for row in rows]
@@ -82,8 +86,8 @@ def saved_rows(path: Path, rows: list[Any]) -> list[dict[str, float]]:
 
 
 def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
-    """Raise ConfigurationError where a saved snapshot is not made of what that of a ``new`` run is made of, naming the first
-    difference: arrays of the same names, shapes and types, and numbers of the same names.
+    """Raise ConfigurationError, naming the first difference, if a saved snapshot does not have the contents of a ``new`` run's:
+    arrays of the same names, shapes and types, and numbers of the same names.
     """
     (arrays, scalars), (like, numbers) = found, new
     fault = ""
@@ -101,7 +105,9 @@ def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
 
 
 def _difference(found: Any, like: Any, where: str) -> str:
-    """Where two pieces of JSON data differ in kind; nothing where they do not. Whole numbers count things: none is negative."""
+    """Description of the first difference in kind between two pieces of JSON data; empty if there is none. Whole numbers are
+    counts, so none may be negative.
+    """
     if isinstance(like, dict):
         if not isinstance(found, dict) or found.keys() != like.keys():
             return f"{where} must have {', '.join(like)}"

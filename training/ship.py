@@ -1,4 +1,4 @@
-"""How a training run becomes a shipped checkpoint with a model card."""
+"""Making a training run's best checkpoint one that comes with the package, with a model card."""
 
 import csv
 import shutil
@@ -9,18 +9,25 @@ from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.results.scores import SCORES
-from marlbc_mj.training.config import METHODS, flat_settings, make_config
+from marlbc_mj.training.config import flat_settings, make_config
+from marlbc_mj.training.methods import METHODS
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
 CHOICE = {"commands": "one of the commands", "orders": "one of all orders", "avoidance": "formation with or without avoidance"}
-"""What is chosen from an action set."""
+"""Description of a choice from each action set."""
 _SAFETY = ("violation_time_worst", "clearance_min_worst")
 
 
 def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
     """Copy the best checkpoint of a run and write its model card, ``<name>.md``; returns the checkpoint's path.
+
+    Args:
+        run: folder of the training run.
+        name: name of the shipped checkpoint.
+        folder: folder of the shipped checkpoints.
+        overwrite: whether a checkpoint of that name may be replaced.
 
     Raises:
         ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
@@ -44,12 +51,12 @@ def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False
 
 
 def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
-    """The model card, Markdown: what it is, how it was made, what it does on the case study, its learning curve.
+    """The model card in Markdown: what the checkpoint is, how it was made, how it does on the case study, its learning curve.
 
     Args:
-        name: of the shipped checkpoint.
-        description: of the checkpoint, from its header.
-        rows: of the run's evaluations.
+        name: name of the shipped checkpoint.
+        description: description in the checkpoint's header.
+        rows: lines of the run's eval.csv.
     """
     train, versions, evaluation = description["train"], description["versions"], description["evaluation"]
     command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
@@ -83,7 +90,7 @@ def _cells(row: dict[str, str]) -> tuple[str, ...]:
 
 
 def _settings(train: dict[str, object]) -> list[str]:
-    """``--set`` and what differs from the method's preset, nothing where nothing does."""
+    """``--set`` and the settings that differ from the method's preset; empty if none does."""
     preset = flat_settings(plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0])))
     said = {"method", "preset", "seed", "budget", "threads"}
     changed = [

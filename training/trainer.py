@@ -1,4 +1,4 @@
-"""A training run of a learner with a replay buffer: worlds, learner, replay and temperatures in one loop."""
+"""Training of a learner with a replay buffer: worlds, learner, replay and temperatures in one loop."""
 
 import math
 from collections.abc import Iterator
@@ -11,7 +11,7 @@ import torch
 
 from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.tasks.batch import Outcome
-from marlbc_mj.training.base import BaseTrainer, lost, prefixed, shaped_reward, unprefixed
+from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
@@ -21,19 +21,20 @@ from marlbc_mj.training.prioritised import PrioritisedReplay
 from marlbc_mj.training.replay import Replay
 from marlbc_mj.training.rivals import learner_class, own_entries
 
-__all__ = ["LATE_TEMPERATURE", "WARM_UP", "Trainer", "lost", "shaped_reward"]
-
 WARM_UP = 5_000
-"""Transitions before the networks are updated, and the states hashed at the earliest."""
+"""Transitions that are stored before the first update of the networks, and before states are hashed."""
 LATE_TEMPERATURE = 0.05
-"""The largest temperature after ``cool_by`` of the budget."""
+"""The largest temperature after the share ``cool_by`` of the budget."""
 
 
 class Trainer(BaseTrainer):
     """One run of a method with a replay buffer. :meth:`advance` makes a decision in every world and updates the networks.
 
     The updates draw from what was stored before the decision, so that the networks can learn while the worlds move. With one
-    thread one follows the other, to the same numbers.
+    thread, the worlds move after the updates, which gives the same numbers.
+
+    Args:
+        config: configuration of the run.
 
     Raises:
         ConfigurationError: a method, scenario, controller or device that cannot be used.
@@ -50,12 +51,12 @@ class Trainer(BaseTrainer):
         self.temperatures = Temperatures(agents, 1 << config.bits, actions)
         self.exploration = Exploration(config, agents, actions)
         self.exploration.begin(self.batch.turn, self.rng)
-        self.first = np.zeros(config.worlds, dtype=np.int64)  # row at which each world's episode began
+        self.first = np.zeros(config.worlds, dtype=np.int64)  # row of the buffer at which each world's episode began
         self.aside = ThreadPoolExecutor(1, "updates", torch.set_num_threads, (1,)) if config.threads > 1 else None
 
     @property
     def updates(self) -> int:
-        """Gradient steps made."""
+        """Number of gradient steps made."""
         return self.learner.updates
 
     @property
@@ -69,7 +70,7 @@ class Trainer(BaseTrainer):
         return self.learner.smooth
 
     def advance(self) -> Outcome:
-        """One decision in every world, and ``updates`` gradient steps."""
+        """Make one decision in every world, and ``updates`` gradient steps."""
         config, replay = self.config, self.replay
         share = self.steps / config.budget
         self.temperatures.nu = max(math.exp(math.log(LATE_TEMPERATURE) * share / config.cool_by), 1e-6)
@@ -84,7 +85,7 @@ class Trainer(BaseTrainer):
         self.explored = float((actions != best).mean())
         lenient = leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0])
         with self._learning(share):
-            outcome = self.batch.step(actions)
+            outcome = self.step(actions)
         reward, over, gone = self.judge(outcome)
         replay.store(
             state=self.state,
@@ -103,15 +104,17 @@ class Trainer(BaseTrainer):
         return outcome
 
     def _seen_enough(self) -> bool:
-        """Whether the buffer holds states of the whole mission: after WARM_UP transitions where episodes begin anywhere, else
-        after a whole mission, or as much of it as there is room for.
+        """Whether the buffer holds states of the whole mission.
+
+        Where episodes begin anywhere, it does after WARM_UP transitions; else after a whole mission, or as much of one as there
+        is room for.
         """
         mission = 0 if self.config.exploring_starts else self.batch.decisions
         rows = self.replay.count
         return rows * self.config.worlds >= WARM_UP and rows >= min(mission, self.replay.rows)
 
     def _fit_hash(self) -> None:
-        """Fit the hash to the buffer's states; episodes count as begun now, so that decisions without a code cool nothing."""
+        """Fit the hash to the buffer's states. Episodes count as begun now, so that decisions without a code cool nothing."""
         self.first[:] = self.replay.count
         states = self.replay.arrays["state"][: self.replay.count].reshape(-1, self.batch.read.size)
         self.hash.fit((states / self.batch.read.scale).astype(np.float32), self.generator)
@@ -128,7 +131,7 @@ class Trainer(BaseTrainer):
 
     @contextmanager
     def _learning(self, share: float) -> Iterator[None]:
-        """Learn while the block runs, or before it, if there is enough to learn from."""
+        """If there is enough to learn from, learn while the block runs, or before it with one thread."""
         replay, config = self.replay, self.config
         if replay.count * config.worlds < WARM_UP or replay.count <= config.n_step:
             yield
@@ -143,7 +146,7 @@ class Trainer(BaseTrainer):
                 self._await(learnt)
 
     def _await(self, learnt: Future[None]) -> None:
-        """Until the networks have learned; a method of its own for the profile's sake."""
+        """Wait until the networks have learned; a method of its own so that a profile shows the waiting."""
         learnt.result()
 
     def _learn(self, share: float) -> None:
@@ -167,7 +170,7 @@ class Trainer(BaseTrainer):
         return arrays, scalars | counts
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Go on from a :meth:`snapshot` of a run with the same configuration."""
+        """Return to a :meth:`snapshot` of a run with the same configuration."""
         super().restore(arrays, scalars)
         self.learner.restore(unprefixed("learner", arrays))
         for name, array in self.replay.arrays.items():
@@ -178,5 +181,5 @@ class Trainer(BaseTrainer):
         self.learner.updates, self.learner.targets.next = scalars["updates"], scalars["next_copy"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
-        """Arrays that are attributes, by owner and name."""
+        """Arrays that are attributes, as pairs of owner and name."""
         return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held"))]

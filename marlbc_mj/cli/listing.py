@@ -8,7 +8,8 @@ from marlbc_mj.scenarios import SCENARIOS
 from marlbc_mj.scenarios.base import REFERENCE_MODES
 from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.supervisors import SUPERVISORS
-from marlbc_mj.training.config import METHODS, PRESETS
+from marlbc_mj.training.config import PRESETS
+from marlbc_mj.training.methods import METHODS
 
 _BASES = ("inputs as in the paper", "inputs relative to the reference", "no networks")
 _REFERENCES = ("behaviors at the reference's own position", "behaviors at the measured position")

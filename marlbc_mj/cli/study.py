@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import tyro
 
-from marlbc_mj.cli.training import with_settings
+from marlbc_mj.training.config import with_settings
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
 from marlbc_mj.util.files import write_json
 

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -75,7 +75,8 @@ class Train:
 
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""
-        from marlbc_mj.training.config import METHODS, make_config
+        from marlbc_mj.training.config import make_config, with_settings
+        from marlbc_mj.training.methods import METHODS
 
         if self.method not in METHODS:
             raise unknown("method", self.method, METHODS)
@@ -83,41 +84,3 @@ class Train:
         changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **given}
         config = make_config(self.preset, **changes)
         return with_settings(config, self.set)
-
-
-Settings = TypeVar("Settings")
-
-
-def with_settings(config: Settings, settings: tuple[str, ...]) -> Settings:
-    """A frozen dataclass with fields replaced by ``name=value`` texts; ``outer.inner=value`` reaches a nested one.
-
-    Raises:
-        ConfigurationError: no such field, or a value of the wrong kind.
-    """
-    from dataclasses import replace
-
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        if not equals:
-            raise ConfigurationError(f"--set takes name=value, got {setting!r}")
-        outer, dot, inner = name.partition(".")
-        names = [f.name for f in fields(config)]  # type: ignore[arg-type]  # a dataclass
-        if outer not in names:
-            raise unknown("setting", outer, names)
-        present = getattr(config, outer)
-        value = with_settings(present, (f"{inner}={text}",)) if dot else _value(outer, present, text)
-        config = replace(config, **{outer: value})  # type: ignore[type-var]  # a dataclass
-    return config
-
-
-def _value(name: str, present: Any, text: str) -> Any:
-    """``text`` as the type of the value it replaces."""
-    try:
-        if isinstance(present, bool):
-            return {"true": True, "false": False}[text.lower()]
-        if isinstance(present, tuple):
-            return tuple(int(part) for part in text.split(","))
-        return type(present)(text)
-    except (KeyError, ValueError):
-        kind = {bool: "true or false", tuple: "whole numbers separated by commas"}.get(type(present), type(present).__name__)
-        raise ConfigurationError(f"setting {name} must be {kind}, got {text!r}") from None

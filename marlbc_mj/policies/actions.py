@@ -7,13 +7,14 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import unknown
 
 ACTIONS = ("commands", "orders", "avoidance")
+"""Names of the action sets."""
 
 
 def order_of(scenario: Scenario, actions: str) -> np.ndarray:
     """(A,) index into ``scenario.orders`` of every action of a set.
 
     Args:
-        scenario: whose orders they are.
+        scenario: the scenario whose orders are chosen from.
         actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, those
             commands that end in the first formation, the shortest first: FM and OA>FM in the case study.
 

@@ -1,4 +1,4 @@
-"""Checkpoints: arrays in safetensors with their description as JSON in the header, written whole or not at all."""
+"""Checkpoints: arrays as safetensors with a description as JSON in the header; a file is written whole or not at all."""
 
 import hashlib
 import itertools
@@ -21,11 +21,16 @@ from marlbc_mj.util.files import staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
 FORMAT = 2
-"""Raised when older checkpoints can no longer be read. 2: a digest of the arrays, a signature of all that a policy depends on."""
+"""Version of the format, for files that this version can read. 2: a digest of the arrays, a signature of what a policy needs."""
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]) -> None:
-    """Arrays and their description as one safetensors file; a file that is there is replaced only by a whole one.
+    """Write arrays and their description as one safetensors file. An existing file is replaced only by a whole one.
+
+    Args:
+        path: the file.
+        arrays: arrays by name.
+        description: what the header says, JSON data or dataclasses.
 
     Raises:
         ConfigurationError: the file cannot be written, no space left for example.
@@ -50,11 +55,11 @@ def digest(arrays: Mapping[str, np.ndarray]) -> str:
 
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """What :func:`write_arrays` wrote; nothing in the file is ever executed.
+    """The arrays and the description that :func:`write_arrays` wrote; nothing in the file is ever executed.
 
     Raises:
-        ConfigurationError: no such file, torn, not a checkpoint of this package, of another format, or with other arrays than
-            were written.
+        ConfigurationError: no such file, an incomplete one, no checkpoint of this package, one of another format, or one whose
+            arrays have changed.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -75,7 +80,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def write_policy(path: Path, policy: Policy, description: dict[str, Any]) -> None:
-    """A policy with its description, and the description once more as JSON beside it for people."""
+    """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
     arrays = {f"weight{k}": w for k, w in enumerate(policy.weights)}
     arrays |= {f"bias{k}": b for k, b in enumerate(policy.biases)}
     description = {**description, "dueling": policy.dueling, "margin": policy.margin, "risk": policy.risk}
@@ -87,8 +92,8 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
     """A policy and its description, whose ``signature`` has all entries of :func:`signature`.
 
     Raises:
-        ConfigurationError: as :func:`read_arrays`; arrays that do not make a policy; or a signature that says less, or what no
-            version of a policy says.
+        ConfigurationError: as :func:`read_arrays`; arrays that do not make a policy; or a signature with an entry that is missing
+            or cannot be.
     """
     arrays, description = read_arrays(path)
     try:
@@ -106,7 +111,7 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
 
 
 def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
-    """What keeps the arrays from being a policy; nothing where they are one."""
+    """The reason why arrays are not a policy; empty if they are one."""
     weights, biases, scale = policy.weights, policy.biases, policy.scale
     if len(arrays) != 2 * len(weights) + 1 or not weights:
         return f"it has the arrays {', '.join(sorted(arrays))}"
@@ -128,7 +133,7 @@ def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
     return ""
 
 
-KINDS: dict[str, type] = {
+SIGNATURE_KINDS: dict[str, type] = {
     "agents": int,
     "commands": list,
     "slots": list,
@@ -142,13 +147,19 @@ KINDS: dict[str, type] = {
     "actions": str,
     "interval": int,
 }
-"""Types of a signature's entries, by name."""
+"""Types of the entries of a signature."""
 
 
 def signature(scenario: Scenario, state: str, actions: str, interval: int) -> dict[str, Any]:
-    """What a policy is tied to: a team, its behaviors, slots and path, what it sees and what it chooses from.
+    """What a policy is tied to: a team, its behaviors, slots and path, its state and its action set.
 
-    Obstacles, starts, drag and duration are free: those it is meant to cope with.
+    Obstacles, starts, drag and duration are not in it: a policy is meant to cope with those.
+
+    Args:
+        scenario: the scenario of the team.
+        state: name of the kind of state.
+        actions: name of the action set.
+        interval: mission steps that a decision holds for.
     """
     return {
         "agents": scenario.agents,
@@ -167,10 +178,10 @@ def signature(scenario: Scenario, state: str, actions: str, interval: int) -> di
 
 
 def _unsigned(found: Any) -> str:
-    """What keeps ``found`` from being a signature; nothing where it is one."""
+    """The reason why JSON data are not a signature; empty if they are one."""
     if not isinstance(found, dict):
         return "it has no signature"
-    for name, kind in KINDS.items():
+    for name, kind in SIGNATURE_KINDS.items():
         if not isinstance(found.get(name), kind) or isinstance(found[name], bool):
             return f"its signature says {name} = {found.get(name)!r}"
     for name, valid in (("state", STATES), ("actions", ACTIONS)):
@@ -182,7 +193,7 @@ def _unsigned(found: Any) -> str:
 
 
 def check_signature(path: Path, found: dict[str, Any], scenario: Scenario) -> None:
-    """Raise ConfigurationError where a checkpoint's signature is not that of ``scenario``, naming the first difference."""
+    """Raise ConfigurationError, naming the first difference, if a checkpoint's signature is not that of ``scenario``."""
     fault = _unsigned(found)
     if fault:
         raise ConfigurationError(f"checkpoint {path} cannot be used: {fault}")
@@ -195,9 +206,16 @@ def check_signature(path: Path, found: dict[str, Any], scenario: Scenario) -> No
 
 
 def check_policy(path: Path, policy: Policy, agents: int, actions: int, state: int) -> None:
-    """Raise ConfigurationError where a policy's networks are not for N agents, A actions each and states of S numbers.
+    """Raise ConfigurationError if a policy's networks do not fit the team.
 
-    They give A values an agent, or one network gives A^N values of joint actions.
+    N networks must give A values each, or one network A^N values of joint actions.
+
+    Args:
+        path: the checkpoint, for the message.
+        policy: the policy.
+        agents: N.
+        actions: A.
+        state: S, size of a state.
     """
     networks, columns, inputs = len(policy.weights[0]), policy.columns, len(policy.scale)
     if inputs != state:

@@ -1,4 +1,8 @@
-"""A trained team without torch: states in, actions out."""
+"""A trained team without torch: states in, actions out.
+
+Three laws make the greedy policy: :func:`dueling_value`, :func:`admissible` and :func:`takes_best`. They work element by element
+on numbers in compiled code, on NumPy arrays and on torch tensors, so that learning, flying and the export share them.
+"""
 
 from __future__ import annotations
 
@@ -11,27 +15,24 @@ from marlbc_mj.core.laws import compiled, inlined
 if TYPE_CHECKING:
     from torch import Tensor
 
-SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
-"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
-
 
 class Policy(NamedTuple):
-    """Greedy policy of N dueling (or plain) networks with a switching margin; what a checkpoint holds."""
+    """Greedy policy of N dueling (or plain) networks with a switching margin; a checkpoint holds one."""
 
     weights: tuple[np.ndarray, ...]  # (N, in, out) float32 each
     biases: tuple[np.ndarray, ...]  # (N, 1, out)
-    scale: np.ndarray  # (S,)
+    scale: np.ndarray  # (S,) divisor of the state
     dueling: bool
-    margin: float
+    margin: float  # by which the best action's value must exceed the last one's
     risk: float = 0.0  # largest admissible risk; 0 where the networks have no risks
 
     @property
     def columns(self) -> int:
-        """Values that a network gives for a state."""
+        """Number of action values that a network gives for a state."""
         return int((self.biases[-1].shape[-1] - self.dueling) // (2 if self.risk else 1))
 
     def width(self, columns: int) -> int:
-        """Outputs that the last layer needs for so many values."""
+        """Number of outputs that the last layer needs for this many action values."""
         return int(self.dueling) + columns * (2 if self.risk else 1)
 
     def values(self, state: np.ndarray) -> np.ndarray:
@@ -48,25 +49,59 @@ class Policy(NamedTuple):
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
+RISK_SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
+"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
+
+
+@inlined
+def dueling_value(value: Array, advantage: Array, mean: Array) -> Array:
+    """Q(s, a) = V(s) + B(s, a) - mean_b B(s, b) (Wang et al. 2016).
+
+    Args:
+        value: (..., 1) V.
+        advantage: (..., A) B.
+        mean: (..., 1) of the advantages.
+    """
+    result: Array = value + advantage - mean
+    return result
 
 
 @inlined
 def admissible(risks: Array, least: Array, limit: float) -> Array:
-    """Bool (..., A): which actions may be taken, by their risks (..., A) and the least of these (..., 1)."""
-    return (risks <= limit) | (risks <= least + SLACK)
+    """Bool (..., A): which actions may be taken. Some always may.
+
+    Args:
+        risks: (..., A) of the actions.
+        least: (..., 1) the smallest of these.
+        limit: largest risk that is taken.
+    """
+    return (risks <= limit) | (risks <= least + RISK_SLACK)
+
+
+@inlined
+def takes_best(lead: Array, fresh: Array, margin: float) -> Array:
+    """Bool: whether the best action replaces the last one.
+
+    Args:
+        lead: how much higher the best action's value is.
+        fresh: whether there is no last action.
+        margin: lead that is needed.
+    """
+    result: Array = (lead > margin) | fresh
+    return result
 
 
 def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: float) -> np.ndarray:
-    """(B, N) actions: the best one, but the last one unless the best is better by more than ``margin``.
+    """(B, N) actions: the best one if it :func:`takes_best`, else the last one.
 
     Args:
-        values: (B, N, A), or (B, 1, A^N) of joint actions in C order, of which the best as a whole is taken.
-        last: (B, N) actions before.
-        fresh: (B,) bool, no action has been taken yet, so there is nothing to keep.
-        margin: of the action values.
+        values: (B, N, A) action values, or (B, 1, A^N) of joint actions in C order, which are chosen as a whole.
+        last: (B, N) last actions.
+        fresh: (B,) bool, whether there is no last action.
+        margin: lead in action values that is needed.
 
     Raises:
-        IndexError: a last action that is none.
+        IndexError: a last action that is not one of the A.
     """
     agents = last.shape[1]
     if values.shape[1] != agents:
@@ -79,23 +114,24 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
 
 @compiled
 def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
-    """:func:`greedy` for values (B, N, A)."""
+    """(B, N) actions as :func:`greedy` chooses them, for values (B, N, A)."""
     best = np.empty(last.shape, dtype=np.int64)
     for b in range(last.shape[0]):
         for i in range(last.shape[1]):
             if not 0 <= last[b, i] < values.shape[2]:
                 raise IndexError("a last action is no index into the action values")
             action = values[b, i].argmax()
-            leads = values[b, i, action] - values[b, i, last[b, i]] > margin
-            best[b, i] = action if leads or fresh[b] else last[b, i]
+            lead = values[b, i, action] - values[b, i, last[b, i]]
+            best[b, i] = action if takes_best(lead, fresh[b], margin) else last[b, i]
     return best
 
 
 @compiled
 def action_values(state, scale, weights, biases, dueling, actions, limit):  # type: ignore[no-untyped-def]
-    """(B, N, A) values of ``Policy``'s networks for states (B, S), all float32; ``limit`` is the largest admissible risk, or 0.
+    """(B, N, A) action values of a ``Policy``'s networks in states (B, S), all float32; -inf where an action is too risky.
 
-    For one team, loops take less time than a BLAS call a layer and a NumPy call an operation.
+    ``limit`` is the largest admissible risk, 0 for networks without risks. For one team, loops take less time than one BLAS call
+    per layer and one NumPy call per operation.
     """
     networks, last, widest = len(weights[0]), len(weights) - 1, 0
     for bias in biases:
@@ -117,7 +153,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):  # ty
             if dueling:
                 mean = q.sum() / np.float32(actions)
                 for a in range(actions):
-                    q[a] = y[0] + q[a] - mean
+                    q[a] = dueling_value(y[0], q[a], mean)
             if limit > 0.0:
                 for a in range(actions):
                     risks[a] = one / (one + np.exp(-y[dueling + actions + a]))
@@ -130,7 +166,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):  # ty
 
 @compiled
 def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
-    """``x @ weight + bias`` into ``out``, summed in the order of the inputs, those that are 0 left out."""
+    """Write ``x @ weight + bias`` into ``out``, summed in the order of the inputs; inputs that are 0 are left out."""
     out[:] = bias
     for j in range(len(x)):
         factor = x[j]
@@ -141,7 +177,7 @@ def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
 
 @compiled
 def rectify(x):  # type: ignore[no-untyped-def]
-    """The larger of ``x`` and 0, in place; NaN passes through."""
+    """Replace ``x`` by max(x, 0), in place; NaN passes through."""
     for j in range(len(x)):
         if x[j] < 0.0:
             x[j] = 0.0

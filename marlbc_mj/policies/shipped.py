@@ -1,4 +1,4 @@
-"""Checkpoints that come with the package; each has a model card beside it."""
+"""Where the checkpoints are that come with the package; each has a model card beside it."""
 
 from importlib.resources import files
 from pathlib import Path
@@ -6,6 +6,6 @@ from pathlib import Path
 FOLDER = Path(str(files("marlbc_mj") / "training" / "checkpoints"))
 
 
-def shipped(name: str) -> Path:
-    """Path of a shipped checkpoint, whether there is one or not."""
+def checkpoint_path(name: str) -> Path:
+    """Path of the checkpoint that is shipped under this name; it need not exist."""
     return FOLDER / f"{name}.safetensors"

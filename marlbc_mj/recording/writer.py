@@ -30,6 +30,7 @@ from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import check_target
 from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
+from marlbc_mj.util.seeding import stream
 
 METADATA = "marlbc"
 """Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
@@ -253,7 +254,7 @@ def _attachments(scenario: Scenario, controller: Controller, config: dict[str, A
 
 def _draw(scenario: Scenario, seed: int) -> Draw:
     """The episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
-    return scenario.draw(np.random.default_rng(np.random.SeedSequence([seed, 0])))
+    return scenario.draw(stream(seed))
 
 
 def _weight_table(state: np.ndarray) -> np.ndarray:

@@ -15,7 +15,8 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.training.config import CARE, METHODS, PRESETS, TrainConfig, from_json, make_config
+from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
+from marlbc_mj.training.methods import CARE, METHODS
 from marlbc_mj.training.run import rank
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file

@@ -1,4 +1,4 @@
-"""Output folders and files that appear whole or not at all."""
+"""Output folders and files, which appear whole or not at all."""
 
 import json
 import os
@@ -12,12 +12,16 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import plain_data
 
 PARTIAL = ".partial-"
-"""In the name of what is not whole yet, before the number of the process that writes it."""
+"""Part of the name of an incomplete file or folder, before the number of the process that writes it."""
 
 
 @contextmanager
 def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to write into that becomes ``out`` when the block ends well, and vanishes when it does not.
+    """A folder to write into; it becomes ``out`` if the block ends without an error, and is removed otherwise.
+
+    Args:
+        out: the folder.
+        overwrite: whether ``out`` may hold something, which is then replaced.
 
     Raises:
         ConfigurationError: ``out`` is not empty (and ``overwrite`` is off), is a file, or cannot be written.
@@ -34,7 +38,7 @@ def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def check_folder(out: Path, *, overwrite: bool) -> None:
-    """Raise ConfigurationError where ``out`` holds something that may not be overwritten."""
+    """Raise ConfigurationError if ``out`` holds something that may not be overwritten."""
     if out.is_file():
         raise ConfigurationError(f"output folder {out} is a file")
     if out.is_dir() and any(out.iterdir()) and not overwrite:
@@ -42,7 +46,7 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 
 def _begin(out: Path, create: Callable[[], None]) -> None:
-    """Make the folder of ``out``, then what stands in for it; ConfigurationError where that cannot be done."""
+    """Make the folder that ``out`` is in, then, by ``create``, what is written in its place."""
     with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         create()
@@ -50,7 +54,7 @@ def _begin(out: Path, create: Callable[[], None]) -> None:
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """What the system refuses inside the block, no space left for example, is one line about ``out``."""
+    """Turn the system's errors inside the block, no space left for example, into a ConfigurationError about ``out``."""
     try:
         yield
     except OSError as error:
@@ -58,7 +62,7 @@ def writing(out: Path) -> Iterator[None]:
 
 
 def _sync(path: Path) -> None:
-    """Have a file or a folder on the disk, so that it outlives a loss of power."""
+    """Flush a file or a folder to the disk, so that it survives a loss of power."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -67,7 +71,7 @@ def _sync(path: Path) -> None:
 
 
 def _replace(out: Path, staging: Path) -> None:
-    """Put ``staging`` in the place of ``out``; the old content goes only once the new one is there."""
+    """Put ``staging`` in the place of ``out``; the old content is removed once the new one is there."""
     old = out.with_name(f"{out.name}.old-{os.getpid()}")
     if out.exists():
         out.rename(old)
@@ -77,11 +81,14 @@ def _replace(out: Path, staging: Path) -> None:
 
 @contextmanager
 def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary path beside ``path``, with its suffix, that becomes ``path``, on the disk, when the block ends well.
+    """A temporary path beside ``path``, with its suffix; it becomes ``path``, on the disk, if the block ends without an error.
+
+    Args:
+        path: the file.
+        overwrite: whether an existing file may be replaced.
 
     Raises:
-        ConfigurationError: ``path`` exists (and ``overwrite`` is off), or the system refuses what the block or this does to
-            write it.
+        ConfigurationError: ``path`` exists (and ``overwrite`` is off), or the system refuses to write it.
     """
     check_target(path, overwrite=overwrite)
     staging = path.with_name(f".{path.stem}{PARTIAL}{os.getpid()}{path.suffix}")
@@ -97,10 +104,10 @@ def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what :func:`staged_file` left in ``folder`` and below where a process was killed while it wrote.
+    """Remove what :func:`staged_file` left in ``folder`` and below when a process was killed while it wrote.
 
     Raises:
-        ConfigurationError: the system refuses it.
+        ConfigurationError: the system refuses to remove it.
     """
     for path in folder.rglob(f".*{PARTIAL}*"):
         with writing(path):
@@ -108,7 +115,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Raise ConfigurationError where ``path`` is taken and must not be replaced."""
+    """Raise ConfigurationError if ``path`` exists and must not be replaced, or is a folder."""
     if path.is_dir():
         raise ConfigurationError(f"cannot write {path}: it is a folder")
     if path.exists() and not overwrite:
@@ -116,6 +123,6 @@ def check_target(path: Path, *, overwrite: bool) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Indented JSON, finite numbers only, through a temporary file."""
+    """Write indented JSON through a temporary file; numbers that are not finite are texts in it, see :func:`plain_data`."""
     with staged_file(path, overwrite=True) as staging:
         staging.write_text(json.dumps(plain_data(value), indent=2, allow_nan=False) + "\n")

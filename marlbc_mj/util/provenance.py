@@ -1,4 +1,4 @@
-"""Where a result comes from: versions, machine, revision, configuration."""
+"""Where a result comes from (versions, machine, revision, configuration), and dataclasses as JSON data."""
 
 import dataclasses
 import hashlib
@@ -17,7 +17,7 @@ PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gym
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, by distribution name."""
+    """Versions of Python and of the packages that results depend on, by the names of their distributions."""
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:
@@ -28,13 +28,13 @@ def versions() -> dict[str, str]:
 
 
 UNKNOWN = "unknown"
-"""The revision where the package was not installed from a repository."""
+"""Revision of a package that was not installed from a repository."""
 
 
 def git_revision() -> str:
-    """Revision of the source tree; with changes ``-dirty`` and a digest of them, so that equal texts mean equal tracked files.
+    """Revision of the source tree; ``unknown`` if installed from a wheel.
 
-    ``unknown`` when installed from a wheel.
+    A changed tree has ``-dirty`` and a digest of the changes at its end, so that equal revisions mean equal tracked files.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
@@ -64,12 +64,15 @@ def cpu() -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """What every run directory's config.json and every log carry beside their configuration."""
+    """What the config.json of every run and every log say beside their configuration."""
     return {"versions": versions(), "git_revision": git_revision(), "cpu": cpu(), "platform": platform.platform()}
 
 
 def plain_data(value: Any, *, not_finite: Callable[[float], Any] = str) -> Any:
-    """Dataclasses, tuples and arrays as JSON data; a dataclass keeps its type's name.
+    """JSON data of dataclasses, tuples and arrays. A dataclass keeps the name of its type.
+
+    It goes by the types of the values, not by annotations as :mod:`marlbc_mj.util.settings` does: fields hold any behavior,
+    disturbance or array, and :func:`config_hash` must not change.
 
     Args:
         value: what to convert, nested as deeply as it likes.

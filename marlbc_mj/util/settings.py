@@ -1,0 +1,280 @@
+"""Dataclasses of settings: rules beside their fields, and values read from TOML tables, JSON data and texts by their annotations.
+
+The conversion is cattrs'; what is added here are this package's messages, which name the place, the value and the valid ones.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from types import GenericAlias
+from typing import Any, Literal, NamedTuple, NewType, TypeVar, get_args, get_origin, get_type_hints
+
+from cattrs import BaseConverter, ClassValidationError, Converter, ForbiddenExtraKeysError, IterableValidationError, override
+from cattrs.cols import is_namedtuple, namedtuple_dict_structure_factory
+from cattrs.gen import make_dict_structure_fn
+
+from marlbc_mj.util.errors import ConfigurationError, unknown
+
+T = TypeVar("T")
+Hook = Callable[[Any, Any], Any]
+"""Turns a value into what an annotation says."""
+Unlimited = NewType("Unlimited", float)
+"""A number that may be infinite."""
+
+
+class Rule(NamedTuple):
+    """What a setting must be; stands in its annotation, ``Annotated[int, AT_LEAST_ONE]``."""
+
+    words: str
+    holds: Callable[[Any], bool]
+
+
+AT_LEAST_ONE = Rule("must be at least 1", lambda value: value >= 1)
+SHARE = Rule("must be between 0 and 1", lambda value: 0 <= value <= 1)
+POSITIVE = Rule("must be positive", lambda value: value > 0)
+NOT_NEGATIVE = Rule("must not be negative", lambda value: value >= 0)
+
+
+def check(settings: Any, prefix: str = "") -> None:
+    """Hold every field of a dataclass against the ``Literal`` or the rules of its annotation.
+
+    Args:
+        settings: the dataclass.
+        prefix: written before the fields' names.
+
+    Raises:
+        ConfigurationError: the first value that breaks a rule, with the field's name.
+    """
+    kind: Any = type(settings)
+    for name, hint in annotations(kind).items():
+        value = getattr(settings, name)
+        if get_origin(hint) is Literal and value not in get_args(hint):
+            raise unknown(prefix + name, value, get_args(hint))
+        for rule in getattr(hint, "__metadata__", ()):
+            if not rule.holds(value):
+                raise ConfigurationError(f"{prefix}{name} {rule.words}, got {value}")
+
+
+@cache
+def annotations(kind: type) -> dict[str, Any]:
+    """Annotations of a dataclass's fields by name, those that are set when it is made. A number that is infinite by default is
+    :data:`Unlimited`.
+    """
+    hints = get_type_hints(kind, include_extras=True)
+    return {f.name: Unlimited if f.default == math.inf else hints[f.name] for f in fields(kind) if f.init}
+
+
+class _Misfit(ValueError):
+    """A value of the wrong kind; what it says depends on the place that the value has in the whole."""
+
+    def __init__(self, at: Callable[[str], ConfigurationError]) -> None:
+        super().__init__()
+        self.at = at
+
+
+def misfit(wanted: str, value: object) -> _Misfit:
+    """The error of a hook: ``PLACE must be WANTED, got VALUE``."""
+    return _Misfit(lambda place: ConfigurationError(f"{place} must be {wanted}, got {value!r}"))
+
+
+def choose(value: object, valid: Mapping[str, T], entry: str = "") -> T:
+    """The value of a name in a table.
+
+    Args:
+        value: the name.
+        valid: the table.
+        entry: where the name stood below its place.
+    """
+    if not isinstance(value, str) or value not in valid:
+        raise _Misfit(lambda place: unknown(place + entry, value, valid))
+    return valid[value]
+
+
+def convert(converter: Converter, value: Any, hint: Any, place: str = "") -> Any:
+    """A value as the type of an annotation.
+
+    Args:
+        converter: :func:`tables`, :func:`json_data` or :func:`texts`.
+        value: what was read.
+        hint: the annotation, a dataclass for example.
+        place: the value's name; empty for the whole of a file.
+
+    Raises:
+        ConfigurationError: an unknown key, missing ones, or a value of another type, with its place; or what a dataclass itself
+            refuses.
+    """
+    try:
+        return converter.structure(value, hint)
+    except (ConfigurationError, ClassValidationError, IterableValidationError, _Misfit) as error:
+        raise _explain(error, place) from None
+
+
+def _explain(error: Exception, place: str) -> ConfigurationError:
+    """The first fault of a conversion in words: unknown keys come before missing ones, and those before values."""
+    if isinstance(error, ClassValidationError):
+        return _explain_fields(error, f"{place}." if place else "")
+    if isinstance(error, IterableValidationError):
+        (inner, note), *_ = error.group_exceptions()[0]
+        return _explain(inner, f"{place}[{note.index}]")
+    if isinstance(error, _Misfit):
+        return error.at(place)
+    return error if isinstance(error, ConfigurationError) else ConfigurationError(f"{place}: {error}")
+
+
+def _explain_fields(error: ClassValidationError, prefix: str) -> ConfigurationError:
+    noted, others = error.group_exceptions()
+    for other in others:
+        if isinstance(other, ForbiddenExtraKeysError):
+            return unknown("key", prefix + min(other.extra_fields), (prefix + name for name in annotations(other.cl)))
+    missing = [prefix + note.name for inner, note in noted if isinstance(inner, KeyError)]
+    if missing:
+        return ConfigurationError(f"missing: {', '.join(missing)}")
+    return _explain(noted[0][0], prefix + noted[0][1].name) if noted else _explain(others[0], prefix)
+
+
+def _exactly(kind: type | tuple[type, ...], wanted: str) -> Hook:
+    """A hook that takes values of a type as they are; true and false are no numbers."""
+
+    def take(value: Any, _: Any) -> Any:
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+            raise misfit(wanted, value)
+        return value
+
+    return take
+
+
+_number = _exactly((int, float), "a number")
+
+
+def _finite(value: Any, hint: Any) -> float:
+    if not math.isfinite(_number(value, hint)):
+        raise _Misfit(lambda place: ConfigurationError(f"{place} must be finite, got {value}"))
+    return float(value)
+
+
+def _choice(value: Any, hint: Any) -> Any:
+    return choose(value, {name: name for name in get_args(hint)})
+
+
+def _dataclass_hook(kind: type, converter: BaseConverter) -> Hook:
+    unlimited = override(struct_hook=converter.get_structure_hook(Unlimited))
+    hooks: dict[str, Any] = {name: unlimited for name, hint in annotations(kind).items() if hint is Unlimited}
+    fill: Hook = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True, **hooks)
+
+    def structure(value: Any, _: Any) -> Any:
+        if not isinstance(value, dict):
+            raise misfit("a table", value)
+        return fill(value, kind)
+
+    return structure
+
+
+def _limitless(value: Any, hint: Any) -> float:
+    return math.inf if value == math.inf else _finite(value, hint)
+
+
+def _row_hook(kind: Any, converter: BaseConverter) -> Hook:
+    """For a list that becomes a named tuple, whose last fields may have defaults."""
+    names = kind._fields
+    least = len(names) - len(kind._field_defaults)
+    fill = namedtuple_dict_structure_factory(kind, converter)
+
+    def structure(value: Any, _: Any) -> Any:
+        if not isinstance(value, list) or not least <= len(value) <= len(names):
+            raise misfit(f"a list [{', '.join(names)}]", value)
+        return fill(dict(zip(names, value, strict=False)), kind)
+
+    return structure
+
+
+def _tuple_hook(hint: Any, converter: BaseConverter) -> Hook:
+    """For a list that becomes a tuple: of any length for ``tuple[T, ...]``, else as long as the annotation."""
+    entry, *others = get_args(hint)
+    size = None if others == [Ellipsis] else 1 + len(others)
+    fill = converter.get_structure_hook(GenericAlias(list, (entry,)))
+
+    def structure(value: Any, _: Any) -> Any:
+        if not isinstance(value, list):
+            raise misfit("a list", value)
+        if size is not None and len(value) != size:
+            raise misfit(f"a list of {size}", value)
+        return tuple(fill(value, hint))
+
+    return structure
+
+
+def _numbers_hook(hint: Any, converter: BaseConverter) -> Hook:
+    """For a text that becomes a tuple of whole numbers."""
+
+    def structure(text: str, _: Any) -> tuple[int, ...]:
+        try:
+            return tuple(int(part) for part in text.split(","))
+        except ValueError:
+            raise misfit("whole numbers separated by commas", text) from None
+
+    return structure
+
+
+def _refuse_whole(text: str, _: Any) -> Any:
+    raise misfit("set field by field, name.field=value", text)
+
+
+def _made_of(origin: Any) -> Callable[[Any], bool]:
+    """Whether an annotation is ``origin[...]``."""
+    return lambda hint: get_origin(hint) is origin
+
+
+def tables() -> Converter:
+    """A converter of TOML tables: numbers are finite, names are those of their ``Literal``, unknown keys are refused."""
+    converter = Converter()
+    converter.register_structure_hook_factory(is_dataclass, _dataclass_hook)
+    converter.register_structure_hook_factory(is_namedtuple, _row_hook)
+    converter.register_structure_hook_factory(_made_of(tuple), _tuple_hook)
+    converter.register_structure_hook_func(_made_of(Literal), _choice)
+    for kind, hook in (
+        (int, _exactly(int, "a whole number")),
+        (float, _finite),
+        (Unlimited, _limitless),
+        (bool, _exactly(bool, "true or false")),
+        (str, _exactly(str, "a text")),
+    ):
+        converter.register_structure_hook(kind, hook)
+    return converter
+
+
+def json_data() -> Converter:
+    """A converter of what :func:`marlbc_mj.util.provenance.plain_data` made of a dataclass.
+
+    It gives an equal dataclass. Numbers may be infinite, and any text stands for a ``Literal``: the dataclass checks its values.
+    """
+    converter = tables()
+    for kind in (float, Unlimited):
+        converter.register_structure_hook(kind, lambda value, hint: _number(math.inf if value == "inf" else value, hint))
+    converter.register_structure_hook_func(_made_of(Literal), _exactly(str, "a text"))
+    return converter
+
+
+def texts() -> Converter:
+    """A converter of texts from a command line, which checks kinds only."""
+
+    def parsed(kind: Callable[[str], Any], wanted: str) -> Hook:
+        def parse(text: str, _: Any) -> Any:
+            try:
+                return kind(text)
+            except (KeyError, ValueError):
+                raise misfit(wanted, text) from None
+
+        return parse
+
+    converter = Converter()
+    converter.register_structure_hook_factory(_made_of(tuple), _numbers_hook)
+    converter.register_structure_hook_func(_made_of(Literal), parsed(str, "a text"))
+    converter.register_structure_hook_func(is_dataclass, _refuse_whole)
+    for kind, hook in (
+        (int, parsed(int, "int")),
+        (float, parsed(float, "float")),
+        (bool, parsed(lambda text: {"true": True, "false": False}[text.lower()], "true or false")),
+    ):
+        converter.register_structure_hook(kind, hook)
+    return converter
