@@ -14,7 +14,8 @@ from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
-from marlbc_mj.studies.bench import Stopwatch, matrix
+from marlbc_mj.studies.bench import matrix
+from marlbc_mj.studies.episodes import Stopwatch
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import METHODS, PRESETS
 
@@ -180,12 +181,12 @@ def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
         def decide(self, situation: Any, memory: Memory) -> tuple[np.ndarray, Memory]:
             return np.zeros(4, dtype=int), Memory(3.0)
 
-    watch = Stopwatch(Solver())
+    watch = Stopwatch(Solver(), paper())
     memory = watch.start(paper())
     for _ in range(2):
         _, memory = watch.decide(None, memory)  # type: ignore[arg-type]
     assert watch.share(np.array([4.0, 8.0])) == 0.5
-    assert Stopwatch(make_supervisor("scripted")).share(np.ones(2)) is None
+    assert Stopwatch(make_supervisor("scripted"), paper()).share(np.ones(2)) is None
 
 
 def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> No
 
     now = iter(range(100))
     monkeypatch.setattr(perf_training, "perf_counter", lambda: float(next(now)))  # a second between any two looks
-    clock, work = perf_training.Clock(), Work()
+    clock, work = perf_training.PartClock(), Work()
     with clock.timing(work, ("outer",), "a"), clock.timing(work, ("__call__",), "b"):
         work.outer()
         other = Thread(target=work)

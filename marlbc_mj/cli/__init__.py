@@ -9,36 +9,36 @@ from typing import Annotated
 import tyro
 from tyro.conf import subcommand
 
-from marlbc_mj.cli.benchmark import Bench, Run
-from marlbc_mj.cli.export import Export
-from marlbc_mj.cli.missions import Evaluate, Scale
-from marlbc_mj.cli.recordings import Log, Video, View
+from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand
+from marlbc_mj.cli.export import ExportCommand
+from marlbc_mj.cli.learners import StudyCommand
+from marlbc_mj.cli.listing import ListCommand
+from marlbc_mj.cli.measuring import AblationCommand, CalibrateCommand, OracleCommand, PerfCommand, ScaleCommand
+from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
-from marlbc_mj.cli.ship import Ship
-from marlbc_mj.cli.studies import Ablation, Calibrate, ListAll, OracleSearch, Perf
-from marlbc_mj.cli.study import Study
+from marlbc_mj.cli.ship import ShipCommand
 from marlbc_mj.cli.terminal import prepare_gl
-from marlbc_mj.cli.training import Train
+from marlbc_mj.cli.training import TrainCommand
 from marlbc_mj.util.errors import MarlbcError
 
 Command = (
-    Annotated[Bench, subcommand("bench")]
-    | Annotated[Run, subcommand("run")]
-    | Annotated[Evaluate, subcommand("evaluate")]
-    | Annotated[Train, subcommand("train")]
-    | Annotated[Ship, subcommand("ship")]
-    | Annotated[Export, subcommand("export")]
-    | Annotated[Study, subcommand("study")]
-    | Annotated[Video, subcommand("video")]
-    | Annotated[View, subcommand("view")]
-    | Annotated[Log, subcommand("log")]
-    | Annotated[ListAll, subcommand("list")]
+    Annotated[BenchCommand, subcommand("bench")]
+    | Annotated[RunCommand, subcommand("run")]
+    | Annotated[EvaluateCommand, subcommand("evaluate")]
+    | Annotated[TrainCommand, subcommand("train")]
+    | Annotated[ShipCommand, subcommand("ship")]
+    | Annotated[ExportCommand, subcommand("export")]
+    | Annotated[StudyCommand, subcommand("study")]
+    | Annotated[VideoCommand, subcommand("video")]
+    | Annotated[ViewCommand, subcommand("view")]
+    | Annotated[LogCommand, subcommand("log")]
+    | Annotated[ListCommand, subcommand("list")]
     | Annotated[RobotCommand, subcommand("robot")]
-    | Annotated[Perf, subcommand("perf")]
-    | Annotated[Scale, subcommand("scale")]
-    | Annotated[Ablation, subcommand("ablation")]
-    | Annotated[Calibrate, subcommand("calibrate")]
-    | Annotated[OracleSearch, subcommand("oracle")]
+    | Annotated[PerfCommand, subcommand("perf")]
+    | Annotated[ScaleCommand, subcommand("scale")]
+    | Annotated[AblationCommand, subcommand("ablation")]
+    | Annotated[CalibrateCommand, subcommand("calibrate")]
+    | Annotated[OracleCommand, subcommand("oracle")]
 )
 
 DESCRIPTION = "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper"
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run."""
     command = _parse(arguments)
     try:
-        prepare_gl(strict=isinstance(command, Video))
+        prepare_gl(strict=isinstance(command, VideoCommand))
         command.run()
     except MarlbcError as error:
         print(f"marlbc: {error}", file=sys.stderr)

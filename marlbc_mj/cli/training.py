@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Train:
+class TrainCommand:
     """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
 
     method: Positional[str] = "marlms"
