@@ -38,8 +38,9 @@ class ExactModel(PD):
 
 
 def half_mission(scale: float) -> Scenario:
-    """The case study's first 50 s from the slots: both points, no jump of the reference that a large drag would turn into a
-    fall; the drag is multiplied by ``scale``.
+    """The case study's first 50 s from the slots, with ``scale`` times the drag.
+
+    Both points are passed, and the reference does not jump, which a large drag would turn into a fall.
     """
     starts = tuple((x - 2.5, y) for x, y in SLOTS)
     return paper(starts=starts, duration=50.0, disturbance=PaperDrag(scale))
