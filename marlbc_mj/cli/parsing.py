@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from marlbc_mj.util.text import one_line
 
-CLOSE = 0.8  # likeness from which an option is suggested
+ALIKE = 0.8  # likeness from which an option is suggested
 MOST_SUGGESTED = 3
 
 
@@ -87,7 +87,7 @@ def _suggestion(tokens: Sequence[str], commands: Any, given: Sequence[str]) -> s
     scores = {
         name: max(SequenceMatcher(a=token, b=name).ratio() for token in unknown) for name in options_of(commands) if unknown
     }
-    close = sorted((name for name in scores if scores[name] >= CLOSE), key=lambda name: (-scores[name], name))
+    close = sorted((name for name in scores if scores[name] >= ALIKE), key=lambda name: (-scores[name], name))
     return listed + (f"; perhaps {', '.join(close[:MOST_SUGGESTED])}" if close else "")
 
 
