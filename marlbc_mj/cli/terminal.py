@@ -94,7 +94,7 @@ def print_results(results: list[Any]) -> None:
 
 @contextmanager
 def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
-    """Progress of a training run: mission steps, rate, time left and the last evaluation; a line an evaluation elsewhere."""
+    """Progress of a training run: mission steps, rate, time left and the last evaluation; elsewhere a line per evaluation."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 

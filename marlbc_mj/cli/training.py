@@ -10,6 +10,8 @@ from tyro.conf import Positional
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
     from marlbc_mj.training.config import TrainConfig
 
 
@@ -85,7 +87,7 @@ class TrainCommand:
         return with_settings(config, self.set)
 
 
-Settings = TypeVar("Settings")
+Settings = TypeVar("Settings", bound="DataclassInstance")
 
 
 def with_settings(config: Settings, settings: tuple[str, ...]) -> Settings:
@@ -101,12 +103,12 @@ def with_settings(config: Settings, settings: tuple[str, ...]) -> Settings:
         if not equals:
             raise ConfigurationError(f"--set takes name=value, got {setting!r}")
         outer, dot, inner = name.partition(".")
-        names = [f.name for f in fields(config)]  # type: ignore[arg-type]  # a dataclass
+        names = [f.name for f in fields(config)]
         if outer not in names:
             raise unknown("setting", outer, names)
         present = getattr(config, outer)
         value = with_settings(present, (f"{inner}={text}",)) if dot else _value(outer, present, text)
-        config = replace(config, **{outer: value})  # type: ignore[type-var]  # a dataclass
+        config = replace(config, **{outer: value})
     return config
 
 

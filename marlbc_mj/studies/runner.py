@@ -7,10 +7,10 @@ they end.
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.queues import SimpleQueue
@@ -93,10 +93,11 @@ def run_jobs(
     engine = _alone if workers == 1 else partial(_pooled, workers=workers)
     results: dict[int, ResultT] = {}
     try:
-        for place, result in engine(study, jobs, folder, progress, stop):
-            results[place] = result
-            if ended is not None:
-                ended(jobs[place], result)
+        with closing(engine(study, jobs, folder, progress, stop)) as finished:
+            for place, result in finished:
+                results[place] = result
+                if ended is not None:
+                    ended(jobs[place], result)
     except BrokenProcessPool as error:
         if stop is None or not stop.signal:
             again = "; the same command goes on" if stop is not None else ""
@@ -120,7 +121,7 @@ def counting(jobs: Sequence[JobT], stage: Callable[[JobT], str], progress: Progr
 
 def _alone(
     study: Study[JobT, ResultT], jobs: Sequence[JobT], folder: Path | None, progress: Progress, stop: StopRequest | None
-) -> Iterator[tuple[int, ResultT]]:
+) -> Generator[tuple[int, ResultT]]:
     """Every job in turn. One that is stopped yields nothing; those behind it are asked as well, since some may be done."""
     watch = Watch(progress, lambda: stop is not None and bool(stop.signal), folder)
     for place, job in enumerate(jobs):
@@ -140,7 +141,7 @@ def _pooled(
     stop: StopRequest | None,
     *,
     workers: int,
-) -> Iterator[tuple[int, ResultT]]:
+) -> Generator[tuple[int, ResultT]]:
     """Jobs in worker processes. After an error those that run are asked to save themselves, and awaited."""
     context = get_context("spawn")
     stopping, told = context.Event(), context.SimpleQueue()

@@ -56,7 +56,7 @@ class Question:
     about: str  # what varies and why; no number in it
     parameters: tuple[str, ...]
     cases: Callable[[], Sequence[Case]]
-    columns: tuple[str, ...]  # of the printed table, keys of page.COLUMNS; the CSV has all
+    columns: tuple[str, ...]  # of the table, keys of page.ABLATION_COLUMNS; the CSV has all
     block: int = 0
     remark: Callable[[Sequence[AblationRow]], str] | None = None  # a sentence computed from the rows
 
