@@ -92,6 +92,7 @@ def test_evaluate_reports_every_supervisor(tmp_path: Path, capsys: pytest.Captur
     [
         (["evaluate", "paper"], "draws no layouts"),
         (["evaluate", "field", "--supervisors", "nobody"], "unknown supervisor 'nobody'"),
+        (["evaluate", "field", "--supervisors"], "name at least one supervisor"),
         (["bench", "nowhere.toml"], "cannot read nowhere.toml"),
         (["run", "field", "--split", "validation"], "unknown split 'validation'"),
         (["scale", "--rounds", "3"], "rounds must be at least 5"),

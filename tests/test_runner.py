@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -148,7 +149,7 @@ from pathlib import Path
 from marlbc_mj.studies.runner import run_jobs
 sys.path.insert(0, sys.argv[2])
 from orphans import Patient
-run_jobs(Patient(Path(sys.argv[1])), workers=2)
+run_jobs(Patient(Path(sys.argv[1]), sys.argv[3] == "heeds"), workers=2)
 """
 ORPHANS = """
 import os, time
@@ -158,31 +159,50 @@ from pathlib import Path
 @dataclass(frozen=True)
 class Patient:
     out: Path
+    heeds: bool
 
     def jobs(self):
-        return [1, 2]
+        return [1, 2] if self.heeds else [1, 2, 3, 4]
 
     def run(self, job, watch):
         (self.out / f"{job}.begun").write_text(str(os.getpid()))
-        while not watch.stopping():
+        while not (self.heeds and watch.stopping()):
             time.sleep(0.02)
         (self.out / f"{job}.saved").touch()
 """
 
 
-def test_workers_do_not_outlive_their_study(tmp_path: Path) -> None:
-    """Killed without a chance to say so: its workers are asked to stop, save themselves and end."""
+@pytest.fixture
+def patient(tmp_path: Path, request: pytest.FixtureRequest):
+    """A study of jobs that never end by themselves, in a process group of its own, once two workers have begun."""
     (tmp_path / "orphans.py").write_text(ORPHANS)
-    (tmp_path / "__init__.py").touch()
-    parent = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path), str(tmp_path)], stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-c", PARENT, str(tmp_path), str(tmp_path), request.param]
+    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
     try:
         wait_for(lambda: len([p for p in tmp_path.glob("*.begun") if p.read_text()]) == 2)
-        workers = [int(path.read_text()) for path in tmp_path.glob("*.begun")]
+        yield parent
     finally:
-        parent.kill()
+        with suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
         parent.wait()
+
+
+@pytest.mark.parametrize("patient", ["heeds"], indirect=True)
+def test_workers_do_not_outlive_their_study(patient: subprocess.Popen, tmp_path: Path) -> None:
+    """Killed without a chance to say so: its workers are asked to stop, save themselves and end."""
+    workers = [int(path.read_text()) for path in tmp_path.glob("*.begun")]
+    patient.kill()
+    patient.wait()
     wait_for(lambda: len(list(tmp_path.glob("*.saved"))) == 2)
     wait_for(lambda: not any(alive(worker) for worker in workers))
+
+
+@pytest.mark.parametrize("patient", ["hurries"], indirect=True)
+def test_after_ctrl_c_no_job_begins(patient: subprocess.Popen, tmp_path: Path) -> None:
+    """Also none that waits in a worker's queue: the study ends at once."""
+    os.killpg(patient.pid, signal.SIGINT)
+    assert patient.wait(60) != 0
+    assert len(list(tmp_path.glob("*.begun"))) == 2 and not list(tmp_path.glob("*.saved"))
 
 
 def wait_for(condition, seconds: float = 60.0) -> None:

@@ -178,25 +178,43 @@ def _pass_on(told: "SimpleQueue[Any]", progress: Progress) -> None:
         progress(*told.get())
 
 
-_watch = Watch()  # a worker's own
+class _Worker(NamedTuple):
+    """What a worker process knows besides its jobs."""
+
+    watch: Watch
+    stopping: Event  # shared by the study's process and all workers
+    saving: bool  # whether jobs save themselves
+
+
+_worker: _Worker | None = None
 
 
 def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, folder: Path | None, saving: bool) -> None:
     """What a worker's jobs tell goes to the study's process.
 
-    Ctrl-C reaches the whole group of processes: where jobs save themselves, a worker leaves it to the study, which
-    asks it to stop.
+    Ctrl-C reaches the whole group of processes: where jobs save themselves, a worker leaves it to the study, which asks it to
+    stop.
     """
-    global _watch
-    _watch = Watch(lambda *step: told.put(step), lambda: stopping.is_set() or _orphaned(), folder)
+    global _worker
+    watch = Watch(lambda *step: told.put(step), lambda: stopping.is_set() or _orphaned(), folder)
+    _worker = _Worker(watch, stopping, saving)
     if saving:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _work(study: Study[JobT, ResultT], job: JobT) -> ResultT:
-    """A job in a worker; without its study, which was killed perhaps, the worker ends."""
+    """A job in a worker. Jobs that do not save themselves do not begin once the study ends, also those that are queued here.
+
+    Without its study, which was killed perhaps, the worker ends.
+    """
+    assert _worker is not None
     try:
-        return study.run(job, _watch)
+        if not _worker.saving and _worker.watch.stopping():
+            raise Stopped
+        return study.run(job, _worker.watch)
+    except KeyboardInterrupt:
+        _worker.stopping.set()
+        raise
     finally:
         if _orphaned():
             os._exit(1)
