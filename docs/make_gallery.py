@@ -14,7 +14,7 @@ from marlbc_mj import World, make_controller, make_supervisor, paper, run_episod
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.video import render_still, render_video
 from marlbc_mj.robots import make_robot
-from marlbc_mj.studies.robot_gate import CONTROLLERS, SHOWN, fly_gate
+from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, SHOWN, fly_gate
 
 GALLERY = Path(__file__).parent / "gallery"
 STILL, CLIP = (960, 540), (640, 360)  # [pixels]
@@ -44,7 +44,7 @@ def shots(names: list[str]) -> Iterator[Shot]:
         else:
             _, trajectory = fly_gate(name, "scripted")
             duration = trajectory.scenario.duration
-            log = from_trajectory(trajectory, CONTROLLERS["pd"](make_robot(name)))
+            log = from_trajectory(trajectory, GATE_CONTROLLERS["pd"](make_robot(name)))
             clip = 0.35 * duration, 0.60 * duration
             yield Shot(name, log, "close", 0.56 * duration, clip, max(1.0, round((clip[1] - clip[0]) / 6.0)))
 

@@ -1,4 +1,4 @@
-"""Does the basis learn, and what are the other choices worth? The studies of `marlbc ablation`, on shorter runs."""
+"""Does the basis learn, and what are the other choices worth? The questions of `marlbc ablation`, on shorter runs."""
 
 import csv
 from collections.abc import Sequence
@@ -8,25 +8,42 @@ from pathlib import Path
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.cli.studies import Ablation
+from marlbc_mj.cli.measuring import AblationCommand
 from marlbc_mj.controllers import SORLC
 from marlbc_mj.core.disturbances import PaperDrag
 from marlbc_mj.scenarios import Scenario, cruise, paper
-from marlbc_mj.studies.ablation import STUDIES, Case, Row, Study, run_study, select_studies, study_table, write_page
-from marlbc_mj.studies.ablation.studies import _largest_changes, half_mission, variants
+from marlbc_mj.studies.ablation import (
+    QUESTIONS,
+    AblationRow,
+    AblationStudy,
+    Case,
+    Question,
+    ablation_table,
+    run_ablation,
+    select_questions,
+    write_ablation_page,
+)
+from marlbc_mj.studies.ablation.questions import _largest_changes, half_mission, variants
 from marlbc_mj.util.errors import ConfigurationError
 
 
-def compare(scenario: Scenario) -> dict[str, Row]:
+def rows_of(question: Question) -> list[AblationRow]:
+    """One question, run."""
+    return AblationStudy((question,)).rows(run_ablation([question]).results)[question.name][1]
+
+
+def compare(scenario: Scenario) -> dict[str, AblationRow]:
     """Rows of every variant in one scenario, by variant."""
     cases = [Case((name,), scenario, controller) for name, controller in variants().items()]
-    study = replace(STUDIES["basis"], parameters=("controller",), block=0, cases=lambda: cases)
-    return {row.settings[0]: row for row in run_study(study)}
+    study = replace(QUESTIONS["basis"], parameters=("controller",), block=0, cases=lambda: cases)
+    return {row.settings[0]: row for row in rows_of(study)}
 
 
-def shortened(study: Study, duration: float) -> Study:
+def shortened(question: Question, duration: float) -> Question:
     """The same cases, each episode cut."""
-    return replace(study, cases=lambda: [c._replace(scenario=replace(c.scenario, duration=duration)) for c in study.cases()])
+    return replace(
+        question, cases=lambda: [c._replace(scenario=replace(c.scenario, duration=duration)) for c in question.cases()]
+    )
 
 
 def test_scaled_learns_and_printed_does_not() -> None:
@@ -47,65 +64,65 @@ def test_whole_case_study_cannot_be_flown_at_drag_20() -> None:
     rows = list(compare(paper(disturbance=PaperDrag(20.0), duration=2.0)).values())
     assert all(row.figures is None and row.first_over_this is None for row in rows)
     assert all(row.failure.startswith("diverged: agent ") and "t = 1." in row.failure for row in rows)
-    table = study_table(replace(STUDIES["basis"], parameters=("controller",), block=0), rows)
+    table = ablation_table(replace(QUESTIONS["basis"], parameters=("controller",), block=0), rows)
     assert [row[-1] for row in table.rows] == [row.failure for row in rows]
     assert table.notes[-1] == f"{len(rows)} of {len(rows)} rows have no figures."
 
 
 def test_default_gains_are_the_best_of_the_sweep() -> None:
     """`SORLC.scaled` has the gains of the sweep's smallest RMS velocity error, and the table's note says so."""
-    rows = run_study(STUDIES["sweep"])
+    rows = rows_of(QUESTIONS["sweep"])
     best = max(rows, key=lambda row: row.first_over_this or 0.0)
     default = SORLC.scaled()
     assert best.settings == (f"{default.identifier_rate:g}", f"{default.width:g}")
-    notes = study_table(STUDIES["sweep"], rows).notes
+    notes = ablation_table(QUESTIONS["sweep"], rows).notes
     assert f"Smallest error: rate {best.settings[0]}, width {best.settings[1]}; `sorlc-scaled` has rate" in notes[2]
 
 
 def test_studies_cover_every_choice() -> None:
     """Bases, signs and drag scales in full; modes, sides and four substeps; no two rows alike."""
-    settings = {name: [case.settings for case in study.cases()] for name, study in STUDIES.items()}
+    settings = {name: [case.settings for case in study.cases()] for name, study in QUESTIONS.items()}
     assert all(len(set(rows)) == len(rows) for rows in settings.values())
-    signs = {(c.settings, c.controller.tau_sign) for c in STUDIES["sorlc"].cases() if isinstance(c.controller, SORLC)}
+    signs = {(c.settings, c.controller.tau_sign) for c in QUESTIONS["sorlc"].cases() if isinstance(c.controller, SORLC)}
     assert {sign for (_, _, mark), sign in signs if mark == "+"} == {1}
     assert len(signs) == 4 * 3 * 2
     assert settings["reference"] == [("virtual",), ("actual",)]
     assert settings["avoidance"] == [("one-sided",), ("two-sided",)]
-    assert [case.scenario.substep for case in STUDIES["substep"].cases()] == [0.010, 0.005, 0.002, 0.001]
-    for study in STUDIES.values():
+    assert [case.scenario.substep for case in QUESTIONS["substep"].cases()] == [0.010, 0.005, 0.002, 0.001]
+    for study in QUESTIONS.values():
         assert all(len(case.settings) == len(study.parameters) for case in study.cases())
 
 
 def test_rows_are_compared_within_their_block() -> None:
     """The first row of each drag scale has ratio one; the sign's and the basis's worth compare rows that are alike otherwise."""
-    study = shortened(STUDIES["sorlc"], 1.0)
-    rows = run_study(study)
+    study = shortened(QUESTIONS["sorlc"], 1.0)
+    rows = rows_of(study)
     firsts = [row for k, row in enumerate(rows) if k == 0 or row.settings[0] != rows[k - 1].settings[0]]
     assert [row.settings for row in firsts] == [(scale, "off", "−") for scale in ("0", "1", "5", "20")]
     assert all(row.first_over_this == 1.0 for row in firsts)
     errors = {row.settings: row.figures.rms_velocity_error for row in rows if row.figures}
-    worth = max(abs(errors[scale, basis, "+"] - e) / min(e, errors[scale, basis, "+"]) for scale, basis, _ in errors
-                for e in [errors[scale, basis, "−"]])  # fmt: skip
+    pairs = [(errors[scale, basis, "−"], errors[scale, basis, "+"]) for scale, basis, _ in errors]
+    worth = max(abs(minus - plus) / min(minus, plus) for minus, plus in pairs)
     assert _largest_changes(rows, 2)[0] == pytest.approx(worth)
-    assert study_table(study, rows).rules == (6, 12, 18)
+    assert ablation_table(study, rows).rules == (6, 12, 18)
 
 
 def test_a_substep_beyond_the_limit_is_a_row() -> None:
     """Refused with the limit; the others have figures, and nothing is compared with a row that has none."""
     cases: Sequence[Case] = [Case((f"{1e3 * h:g}",), paper(substep=h, duration=1.0), SORLC()) for h in (0.025, 0.005)]
-    study = replace(STUDIES["substep"], cases=lambda: cases)
-    refused, ran = run_study(study)
+    study = replace(QUESTIONS["substep"], cases=lambda: cases)
+    refused, ran = rows_of(study)
     assert refused.failure.startswith("refused: substep 25 ms is beyond the stability limit 19.8 ms")
     assert ran.figures is not None
     assert ran.first_over_this is None
-    assert "19.8 ms" in study_table(study, [refused, ran]).notes[2]
+    assert "19.8 ms" in ablation_table(study, [refused, ran]).notes[2]
 
 
 def test_page_and_csv_hold_every_row(tmp_path: Path) -> None:
     """Three files; the CSV has a column for every parameter of any study, and the figures bit for bit."""
-    studies = [shortened(STUDIES[name], 1.0) for name in ("reference", "avoidance", "substep")]
-    results = {study.name: (study, run_study(study)) for study in studies}
-    write_page(results, tmp_path, {"revision": "<abc>"})
+    studies = [shortened(QUESTIONS[name], 1.0) for name in ("reference", "avoidance", "substep")]
+    results = {study.name: (study, rows_of(study)) for study in studies}
+    write_ablation_page(results, tmp_path, {"revision": "<abc>"})
     assert {path.name for path in tmp_path.iterdir()} == {"ablation.md", "ablation.csv", "index.html"}
     with open(tmp_path / "ablation.csv", newline="", encoding="utf-8") as stream:
         lines = list(csv.DictReader(stream))
@@ -126,7 +143,7 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     main(["ablation", "--study", "avoidance", "--out", str(out)])
     assert "two-sided" in capsys.readouterr().out
     wrong = {
-        ("--study", "avoidance", "foo"): f"marlbc: unknown study 'foo'; choose from: {', '.join(STUDIES)}\n",
+        ("--study", "avoidance", "foo"): f"marlbc: unknown study 'foo'; choose from: {', '.join(QUESTIONS)}\n",
         ("--study", "sweep", "sweep"): "marlbc: a study is named twice: sweep, sweep\n",
         ("--out", str(out)): f"marlbc: output folder {out} is not empty; choose another or add --overwrite\n",
     }
@@ -135,11 +152,11 @@ def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
             main(["ablation", *arguments])
         assert stopped.value.code == 2
         assert capsys.readouterr().err == said
-    assert ", ".join(STUDIES) in Path(Ablation.run.__code__.co_filename).read_text()  # the option's help names them all
+    assert ", ".join(QUESTIONS) in Path(AblationCommand.run.__code__.co_filename).read_text()  # the option's help names them all
 
 
 def test_selection_keeps_the_order_given() -> None:
-    assert [study.name for study in select_studies(("substep", "basis"))] == ["substep", "basis"]
-    assert [study.name for study in select_studies(())] == list(STUDIES)
+    assert [study.name for study in select_questions(("substep", "basis"))] == ["substep", "basis"]
+    assert [study.name for study in select_questions(())] == list(QUESTIONS)
     with pytest.raises(ConfigurationError, match="twice"):
-        select_studies(("basis", "basis"))
+        select_questions(("basis", "basis"))

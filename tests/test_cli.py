@@ -12,9 +12,12 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.engine.world import World
+from marlbc_mj.recording import writer
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Scenario, paper
-from marlbc_mj.studies.bench import Stopwatch, matrix
+from marlbc_mj.studies.bench import matrix
+from marlbc_mj.studies.episodes import Stopwatch
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import PRESETS
 from marlbc_mj.training.methods import METHODS
@@ -169,24 +172,44 @@ def test_a_method_that_cannot_start_is_a_row(seeds: list[str], tmp_path: Path) -
 
 
 def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
-    """The share of its solver's time in all decisions; nothing where the memory says nothing."""
+    """The share of its solver's time in all decisions, nothing where the memory says nothing; one start serves one episode."""
+    starts = []
 
     class Memory(NamedTuple):
         solver_ms: float
 
     class Solver:
         def start(self, scenario: Scenario) -> Memory:
+            starts.append(scenario)
             return Memory(0.0)
 
         def decide(self, situation: Any, memory: Memory) -> tuple[np.ndarray, Memory]:
             return np.zeros(4, dtype=int), Memory(3.0)
 
-    watch = Stopwatch(Solver())
+    watch = Stopwatch(Solver(), paper())
     memory = watch.start(paper())
     for _ in range(2):
         _, memory = watch.decide(None, memory)  # type: ignore[arg-type]
-    assert watch.share(np.array([4.0, 8.0])) == 0.5
-    assert Stopwatch(make_supervisor("scripted")).share(np.ones(2)) is None
+    assert watch.share(np.array([4.0, 8.0])) == 0.5 and len(starts) == 1
+    watch.start(paper())
+    assert len(starts) == 2  # another episode has a memory of its own
+    assert Stopwatch(make_supervisor("scripted"), paper()).share(np.ones(2)) is None
+
+
+def test_a_run_assembles_no_model_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One world, and one start of a supervisor that predicts with a plan of its own; the log takes the world's model."""
+    made: list[str] = []
+    for kind, method in ((World, "__init__"), (MPCMS, "start")):
+        original = getattr(kind, method)
+
+        def counted(self, *arguments, _original=original, _name=f"{kind.__name__}.{method}", **options):
+            made.append(_name)
+            return _original(self, *arguments, **options)
+
+        monkeypatch.setattr(kind, method, counted)
+    monkeypatch.setattr(writer, "make_plan", None)
+    main(["run", "paper", "--supervisor", "mpcms", "--out", str(tmp_path / "run"), *SHORT])
+    assert made == ["World.__init__", "MPCMS.start"]
 
 
 def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:

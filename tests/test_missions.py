@@ -12,10 +12,10 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.outcomes import FAILED_MISSION, outcome
-from marlbc_mj.results.seeds import perturbed, run_methods
 from marlbc_mj.scenarios import held_out, make_scenario
 from marlbc_mj.scenarios.families import Gates
 from marlbc_mj.studies import scale
+from marlbc_mj.studies.draws import perturbed, run_methods
 from marlbc_mj.supervisors import UNLEARNED, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -92,6 +92,7 @@ def test_evaluate_reports_every_supervisor(tmp_path: Path, capsys: pytest.Captur
     [
         (["evaluate", "paper"], "draws no layouts"),
         (["evaluate", "field", "--supervisors", "nobody"], "unknown supervisor 'nobody'"),
+        (["evaluate", "field", "--supervisors"], "name at least one supervisor"),
         (["bench", "nowhere.toml"], "cannot read nowhere.toml"),
         (["run", "field", "--split", "validation"], "unknown split 'validation'"),
         (["scale", "--rounds", "3"], "rounds must be at least 5"),
@@ -121,11 +122,10 @@ def test_a_small_scale_run_has_every_figure(tmp_path: Path, monkeypatch: pytest.
     """Table, picture and numbers; the figures themselves are the machine's."""
     for name, value in {"SIZES": (4, 16), "AGENT_STEPS": 64, "MEMORY_AGENTS": 64, "LEAST_WORLDS": 8}.items():
         monkeypatch.setattr(scale, name, value)
-    figures = scale.measure_scale(5)
+    figures = scale.ScaleStudy(5).gather(scale.run_scale(5, tmp_path / "out").results)
     assert figures["growth"]["4"] == 1.0
     for key in ("us_per_agent_and_mission_step", "kib_per_world", "kib_per_agent", "growth"):
         assert set(figures[key]) == {"4", "16"} and min(figures[key].values()) > 0
-    scale.write_scale(figures, tmp_path)
     assert {path.name for path in tmp_path.rglob("*.*")} == {"scale.md", "scale.json", "scale.pdf", "scale.png"}
 
 
@@ -134,7 +134,7 @@ def test_256_agents_run_under_every_supervisor_that_decides_per_agent():
     scenario = replace(scale.mission(256), duration=0.2)
     world = World(scenario, record=True)
     assert world.data[0].narena > 2 * 133_000
-    for name in scale.SUPERVISORS:
+    for name in scale.SCALED_SUPERVISORS:
         assert np.isfinite(run_episode(world, make_supervisor(name)).position).all()
     with pytest.raises(ConfigurationError, match="256 agents"):
         make_supervisor("mpcms").start(scenario)

@@ -7,7 +7,7 @@ import pytest
 
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import paper
-from marlbc_mj.studies import perf, perf_training
+from marlbc_mj.studies import perf, perf_episode, perf_training
 from marlbc_mj.training import trainer
 from marlbc_mj.training.config import TrainConfig, make_config
 
@@ -34,7 +34,8 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All keys of the file's schema, positive and finite, and lines that show them."""
     for name, value in {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1}.items():
         monkeypatch.setattr(perf, name, value)
-    monkeypatch.setattr(perf, "paper", lambda: paper(duration=2.0))
+    for module in (perf, perf_episode):
+        monkeypatch.setattr(module, "paper", lambda: paper(duration=2.0))
     monkeypatch.setattr(perf_training, "make_scenario", lambda name: paper(duration=10.0))
     monkeypatch.setattr("marlbc_mj.training.base.make_scenario", lambda name: paper(duration=10.0))
     monkeypatch.setattr(perf_training, "training_config", small)
@@ -79,7 +80,7 @@ def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> No
 
     now = iter(range(100))
     monkeypatch.setattr(perf_training, "perf_counter", lambda: float(next(now)))  # a second between any two looks
-    clock, work = perf_training.Clock(), Work()
+    clock, work = perf_training.PartClock(), Work()
     with clock.timing(work, ("outer",), "a"), clock.timing(work, ("__call__",), "b"):
         work.outer()
         other = Thread(target=work)

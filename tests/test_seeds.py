@@ -2,6 +2,7 @@
 
 import csv
 import json
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -19,21 +20,18 @@ from marlbc_mj.report.templates import render
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seed_statistics import analyse, group, supervisor_of
-from marlbc_mj.results.seeds import (
-    CASE_STUDY_PERTURBATION,
-    Instance,
-    MethodRuns,
-    SeedResults,
-    SeedRun,
-    perturbed,
-    run_methods,
-    run_seeds,
-    seed_range,
-)
+from marlbc_mj.results.seeds import Instance, MethodRuns, SeedResults, SeedRun, seed_range
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
+from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION, perturbed, run_methods
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
+
+
+def run_seeds(scenario, supervisors, controllers, seeds, progress=None, **options) -> SeedResults:
+    """Every supervisor with every controller."""
+    return run_methods(scenario, list(product(supervisors, controllers)), seeds, progress, **options)
+
 
 CLOCK = {"decision_ms_median", "decision_ms_p99"}
 CONFIG = {"versions": {"mujoco": "3.17"}, "git_revision": "abc", "command": "marlbc bench paper --seeds 4 <&>"}
@@ -99,6 +97,7 @@ def test_results_depend_on_neither_order_nor_company_nor_a_reused_world(results:
 
 
 def test_workers_change_nothing(results: SeedResults) -> None:
+    """Neither results nor what progress is told, only the order in which methods take turns."""
     told = []
     shared = run_seeds(
         paper(duration=2.0),
@@ -108,7 +107,9 @@ def test_workers_change_nothing(results: SeedResults) -> None:
         lambda what, done, total: told.append((what, done)),
         workers=2,
     )
-    assert [m.key for m in shared.methods] == ["scripted+pd", "fsams+pd"] and told == [("scripted+pd", 2), ("fsams+pd", 2)]
+    assert [m.key for m in shared.methods] == ["scripted+pd", "fsams+pd"] and len(told) == 4
+    for key in ("scripted+pd", "fsams+pd"):  # what the workers tell arrives here, each method's in its order
+        assert [step for step in told if step[0] == key] == [(key, 1), (key, 2)]
     for method, here in zip(shared.methods, results.methods[1::2], strict=True):
         assert [without_clock(r) for r in method.runs] == [without_clock(r) for r in here.runs[:2]]
 

@@ -10,24 +10,25 @@ from pathlib import Path
 
 import pytest
 
-from marlbc_mj.cli import main, study
-from marlbc_mj.cli.study import Job, plan, run_job, run_study
+from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.report.table import to_markdown
-from marlbc_mj.studies.learners import (
-    COLUMNS,
-    DONE,
-    FAILED,
+from marlbc_mj.studies.learners import VARIANTS, trainings
+from marlbc_mj.studies.learners.comparison import WIDE, by_variant, learners_table, rows_of_panels, write_comparison
+from marlbc_mj.studies.learners.records import (
+    DONE_MARK,
+    FAILED_MARK,
     GOAL_SWITCHES,
+    RUN_COLUMNS,
     UNFINISHED,
-    VARIANTS,
     collect,
     meets_goal,
     read_study,
     scripted_return,
     write_csvs,
 )
-from marlbc_mj.studies.learners_report import WIDE, by_variant, rows_of_panels, study_table, write_report
+from marlbc_mj.studies.learners.trainings import LearnerStudy, TrainingJob, train_job, train_learners
+from marlbc_mj.studies.protocol import Stopped, Watch
 from marlbc_mj.training import run
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.methods import CARE
@@ -43,8 +44,12 @@ def tiny(config: TrainConfig) -> TrainConfig:
     return replace(config, **TINY)
 
 
-def jobs_of(out: Path, *variants: str, seeds: int = 1, budget: int = 1_600) -> list[Job]:
-    return plan(variants, seeds, budget, out, tiny)
+def study_of(out: Path, *variants: str, seeds: int = 1, budget: int = 1_600) -> LearnerStudy:
+    return LearnerStudy(out, variants, seeds, budget, tiny)
+
+
+def jobs_of(out: Path, *variants: str, seeds: int = 1, budget: int = 1_600) -> list[TrainingJob]:
+    return study_of(out, *variants, seeds=seeds, budget=budget).jobs()
 
 
 def evaluations(folder: Path) -> list[dict[str, str]]:
@@ -52,8 +57,13 @@ def evaluations(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def quiet(line: str) -> None:
-    assert "\n" not in line
+def quiet(line: str, done: float, total: float) -> None:
+    assert "\n" not in line and 0 <= done <= total
+
+
+def listening(said: list[str]) -> Watch:
+    """Keeps every line that a job tells."""
+    return Watch(lambda line, done, total: said.append(line))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +81,7 @@ def test_a_study_leaves_what_it_promises(finished: Path) -> None:
     for variant in ("marlms", "vdn"):
         for seed in ("0", "1"):
             folder = finished / variant / seed
-            assert {p.name for p in folder.iterdir()} == {"eval.csv", "progress.csv", "config.json", "checkpoint", DONE}
+            assert {p.name for p in folder.iterdir()} == {"eval.csv", "progress.csv", "config.json", "checkpoint", DONE_MARK}
             assert {p.name for p in (folder / "checkpoint").iterdir()} == {"best.safetensors", "best.json"}
             assert json.loads((folder / "config.json").read_text())["train"]["threads"] == 1
     rows, curves = read_study(finished)
@@ -90,7 +100,8 @@ def test_finished_runs_are_skipped(finished: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(run, "train", None)
     monkeypatch.setattr(run, "resume", None)
     said: list[str] = []
-    assert run_study(jobs_of(finished, "marlms", "vdn", seeds=2), 1, said.append) == 0
+    study = study_of(finished, "marlms", "vdn", seeds=2)
+    assert train_learners(study, 1, lambda line, done, total: said.append(line)) == 0
     assert len(said) == 4 and all(line.endswith(": found") for line in said)
     with pytest.raises(ConfigurationError, match="other settings"):
         jobs_of(finished, "vdn", budget=5_000)
@@ -106,7 +117,7 @@ def test_table_and_figure_from_csv_alone(finished: Path, tmp_path: Path) -> None
         assert (tmp_path / name).read_bytes() == (finished / name).read_bytes(), name
 
 
-def interrupted(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
+def interrupted(job: TrainingJob, monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave what a run killed after its save leaves."""
     with monkeypatch.context() as patch:
         original, calls = Trainer.advance, []
@@ -118,8 +129,9 @@ def interrupted(job: Job, monkeypatch: pytest.MonkeyPatch) -> None:
             return original(self)
 
         patch.setattr(Trainer, "advance", advance)
-        assert run_job(job, quiet).how == "stopped"
-    assert (job.folder / run.RESUME).is_file() and not (job.folder / DONE).exists()
+        with pytest.raises(Stopped):
+            train_job(job, Watch(quiet))
+    assert (job.folder / run.RESUME).is_file() and not (job.folder / DONE_MARK).exists()
 
 
 def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -128,13 +140,13 @@ def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch:
     interrupted(job, monkeypatch)
     rows, _ = collect(tmp_path)
     assert rows[0]["failure"] == UNFINISHED
-    assert study_table(rows).rows[0][1:3] == ("0", "0 of 0")
+    assert learners_table(rows).rows[0][1:3] == ("0", "0 of 0")
     with pytest.raises(ConfigurationError, match="other settings"):
         jobs_of(tmp_path, "marlms", budget=9_000)
     said: list[str] = []
     with monkeypatch.context() as patch:
         patch.setattr(run, "train", None)
-        assert run_job(job, said.append).how == "finished"
+        assert train_job(job, listening(said)).how == "finished"
     assert said[0] == "marlms seed 0: goes on" and not (job.folder / run.RESUME).exists()
     one, other = ([{**e, "wall_s": ""} for e in evaluations(out / "marlms" / "0")] for out in (finished, tmp_path))
     assert len(one) == 2 and one == other
@@ -146,7 +158,7 @@ def test_an_interrupted_run_of_other_code_begins_anew(tmp_path: Path, monkeypatc
     arrays, description = read_arrays(job.folder / run.RESUME)
     write_arrays(job.folder / run.RESUME, arrays, {**description, "versions": {}})
     said: list[str] = []
-    assert run_job(job, said.append).how == "finished"
+    assert train_job(job, listening(said)).how == "finished"
     assert said[0] == "marlms seed 0: begins" and len(evaluations(job.folder)) == 2
 
 
@@ -161,24 +173,25 @@ def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPat
             raise RuntimeError("shapes\ndiffer")
         return original(config)
 
-    jobs = jobs_of(tmp_path, "marlms", "vdn", "qmix", budget=400)
+    study = study_of(tmp_path, "marlms", "vdn", "qmix", budget=400)
+    jobs = study.jobs()
     said: list[str] = []
     with monkeypatch.context() as patch:
         patch.setattr(run, "make_trainer", make)
-        run_study(jobs, 1, said.append)
+        train_learners(study, 1, lambda line, done, total: said.append(line))
     assert "[2/3] vdn seed 0: failed: the networks diverged" in said
     rows, curves = collect(tmp_path)
     assert [row["failure"] for row in rows] == ["", "the networks diverged", "RuntimeError: shapes differ"]
     write_csvs(tmp_path, rows, curves)
-    write_report(tmp_path, rows, curves)
+    write_comparison(tmp_path, rows, curves)
     assert read_study(tmp_path) == (rows, curves)
     for name in ("study.csv", "study.md", "study.tex"):
         assert "the networks diverged" in (tmp_path / name).read_text()
-    cells = {row[0]: row[1:] for row in study_table(rows).rows}
+    cells = {row[0]: row[1:] for row in learners_table(rows).rows}
     assert cells["vdn"][:4] == ("1, 1 failed", "0 of 1", "∞", "∞") and cells["vdn"][4] == "–"
-    assert run_job(jobs[1], quiet).how == "finished" and not (jobs[1].folder / FAILED).exists()
+    assert train_job(jobs[1], Watch(quiet)).how == "finished" and not (jobs[1].folder / FAILED_MARK).exists()
     only = by_variant(rows)["qmix"]
-    write_report(tmp_path, only, [])  # nothing but a failure can still be drawn
+    write_comparison(tmp_path, only, [])  # nothing but a failure can still be drawn
 
 
 def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
@@ -193,7 +206,7 @@ def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
     thread = threading.Thread(target=interrupt)
     thread.start()
     try:
-        assert run_study(jobs_of(tmp_path, "vdn", budget=900_000_000), 2, quiet) == signal.SIGINT
+        assert train_learners(study_of(tmp_path, "vdn", budget=900_000_000), 2, quiet) == signal.SIGINT
     finally:
         over.set()
         thread.join()
@@ -203,7 +216,7 @@ def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
 
 def test_a_stopped_study_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     """After what there is; the exit status is the signal's."""
-    monkeypatch.setattr(study, "run_study", lambda jobs, workers, say: signal.SIGTERM)
+    monkeypatch.setattr(trainings, "train_learners", lambda study, workers, progress: signal.SIGTERM)
     with pytest.raises(SystemExit) as stopped:
         main(["study", "--out", str(tmp_path)])
     assert stopped.value.code == 128 + signal.SIGTERM
@@ -212,7 +225,7 @@ def test_a_stopped_study_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.M
 
 def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
     """All can be configured, no two alike, each a switch away from marlms; a group fits a row of the figure."""
-    configs = {job.variant: job.config for job in plan((), 1, 5_000, tmp_path)}
+    configs = {job.variant: job.config for job in LearnerStudy(tmp_path, seeds=1, budget=5_000).jobs()}
     assert list(configs) == list(VARIANTS) and len({repr(config) for config in configs.values()}) == len(VARIANTS)
     assert all((c.budget, c.threads, c.scenario) == (5_000, 1, "paper") for c in configs.values())
     base = configs["marlms"]
@@ -256,15 +269,15 @@ def test_the_goal_is_the_scripted_supervisors() -> None:
 
 def test_a_goal_that_is_never_met_is_infinite() -> None:
     """The median over runs counts a run that fails or never gets there; the interval may end at infinity."""
-    row = dict.fromkeys(COLUMNS, "")
+    row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"variant": "marlms", "budget": "5000000", "goal_return": "15017", "best_switches": "4/2/2/4", "wall_s": "60"}
     numbers = dict.fromkeys(("best_return", "best_violation_time", "best_clearance_min", "final_return"), "1")
     met = [{**row, **numbers, "seed": str(k), "goal_mission_steps": f"{k + 1}e6", "goal_wall_s": "60"} for k in range(2)]
     failed = {**row, "seed": "2", "failure": "diverged"}
-    cells = study_table([*met, failed]).rows[0]
+    cells = learners_table([*met, failed]).rows[0]
     assert cells[1:4] == ("3, 1 failed", "2 of 3", "2.00 [1.00, ∞]")
-    assert study_table([*met[:1], failed, {**failed, "seed": "3"}]).rows[0][3] == "∞ [1.00, ∞]"
-    assert "marlms seed 2: diverged" in to_markdown(study_table([*met, failed]))
+    assert learners_table([*met[:1], failed, {**failed, "seed": "3"}]).rows[0][3] == "∞ [1.00, ∞]"
+    assert "marlms seed 2: diverged" in to_markdown(learners_table([*met, failed]))
 
 
 @pytest.mark.parametrize(
@@ -309,5 +322,6 @@ def test_damaged_csv_files_are_one_line(damage: str, finished: Path, tmp_path: P
 def test_workers_heed_their_study() -> None:
     """A job that has not begun when the study stops is left alone."""
     (job,) = jobs_of(Path("nowhere"), "marlms")
-    assert run_job(job, quiet, lambda: True) == study.Ended("marlms seed 0", "stopped")
+    with pytest.raises(Stopped):
+        train_job(job, Watch(quiet, lambda: True))
     assert not Path("nowhere").exists()

@@ -1,7 +1,7 @@
-"""``marlbc bench`` and ``marlbc run``, and the changes to a scenario that they share."""
+"""``marlbc bench``, ``run`` and ``evaluate``, and the changes to a scenario that they share."""
 
 import sys
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -12,6 +12,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from marlbc_mj.scenarios import Scenario
+    from marlbc_mj.studies.bench import BenchConfig
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class ScenarioOptions:
     reference: str | None = None
     """Where behaviors are evaluated: virtual (at the reference) or actual (at the measured position)."""
     two_sided: bool = False
-    """Obstacle avoidance as the printed equality task, which also attracts (erratum 6)."""
+    """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
     disturbance: str | None = None
     """Unknown dynamics: paper, linear, quadratic, wind or gusts."""
     drag_scale: float | None = None
@@ -33,7 +34,7 @@ class ScenarioOptions:
     duration: float | None = None
     """Mission time [s]."""
     split: str | None = None
-    """Whose layouts a scenario that draws them takes: train (default) or test, the held-out ones."""
+    """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
@@ -51,7 +52,7 @@ class ScenarioOptions:
 
 
 @dataclass(frozen=True)
-class Bench:
+class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
     By default every supervisor but two (mpcms-mujoco, oracle-schedule) runs with sorlc, and scripted with every controller.
@@ -85,40 +86,46 @@ class Bench:
 
     def run(self) -> None:
         """Run the matrix, then say where the results are and what they are."""
-        from marlbc_mj.results.seeds import CASE_STUDY_PERTURBATION
-        from marlbc_mj.studies.bench import BenchConfig, run_bench, run_bench_seeds
+        from marlbc_mj.studies.bench import run_bench
+        from marlbc_mj.studies.draws import run_bench_seeds
 
-        config = BenchConfig(
-            supervisors=self.supervisors,
-            controllers=self.controllers,
-            seed=self.seed,
-            figures=self.figures,
-            logs=self.logs,
-            video=self.video,
-            overwrite=self.overwrite,
-            seeds=self.seeds,
-            workers=self.workers,
-        )
-        if self.drag_range is not None and self.seeds is None:
-            raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
-        if self.seeds is not None:
-            scenario = self.options.build(self.scenario)
-            if self.drag_range is not None:
-                scenario = replace(scenario, perturbation=replace(CASE_STUDY_PERTURBATION, drag_scale=self.drag_range))
-            with progress_bars() as progress:
-                run_bench_seeds(scenario, config, self.out, progress=progress)
-            print(f"{self.out / 'index.html'} shows it all")
-            return
+        config = self.config()
+        scenario = self.scenario_drawn()
         with progress_bars() as progress:
-            results, problems = run_bench(self.options.build(self.scenario), config, self.out, progress=progress)
-        print_results(results)
-        for problem in problems:
-            print(f"marlbc: {problem}", file=sys.stderr)
+            if self.seeds is not None:
+                run_bench_seeds(scenario, config, self.out, progress=progress)
+            else:
+                results, problems = run_bench(scenario, config, self.out, progress=progress)
+        if self.seeds is None:
+            print_results(results)
+            for problem in problems:
+                print(f"marlbc: {problem}", file=sys.stderr)
         print(f"{self.out / 'index.html'} shows it all")
+
+    def config(self) -> "BenchConfig":
+        """The options under the names that the benchmark gives them."""
+        from marlbc_mj.studies.bench import BenchConfig
+
+        return BenchConfig(**{each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)})
+
+    def scenario_drawn(self) -> "Scenario":
+        """The scenario with the options' changes, and with the range that draws multiply its disturbance by.
+
+        Raises:
+            ConfigurationError: a range without draws.
+        """
+        from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
+
+        if self.drag_range is None:
+            return self.options.build(self.scenario)
+        if self.seeds is None:
+            raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
+        perturbation = replace(CASE_STUDY_PERTURBATION, drag_scale=self.drag_range)
+        return replace(self.options.build(self.scenario), perturbation=perturbation)
 
 
 @dataclass(frozen=True)
-class Run:
+class RunCommand:
     """Run one episode of one method and log it."""
 
     scenario: Positional[str] = "paper"
@@ -151,3 +158,49 @@ class Run:
             )
         print_results([result])
         print(f"{self.out} holds the log, the metrics and the configuration")
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Run supervisors on held-out layouts of a scenario family: success, violation and collision rates with intervals.
+
+    By default every supervisor without learning. Scripted schedules and the oracle's belong to scenarios whose geometry is the
+    same for every seed; elsewhere they are reported as failed, with the reason.
+    """
+
+    scenario: Positional[str] = "field"
+    """Scenario that draws layouts, see `marlbc list`, or a .toml file."""
+    supervisors: tuple[str, ...] | None = None
+    """Supervisors to run."""
+    controller: str = "sorlc"
+    """Controller they run with."""
+    seeds: int = 200
+    """Number of held-out layouts."""
+    seed: int = 0
+    """First seed."""
+    workers: int = 1
+    """Processes that share the supervisors."""
+    out: Path = Path("out/evaluation")
+    """Folder of the results."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+
+    def run(self) -> None:
+        """Evaluate, and print the table of outcomes."""
+        from marlbc_mj.report.seed_tables import outcome_table
+        from marlbc_mj.report.table import to_markdown
+        from marlbc_mj.studies.evaluate import evaluation, run_evaluation
+
+        config = evaluation(
+            self.supervisors,
+            self.controller,
+            seeds=self.seeds,
+            seed=self.seed,
+            workers=self.workers,
+            overwrite=self.overwrite,
+        )
+        with progress_bars() as progress:
+            results = run_evaluation(self.options.build(self.scenario), config, self.out, progress=progress)
+        print(to_markdown(outcome_table(results)))
+        print(f"{self.out / 'index.html'} shows it all")

@@ -7,7 +7,7 @@ from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
-class Export:
+class ExportCommand:
     """Write a checkpoint's policy as an ONNX file for a robot's computer; needs the onnx extra."""
 
     checkpoint: Positional[Path]

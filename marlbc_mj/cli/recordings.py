@@ -11,7 +11,7 @@ from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)
-class Video:
+class VideoCommand:
     """Render a video from a log, off-screen."""
 
     log: Positional[Path]
@@ -69,7 +69,7 @@ class Video:
 
 
 @dataclass(frozen=True)
-class View:
+class ViewCommand:
     """Play a log in MuJoCo's interactive viewer."""
 
     log: Positional[Path]
@@ -86,7 +86,7 @@ class View:
 
 
 @dataclass(frozen=True)
-class LogInfo:
+class LogInfoCommand:
     """Say what a log holds."""
 
     log: Positional[Path]
@@ -102,7 +102,7 @@ class LogInfo:
 
 
 @dataclass(frozen=True)
-class LogRecover:
+class LogRecoverCommand:
     """Salvage a log that was torn: all whole chunks of it."""
 
     log: Positional[Path]
@@ -121,7 +121,7 @@ class LogRecover:
 
 
 @dataclass(frozen=True)
-class LogExport:
+class LogExportCommand:
     """Write a log as .csv (a row per mission step and agent) or .npz (arrays)."""
 
     log: Positional[Path]
@@ -140,13 +140,13 @@ class LogExport:
 
 
 @dataclass(frozen=True)
-class Log:
+class LogCommand:
     """Look into, salvage or convert MCAP logs."""
 
     action: OmitSubcommandPrefixes[
-        Annotated[LogInfo, subcommand("info")]
-        | Annotated[LogRecover, subcommand("recover")]
-        | Annotated[LogExport, subcommand("export")]
+        Annotated[LogInfoCommand, subcommand("info")]
+        | Annotated[LogRecoverCommand, subcommand("recover")]
+        | Annotated[LogExportCommand, subcommand("export")]
     ]
 
     def run(self) -> None:

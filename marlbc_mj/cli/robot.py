@@ -11,14 +11,14 @@ from marlbc_mj.cli.terminal import progress_bars
 
 
 @dataclass(frozen=True)
-class RobotCheck:
+class RobotCheckCommand:
     """Go through the checklist of a robot; exit status 1 if something fails."""
 
     file: Positional[str]
     """A robot's MJCF (.xml) or Python file (.py), menagerie:FOLDER/FILE.xml, or a name from `marlbc list`."""
 
     def run(self) -> None:
-        """Print one line a check."""
+        """Print one line per check."""
         from marlbc_mj.studies.robot_check import checklist
 
         failed = 0
@@ -30,7 +30,7 @@ class RobotCheck:
 
 
 @dataclass(frozen=True)
-class RobotGate:
+class RobotGateCommand:
     """Fly the gate mission, scaled to each robot, under scripted, FSAMS with hysteresis and MPCMS: a table, stills and clips."""
 
     robots: tuple[str, ...] = ()
@@ -48,10 +48,10 @@ class RobotGate:
 
     def run(self) -> None:
         """Fly, write, and print the table."""
-        from marlbc_mj.studies.robot_gate import SHOWN, gate_table, run_gates
+        from marlbc_mj.studies.robot_gate import SHOWN, run_gates
 
         with progress_bars() as progress:
-            rows = run_gates(
+            done = run_gates(
                 self.robots or SHOWN,
                 self.supervisors,
                 self.out,
@@ -60,14 +60,16 @@ class RobotGate:
                 overwrite=self.overwrite,
                 progress=progress,
             )
-        print(gate_table(rows))
+        print(done.report.text)
 
 
 @dataclass(frozen=True)
 class RobotCommand:
     """Check a robot of your own, or fly robots through their gate."""
 
-    action: OmitSubcommandPrefixes[Annotated[RobotCheck, subcommand("check")] | Annotated[RobotGate, subcommand("gate")]]
+    action: OmitSubcommandPrefixes[
+        Annotated[RobotCheckCommand, subcommand("check")] | Annotated[RobotGateCommand, subcommand("gate")]
+    ]
 
     def run(self) -> None:
         """Hand over to the action."""

@@ -7,7 +7,7 @@ from tyro.conf import Positional
 
 
 @dataclass(frozen=True)
-class Ship:
+class ShipCommand:
     """Copy the best checkpoint of a run to the shipped ones and write its model card. For developers of the package."""
 
     run_folder: Positional[Path]

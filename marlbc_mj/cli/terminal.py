@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.progress import Progress
 
 LEAST_WIDTH = 112  # least width of the table of results [characters]
 
@@ -34,7 +35,7 @@ def prepare_gl(strict: bool) -> None:
 
 
 @contextmanager
-def progress_bars() -> Iterator[Callable[[str, float, float], None]]:
+def progress_bars() -> Iterator[Progress]:
     """A bar per stage, with rate and time left, on a terminal; silent elsewhere."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -59,6 +60,15 @@ def progress_bars() -> Iterator[Callable[[str, float, float], None]]:
             bars.update(tasks[what], completed=done, total=total, rate=rate)
 
         yield update
+
+
+def progress_lines(before: str = "") -> Progress:
+    """A line for everything that is told, also where there is no terminal."""
+
+    def tell(what: str, done: float, total: float) -> None:
+        print(f"{before}{what}", file=sys.stderr, flush=True)
+
+    return tell
 
 
 def print_results(results: list[Any]) -> None:

@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Train:
+class TrainCommand:
     """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
 
     method: Positional[str] = "marlms"
     """What is learned, see `marlbc list`."""
     preset: str = "fast"
-    """Hyper-parameters: fast, or paper for the printed ones."""
+    """Hyper-parameters: fast, or paper for the published ones."""
     seed: int = 0
-    """Of networks, exploration and starts."""
+    """Random seed of networks, exploration and starts."""
     out: Path | None = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
     resume: Path | None = None

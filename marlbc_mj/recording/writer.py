@@ -58,6 +58,7 @@ class LogWriter:
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.
         overwrite: replace a log, finished or partial, of the same name.
+        model: the scenario's MJCF, where a world of it has been made already; None: it is assembled for the log.
 
     Raises:
         ConfigurationError: a path that cannot or must not be written, or a scenario that cannot be assembled.
@@ -74,6 +75,7 @@ class LogWriter:
         seed: int,
         config: dict[str, Any],
         overwrite: bool = False,
+        model: str | None = None,
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
@@ -86,7 +88,7 @@ class LogWriter:
             "revision": git_revision(),
             **_describe(scenario, controller, draw),
         }
-        attachments = _attachments(scenario, controller, config)
+        attachments = _attachments(scenario, model or make_plan(scenario, controller).xml, config)
         self._scene = Scene(scenario, draw.obstacles, draw.motions)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = controller.initial_state(0).shape == (sorlc.STATE_SIZE,)
@@ -242,12 +244,12 @@ def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[st
     }
 
 
-def _attachments(scenario: Scenario, controller: Controller, config: dict[str, Any]) -> list[tuple[str, str, bytes]]:
+def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list[tuple[str, str, bytes]]:
     """Name, media type and content."""
     canonical = json.dumps(plain_data(config), sort_keys=True, separators=(",", ":"))  # what config_hash hashes
     return [
         (CONFIG, "application/json", canonical.encode()),
-        (MODEL, "application/xml", make_plan(scenario, controller).xml.encode()),
+        (MODEL, "application/xml", model.encode()),
         (LAYOUT, "application/json", json.dumps(foxglove_layout(scenario)).encode()),
     ]
 

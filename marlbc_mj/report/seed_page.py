@@ -17,10 +17,11 @@ from marlbc_mj.report.table import Column, Table
 from marlbc_mj.report.tables import latex_document, markdown
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seed_statistics import MethodStatistics, analyse
-from marlbc_mj.results.seeds import Progress, SeedResults
+from marlbc_mj.results.seeds import SeedResults
 from marlbc_mj.results.summary import AGENT_KEYS
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.progress import Progress
 
 FIGURE = "intervals"
 

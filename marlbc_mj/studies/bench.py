@@ -1,31 +1,27 @@
 """The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it leaves."""
 
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from marlbc_mj.controllers import CONTROLLERS, Controller, make_controller
-from marlbc_mj.engine.world import World
-from marlbc_mj.episode import Frame, run_episode
+from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.recording.reader import read_log
-from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.report.bundle import write_report
-from marlbc_mj.report.seed_page import write_seed_report
-from marlbc_mj.results.seeds import SeedResults, check_free, perturbed, run_methods, seed_range
-from marlbc_mj.results.summary import Result, method_key
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS, Decision, Situation, Supervisor, make_supervisor
+from marlbc_mj.studies.episodes import EpisodeJob, fly, fly_or_fail, name_method, prepare
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.studies.runner import run_study
+from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
-from marlbc_mj.util.files import check_folder, staged_folder, write_json
+from marlbc_mj.util.files import check_folder, write_json
+from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
-
-Progress = Callable[[str, float, float], None]
-"""Called with what is being done, how much of it is done and how much there is."""
 
 
 @dataclass(frozen=True)
@@ -90,6 +86,29 @@ def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None
         raise ConfigurationError(f"a {kind} is named twice: {', '.join(names)}")
 
 
+@dataclass(frozen=True)
+class BenchStudy:
+    """One episode of every method. A method that fails, or cannot start in this scenario, is a result with its reason."""
+
+    scenario: Scenario
+    config: BenchConfig
+
+    def jobs(self) -> list[EpisodeJob]:
+        return [EpisodeJob(self.scenario, *method, self.config.seed) for method in self.config.methods]
+
+    def run(self, job: EpisodeJob, watch: Watch) -> Result:
+        return fly_or_fail(job, watch.folder if self.config.logs else None, watch.progress)
+
+    def report(self, results: Sequence[Result], out: Path | None, progress: Progress = silent) -> Report:
+        if out is None:
+            return Report()
+        facts = describe(self.scenario, self.config)
+        write_json(out / "config.json", facts)
+        videos, problems = _render_videos(results, self.config, out, progress)
+        write_report(results, out, config=facts, videos=videos, figures=self.config.figures, progress=progress)
+        return Report(problems=tuple(problems))
+
+
 def run_bench(
     scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None
 ) -> tuple[list[Result], list[str]]:
@@ -100,33 +119,12 @@ def run_bench(
     Raises:
         ConfigurationError: a setting or the output folder; nothing is written then.
     """
-    say = progress or (lambda what, done, total: None)
-    with staged_folder(out, overwrite=config.overwrite) as folder:
-        write_json(folder / "config.json", _config(scenario, config))
-        results = [
-            run_method(scenario, supervisor, controller, config.seed, folder if config.logs else None, say)
-            for supervisor, controller in config.methods
-        ]
-        videos, problems = _render_videos(results, config, folder, say)
-        write_report(results, folder, config=_config(scenario, config), videos=videos, figures=config.figures, progress=say)
-    return results, problems
+    done = run_study(BenchStudy(scenario, config), out, overwrite=config.overwrite, progress=progress or silent)
+    return done.results, list(done.report.problems)
 
 
-def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
-    """The whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
-
-    Raises:
-        ConfigurationError: a setting or the output folder; nothing is written then.
-    """
-    scenario, seeds = perturbed(scenario), seed_range(config.seeds or 0, config.seed)
-    with staged_folder(out, overwrite=config.overwrite) as folder:
-        write_json(folder / "config.json", _config(scenario, config))
-        results = run_methods(scenario, config.methods, seeds, progress, reference=config.against, workers=config.workers)
-        write_seed_report(results, folder, config=_config(scenario, config), figures=config.figures, progress=progress)
-    return results
-
-
-def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
+def describe(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
+    """What config.json says: versions, revision, machine, command line and every setting."""
     return {
         **provenance(),
         "command": " ".join(["marlbc", *sys.argv[1:]]),
@@ -136,95 +134,9 @@ def _config(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
     }
 
 
-class Stopwatch:
-    """A supervisor whose memory may tell, as ``solver_ms``, how long its network or solver took in the last decision [ms]."""
-
-    def __init__(self, supervisor: Supervisor) -> None:
-        self.supervisor = supervisor
-        self.solver_ms: list[float] = []
-
-    def start(self, scenario: Scenario) -> Any:
-        """The supervisor's memory."""
-        return self.supervisor.start(scenario)
-
-    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
-        """The supervisor's orders."""
-        orders, memory = self.supervisor.decide(situation, memory)
-        spent = getattr(memory, "solver_ms", None)
-        if spent is not None:
-            self.solver_ms.append(float(spent))
-        return orders, memory
-
-    def share(self, decision_ms: np.ndarray) -> float | None:
-        """Solver's time over the whole decisions' (M,); None where the supervisor did not tell."""
-        return sum(self.solver_ms) / float(decision_ms.sum()) if self.solver_ms else None
-
-
-def run_method(
-    scenario: Scenario,
-    supervisor: str,
-    controller: str,
-    seed: int,
-    folder: Path | None,
-    say: Progress,
-    overwrite: bool = False,
-) -> Result:
-    """One episode of one method, logged to ``folder/logs`` if there is a folder; a method that cannot start has failed.
-
-    Raises:
-        ConfigurationError: unknown names, or a log that may not be written.
-    """
-    key, names = method_key(supervisor, controller), (supervisor, controller)
-    law, chief = make_controller(controller), Stopwatch(make_supervisor(supervisor, controller))
-    try:
-        world = World(scenario, law, record=True)
-        chief.start(scenario)
-    except MarlbcError as error:
-        return Result.failed(*names, f"cannot start: {error}")
-
-    def step_done(frame: Frame) -> None:
-        if round(frame.time / scenario.mission_step) % 50 == 0:
-            say(key, frame.time, scenario.duration)
-
-    try:
-        if folder is None:
-            trajectory = run_episode(world, chief, seed=seed, names=names, on_frame=step_done)
-        else:
-            path = folder / "logs" / f"{key}.mcap"
-            with open_log(
-                path, scenario, law, supervisor=supervisor, controller=controller, seed=seed, overwrite=overwrite
-            ) as log:
-
-                def record(frame: Frame) -> None:
-                    log.write(frame)
-                    step_done(frame)
-
-                trajectory = run_episode(world, chief, seed=seed, names=names, on_frame=record)
-        check_free(trajectory, law)
-    except SimulationError as error:
-        return Result.failed(*names, str(error))
-    say(key, scenario.duration, scenario.duration)
-    return Result.of(trajectory, chief.share(trajectory.decision_ms))
-
-
-def open_log(
-    path: Path, scenario: Scenario, law: Controller, *, supervisor: str, controller: str, seed: int, overwrite: bool = False
-) -> LogWriter:
-    """A log writer for one method, with everything that defines the run in its configuration."""
-    config = {"scenario": scenario, "controller": law, "supervisor": make_supervisor(supervisor, controller), "seed": seed}
-    return LogWriter(
-        path,
-        scenario,
-        law,
-        supervisor=supervisor,
-        controller_name=controller,
-        seed=seed,
-        config=config,
-        overwrite=overwrite,
-    )
-
-
-def _render_videos(results: list[Result], config: BenchConfig, folder: Path, say: Progress) -> tuple[list[Path], list[str]]:
+def _render_videos(
+    results: Sequence[Result], config: BenchConfig, folder: Path, progress: Progress
+) -> tuple[list[Path], list[str]]:
     """Videos of the methods that ran; a machine without off-screen GL loses the videos and nothing else."""
     if config.video == "none":
         return [], []
@@ -238,7 +150,7 @@ def _render_videos(results: list[Result], config: BenchConfig, folder: Path, say
             key = result.key
             path = folder / "video" / f"{key}.mp4"
             log = read_log(folder / "logs" / f"{key}.mcap")
-            render_video(log, path, progress=lambda done, total, key=key: say(f"video {key}", done, total))  # type: ignore[misc]
+            render_video(log, path, progress=partial(progress, f"video {key}"))
             videos.append(path)
     except MarlbcError as error:
         return videos, [f"no video: {error}"]
@@ -260,17 +172,16 @@ def run_single(
     The log grows in place as ``*.mcap.partial``, so that a killed run can be recovered.
 
     Raises:
-        ConfigurationError: a setting or the output folder.
+        ConfigurationError: a setting or the output folder; a method that cannot start is a wrong setting here.
         SimulationError: the run failed; its log stays as it was.
     """
     config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
-    World(scenario, make_controller(controller))
-    make_supervisor(supervisor, controller).start(scenario)  # a method that cannot start is a wrong setting here
-    say = progress or (lambda what, done, total: None)
-    result = run_method(scenario, supervisor, controller, seed, out, say, overwrite)
+    job = EpisodeJob(scenario, supervisor, controller, seed)
+    flight = prepare(job, *name_method(job))
+    result = fly(flight, out, progress or silent, overwrite=overwrite)
     if result.metrics is None:
         raise SimulationError(result.failure)
-    write_json(out / "config.json", _config(scenario, config))
+    write_json(out / "config.json", describe(scenario, config))
     write_json(out / "metrics.json", result.metrics)
     return result

@@ -1,12 +1,15 @@
-"""Where the velocity gains of the finite- and fixed-time rivals come from: Table 6's printed maxima, inverted by a search.
+"""Where the velocity gains of the finite- and fixed-time rivals come from: Table 6's published maxima, inverted by a search.
 
 Their largest force occurs in the first substep of the column (FR), and again in the first one after it, when v_r jumps; it is
-nearly proportional to the velocity gain. So one gain cannot fit four printed maxima: the search fits the largest of them, and
+nearly proportional to the velocity gain. So one gain cannot fit four published maxima: the search fits the largest of them, and
 the other agents' tell how well the law's shape explains the table.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,8 +18,10 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.report.paper_values import PUBLISHED_INPUT_MAX
 from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
+from marlbc_mj.util.progress import Progress, silent
 
 CALIBRATED: dict[str, FiniteTime | FixedTime] = {"finite-time": FiniteTime(), "fixed-time": FixedTime()}
 """Controllers whose ``velocity_gain`` is tied to Table 6, with the gains they are shipped with."""
@@ -30,7 +35,7 @@ class Calibration:
 
     controller: str
     printed: tuple[float, ...]  # Table 6, per agent [N]
-    found: float  # velocity gain whose largest maximum is the largest printed one [1/s]
+    found: float  # velocity gain whose largest maximum is the largest published one [1/s]
     shipped: float  # the dataclass's default [1/s]
     at_found: tuple[float, ...]  # max |u|_inf per agent with the gain found [N]
     at_shipped: tuple[float, ...]  # the same with the default [N]
@@ -47,11 +52,45 @@ class Calibration:
         return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_shipped, self.printed, strict=True))
 
 
+class CalibrationJob(NamedTuple):
+    """One search."""
+
+    controller: str  # a key of CALIBRATED
+    scenario: Scenario
+    tolerance: float
+
+
+@dataclass(frozen=True)
+class CalibrationStudy:
+    """One search per controller, and a table of gains and maxima.
+
+    Raises:
+        ConfigurationError: unknown name.
+    """
+
+    controllers: tuple[str, ...] = tuple(CALIBRATED)
+
+    def __post_init__(self) -> None:
+        for name in self.controllers:
+            if name not in CALIBRATED:
+                raise unknown("calibrated controller", name, CALIBRATED)
+
+    def jobs(self) -> list[CalibrationJob]:
+        return [CalibrationJob(name, paper(), TOLERANCE) for name in self.controllers]
+
+    def run(self, job: CalibrationJob, watch: Watch) -> Calibration:
+        return calibrate(*job, progress=partial(watch.progress, job.controller))
+
+    def report(self, results: Sequence[Calibration], out: Path | None, progress: Progress = silent) -> Report:
+        """The table; this study leaves no file."""
+        return Report("\n".join(calibration_lines(results)))
+
+
 def calibrate(
     name: str,
     scenario: Scenario | None = None,
-    *,
     tolerance: float = TOLERANCE,
+    *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Calibration:
     """Find the velocity gain that gives Table 6's largest maximum, with whole episodes under the scripted supervisor.
@@ -95,7 +134,7 @@ def maxima(controller: FiniteTime | FixedTime, scenario: Scenario) -> tuple[floa
 
 
 def calibration_lines(results: Sequence[Calibration]) -> list[str]:
-    """A Markdown table with two rows a controller, the gain found and the gain shipped, below the printed maxima."""
+    """A Markdown table with two rows per controller, the gain found and the gain shipped, below the published maxima."""
     lines = [
         "| controller | velocity gain, 1/s | max ‖u‖∞ per agent, N | relative error per agent |",
         "|---|---:|---:|---:|",

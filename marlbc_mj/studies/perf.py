@@ -1,12 +1,11 @@
-"""How fast the benchmark is on this machine: every variant in turn within one process, so that ratios hold on a noisy one."""
+"""How fast the benchmark is on this machine: one job per group of variants, which take turns so that their ratios hold."""
 
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from time import perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -15,11 +14,15 @@ from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core.laws import compiled, plain, threaded
 from marlbc_mj.engine.native import call_step, step_address
 from marlbc_mj.engine.world import World
-from marlbc_mj.episode import Frame, run_episode
-from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, paper
-from marlbc_mj.supervisors import Scripted, situation
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.studies.perf_episode import measure_episode, scripted_orders
+from marlbc_mj.studies.perf_training import measure_training, training_lines
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.studies.runner import run_jobs
+from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import provenance
 
 BATCH = 64  # worlds of the physics comparison
 BATCHES = (1, 64, 1024)  # worlds of the mission-step figures
@@ -46,16 +49,6 @@ def _bare_parallel(step, model, data, substeps):  # type: ignore[no-untyped-def]
     for b in numba.prange(data.shape[0]):
         for _ in range(substeps):
             call_step(step, model, data[b])
-
-
-def scripted_orders(scenario: Scenario) -> np.ndarray:
-    """(M, N) orders of the scripted supervisor at every mission step."""
-    supervisor = Scripted()
-    memory = supervisor.start(scenario)
-    world = World(scenario)
-    start = situation(world.observe(), world.state.obstacles[0], scenario.mission_step)
-    times = np.arange(scenario.mission_steps) * scenario.mission_step
-    return np.array([supervisor.decide(start._replace(time=float(t)), memory)[0] for t in times])
 
 
 class Fleet:
@@ -122,57 +115,66 @@ def _bare(fleet: Fleet, threads: int) -> Callable[[], None]:
     return burst
 
 
-def _seconds(action: Callable[[], Any]) -> float:
-    start = perf_counter()
-    action()
-    return perf_counter() - start
+class PerfJob(NamedTuple):
+    """One group of variants."""
+
+    part: str  # a key of PERF_PARTS
+    rounds: int
 
 
-def interleaved(variants: dict[Any, Callable[[], None]], rounds: int) -> dict[Any, list[float]]:
-    """Seconds of each variant in every round, variants in turn; one round before does not count."""
-    taken: dict[Any, list[float]] = {name: [] for name in variants}
-    for round_ in range(rounds + 1):
-        for name, action in variants.items():
-            seconds = _seconds(action)
-            if round_:
-                taken[name].append(seconds)
-    return taken
+@dataclass(frozen=True)
+class PerfStudy:
+    """All figures of ``marlbc perf``. Its jobs must have the machine to themselves: one after the other.
+
+    Raises:
+        ConfigurationError: fewer than 5 rounds.
+    """
+
+    rounds: int = 9
+
+    def __post_init__(self) -> None:
+        check_rounds(self.rounds)
+
+    def jobs(self) -> list[PerfJob]:
+        return [PerfJob(part, self.rounds) for part in PERF_PARTS]
+
+    def run(self, job: PerfJob, watch: Watch) -> dict[str, Any]:
+        return PERF_PARTS[job.part](threads_measured(), job.rounds, watch.progress)
+
+    def gather(self, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """The figures of all jobs as the file has them."""
+        figures = {name: value for result in results for name, value in result.items() if name != "ratios"}
+        ratios = {name: value for result in results for name, value in result.get("ratios", {}).items()}
+        return {**figures, "ratios": ratios, "rounds": self.rounds}
+
+    def report(self, results: Sequence[dict[str, Any]], out: Path | None, progress: Progress = silent) -> Report:
+        """The figures as lines; ``out`` is a JSON file here."""
+        figures = self.gather(results)
+        if out is not None:
+            write_json(out, {**figures, **provenance()})
+        return Report("\n".join(perf_lines(figures)))
 
 
-def measure_perf(rounds: int = 9, progress: Callable[[str], None] | None = None) -> dict[str, Any]:
+def measure_perf(rounds: int = 9, progress: Progress = silent) -> dict[str, Any]:
     """All figures of ``marlbc perf``: medians over ``rounds``, and the ratios as medians of per-round ratios.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
     """
-    from marlbc_mj.studies.perf_training import measure_training  # it takes its rounds from here
+    study = PerfStudy(rounds)
+    return study.gather(run_jobs(study, progress=progress))
 
-    if rounds < 5:
-        raise ConfigurationError(f"rounds must be at least 5 for a median to mean something, got {rounds}")
-    say = progress or (lambda message: None)
+
+def threads_measured() -> tuple[int, ...]:
+    """One thread, and two where the machine has them."""
+    return (1, 2) if numba.config.NUMBA_NUM_THREADS >= 2 else (1,)
+
+
+def measure_physics(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Physics steps per second by threads: bare MuJoCo, the closed loop, and the Python loop."""
+    progress("physics steps: bare, closed loop, Python loop", 0, 1)
     scenario = paper()
     orders = scripted_orders(scenario)
-    threads = (1, 2) if numba.config.NUMBA_NUM_THREADS >= 2 else (1,)
-    say("physics steps: bare, closed loop, Python loop")
-    physics, ratios = _measure_physics(scenario, orders, threads, rounds)
-    say("mission steps by batch size")
-    missions = _measure_missions(scenario, orders, threads, rounds)
-    say("one episode, and its log")
-    episode = _measure_episode(scenario, rounds)
-    learning, more_ratios = measure_training(threads, rounds, say)
-    return {
-        "physics_steps_per_s": physics,
-        "mission_steps_per_s": missions,
-        **episode,
-        **learning,
-        "ratios": {**ratios, **more_ratios},
-        "rounds": rounds,
-    }
-
-
-def _measure_physics(
-    scenario: Scenario, orders: np.ndarray, threads: tuple[int, ...], rounds: int
-) -> tuple[dict[str, Any], dict[str, float]]:
     variants: dict[Any, Callable[[], None]] = {}
     substeps = scenario.substeps
     for n in threads:
@@ -203,77 +205,33 @@ def _measure_physics(
     if len(threads) > 1:
         ratios["second_thread"] = ratio(taken["closed", 1], taken["closed", 2])
         ratios["second_thread_bare"] = ratio(taken["bare", 1], taken["bare", 2])
-    return physics, ratios
+    return {"physics_steps_per_s": physics, "ratios": ratios}
 
 
-def ratio(above: list[float], below: list[float]) -> float:
-    """Median of the ratios in each round."""
-    return median(a / b for a, b in zip(above, below, strict=True))
-
-
-def _measure_missions(
-    scenario: Scenario, orders: np.ndarray, threads: tuple[int, ...], rounds: int
-) -> dict[str, dict[str, float]]:
+def measure_missions(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Mission steps per second by batch size and threads."""
+    progress("mission steps by batch size", 0, 1)
+    scenario = paper()
+    orders = scripted_orders(scenario)
     fleets = {(b, n): Fleet(scenario, b, n, orders) for b in BATCHES for n in threads}
     steps = {b: max(1, 2000 // b) for b in BATCHES}
     variants: dict[Any, Callable[[], None]] = {key: partial(fleet.advance, steps[key[0]]) for key, fleet in fleets.items()}
     taken = interleaved(variants, rounds)
-    return {str(b): {str(n): b * steps[b] / median(taken[b, n]) for n in threads} for b in BATCHES}
+    rates = {str(b): {str(n): b * steps[b] / median(taken[b, n]) for n in threads} for b in BATCHES}
+    return {"mission_steps_per_s": rates}
 
 
-def _measure_episode(scenario: Scenario, rounds: int) -> dict[str, float]:
-    """Seconds for a whole 100 s episode of one world: its supervisor deciding at every mission step, all orders known
-    beforehand, and writing its log at mission rate.
-    """
-    world = World(scenario)
-    schedule = np.ascontiguousarray(scripted_orders(scenario)[:, None])
-    frames: list[Frame] = []
-    run_episode(World(scenario, record=True), Scripted(), on_frame=frames.append)
-    with tempfile.TemporaryDirectory() as folder:
-        variants: dict[Any, Callable[[], None]] = {
-            "episode": lambda: _episode(world),
-            "rollout": lambda: _rollout(world, schedule),
-            "record": lambda: _write(scenario, frames, Path(folder) / "perf.mcap"),
-        }
-        taken = interleaved(variants, rounds)
-    return {f"{name}_s": median(seconds) for name, seconds in taken.items()}
-
-
-def _rollout(world: World, schedule: np.ndarray) -> None:
-    world.reset()
-    world.rollout(schedule)
-
-
-def _episode(world: World) -> None:
-    scenario, supervisor = world.scenario, Scripted()
-    memory = supervisor.start(scenario)
-    observation = world.reset()
-    done = False
-    while not done:
-        orders, memory = supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
-        step = world.step(orders[None])
-        observation, done = step.observation, bool(step.done[0])
-
-
-def _write(scenario: Scenario, frames: list[Frame], path: Path) -> None:
-    with LogWriter(
-        path,
-        scenario,
-        SORLC(),
-        supervisor="scripted",
-        controller_name="sorlc",
-        seed=0,
-        config={},
-        overwrite=True,
-    ) as log:
-        for frame in frames:
-            log.write(frame)
+PERF_PARTS: dict[str, Callable[[tuple[int, ...], int, Progress], dict[str, Any]]] = {
+    "physics": measure_physics,
+    "missions": measure_missions,
+    "episode": measure_episode,
+    "training": measure_training,
+}
+"""What is measured, in this order."""
 
 
 def perf_lines(figures: dict[str, Any]) -> list[str]:
     """The figures as text, one line each."""
-    from marlbc_mj.studies.perf_training import training_lines
-
     physics, ratios = figures["physics_steps_per_s"], figures["ratios"]
     lines = [
         f"{name}, {threads} thread(s): {rate:,.0f} physics steps/s"

@@ -15,13 +15,14 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.checkpoint import signature
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.studies.perf import interleaved, ratio
+from marlbc_mj.studies.timing import interleaved, ratio
 from marlbc_mj.supervisors import situation
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.training.base import BaseTrainer, make_starts
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.run import make_trainer
+from marlbc_mj.util.progress import Progress, silent
 
 WORLDS = 256  # of the environment alone
 DECISIONS = 10  # of all worlds, in one measurement
@@ -34,9 +35,7 @@ def training_config(threads: int) -> TrainConfig:
     return make_config("fast", threads=threads)
 
 
-def measure_training(
-    threads: tuple[int, ...], rounds: int, say: Callable[[str], None]
-) -> tuple[dict[str, Any], dict[str, float]]:
+def measure_training(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
     """Figures and ratios of learning, each for every number of ``threads``.
 
     The environment has the preset's interval, actions and starts, and random actions; a training run is measured past its
@@ -48,12 +47,12 @@ def measure_training(
     rng = np.random.default_rng(0)
     for batch in (*environments.values(), *(trainer.batch for trainer in trainers.values())):
         spread(batch, rng)
-    say("learned decisions")
+    progress("learned decisions", 0, 4)
     decision = _measure_decisions(trainers[threads[0]], rounds)
-    say("warm-up of training")
+    progress("warm-up of training", 1, 4)
     for trainer in trainers.values():
         warm_up(trainer)
-    say("mission steps of the environment and of training")
+    progress("mission steps of the environment and of training", 2, 4)
     variants: dict[Any, Callable[[], None]] = {}
     for n in threads:
         variants["environment", n] = partial(_play, environments[n], rng)
@@ -62,7 +61,7 @@ def measure_training(
     made = {("environment", n): WORLDS * DECISIONS * configs[n].interval for n in threads}
     made |= {("training", n): configs[n].worlds * DECISIONS * configs[n].interval for n in threads}
     each = {key: [s / made[key] for s in seconds] for key, seconds in taken.items()}
-    say("where the time of training goes")
+    progress("where the time of training goes", 3, 4)
     figures = {
         f"{what}_mission_steps_per_s": {str(n): 1.0 / median(each[what, n]) for n in threads}
         for what in ("environment", "training")
@@ -71,7 +70,8 @@ def measure_training(
     for n in threads:
         profiles[str(n)], aside[str(n)] = profile(trainers[n], PROFILED)
     ratios = {f"training_over_environment_{n}": ratio(each["environment", n], each["training", n]) for n in threads}
-    return {**figures, "training_profile": profiles, "training_profile_aside": aside, "decision_us": decision}, ratios
+    profiled = {"training_profile": profiles, "training_profile_aside": aside}
+    return {**figures, **profiled, "decision_us": decision, "ratios": ratios}
 
 
 def _environment(config: TrainConfig) -> FormationBatch:
@@ -112,7 +112,7 @@ def _learn(trainer: BaseTrainer, decisions: int) -> None:
         trainer.advance()
 
 
-class Clock:
+class PartClock:
     """Seconds by part of a program. Parts may call each other: only the innermost one's time runs.
 
     ``seconds`` are those of the thread that made the clock; ``aside``, of one other thread, whose parts must not call each other.
@@ -179,7 +179,7 @@ def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, f
         (trainer.replay, ("store", "sample", "learnt"), "replay"),
         (trainer, ("_await",), "waiting"),
     )
-    clock = Clock()
+    clock = PartClock()
     with ExitStack() as stack:
         for owner, names, part in parts:
             stack.enter_context(clock.timing(owner, names, part))

@@ -1,6 +1,7 @@
 """Every robot on the gate mission scaled to it, under three supervisors: one table, and stills and clips for a gallery."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,18 +18,21 @@ from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import ROBOTS, Robot, make_robot
 from marlbc_mj.scenarios.robot_gate import robot_gate
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.studies.runner import Conclusion, counting, run_study
 from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
 from marlbc_mj.util.errors import unknown
-from marlbc_mj.util.files import staged_folder, write_json
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
 
-SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
+GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "scripted": lambda robot: Scripted(),
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
 """The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
 
-CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
+GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
     "sorlc-scaled": lambda robot: SORLC.scaled(
         position_error_gain=robot.gains[0], velocity_error_gain=robot.gains[1], identifier_rate=10.0 * robot.gains[1] / 16.0
@@ -41,7 +45,7 @@ CLIP = (0.10, 0.66)  # of the mission
 SHOWN = [name for name in ROBOTS if name != "point_mass"]
 
 
-class Row(NamedTuple):
+class GateRow(NamedTuple):
     """One robot under one supervisor."""
 
     robot: str
@@ -59,25 +63,65 @@ class Row(NamedTuple):
     tilt: float | None  # [deg]
 
 
-def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[Row, Trajectory]:
+class GateJob(NamedTuple):
+    """One episode of a robot's gate mission."""
+
+    robot: str
+    supervisor: str  # a key of GATE_SUPERVISORS
+    controller: str  # a key of GATE_CONTROLLERS
+    shown: bool  # whether stills and a clip of it are drawn
+
+
+@dataclass(frozen=True)
+class GateStudy:
+    """Every robot under every supervisor: a table, and stills and clips of the first supervisor's episodes."""
+
+    robots: tuple[str, ...]
+    supervisors: tuple[str, ...]
+    controller: str = "pd"
+    clips: bool = True
+
+    def jobs(self) -> list[GateJob]:
+        return [
+            GateJob(robot, supervisor, self.controller, self.clips and supervisor == self.supervisors[0])
+            for robot in self.robots
+            for supervisor in self.supervisors
+        ]
+
+    def run(self, job: GateJob, watch: Watch) -> GateRow:
+        row, trajectory = fly_gate(job.robot, job.supervisor, job.controller)
+        if job.shown and watch.folder is not None:
+            show(trajectory, GATE_CONTROLLERS[job.controller](make_robot(job.robot)), watch.folder, Path(job.robot).stem)
+        return row
+
+    def report(self, results: Sequence[GateRow], out: Path | None, progress: Progress = silent) -> Report:
+        text = gate_table(results)
+        if out is not None:
+            (out / "gate.md").write_text(text + "\n")
+            rows = [row._asdict() for row in results]
+            write_json(out / "gate.json", {"schema": 1, "controller": self.controller, "rows": rows})
+        return Report(text)
+
+
+def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateRow, Trajectory]:
     """One episode of a robot's gate mission.
 
     Raises:
         ConfigurationError: an unknown name.
         SimulationError: the world diverged.
     """
-    for kind, name, valid in (("supervisor", supervisor, SUPERVISORS), ("controller", controller, CONTROLLERS)):
+    for kind, name, valid in (("supervisor", supervisor, GATE_SUPERVISORS), ("controller", controller, GATE_CONTROLLERS)):
         if name not in valid:
             raise unknown(kind, name, valid)
     body, scenario = make_robot(robot), robot_gate(robot)
-    world = World(scenario, CONTROLLERS[controller](body), record=True)
+    world = World(scenario, GATE_CONTROLLERS[controller](body), record=True)
     touches: list[bool] = []
 
     def watch(_: Frame) -> None:
         touches.append(touching(world))
 
     names = (supervisor, controller)
-    trajectory = run_episode(world, SUPERVISORS[supervisor](body), names=names, on_frame=watch)
+    trajectory = run_episode(world, GATE_SUPERVISORS[supervisor](body), names=names, on_frame=watch)
     return _row(robot, supervisor, trajectory, world, sum(touches)), trajectory
 
 
@@ -88,14 +132,14 @@ def touching(world: World) -> bool:
     return bool(((roots[:, 0] != roots[:, 1]) & (roots > 0).all(axis=1)).any())
 
 
-def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, collisions: int) -> Row:
+def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, collisions: int) -> GateRow:
     measured, body, scenario = measure(trajectory), world.plan.robot, trajectory.scenario
     agents = measured["agents"]
     found = {name: world.state.robot[0, :, k] for name, k in body.diagnostics.items()}
     saturated = [a["saturation_duty"] for a in agents]
     if "saturated" in found:
         saturated = np.maximum(saturated, found["saturated"] / len(trajectory.time)).tolist()
-    return Row(
+    return GateRow(
         robot=robot,
         supervisor=supervisor,
         clearance=min(a["clearance_min"] for a in agents),
@@ -112,13 +156,13 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
     )
 
 
-def gate_table(rows: Sequence[Row]) -> str:
+def gate_table(rows: Sequence[GateRow]) -> str:
     """A Markdown table with one row per robot and supervisor."""
     head = ("robot", "supervisor", "least clearance / safe", "violation, worst agent", "contacts", "between agents")
     return pipe_table((*head, "tracking, RMS", "saturated", "switches", "height, tilt"), list(map(_gate_cells, rows)))
 
 
-def _gate_cells(r: Row) -> tuple[str, ...]:
+def _gate_cells(r: GateRow) -> tuple[str, ...]:
     flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
     return (
         r.robot,
@@ -142,27 +186,17 @@ def run_gates(
     controller: str = "pd",
     clips: bool = True,
     overwrite: bool = False,
-    progress: Callable[[str, int, int], None] = lambda name, done, total: None,
-) -> list[Row]:
+    progress: Progress = silent,
+) -> Conclusion[GateRow]:
     """Fly every robot under every supervisor, and leave gate.md, gate.json, and stills and clips of the first supervisor.
 
     Raises:
         ConfigurationError: an unknown name, a missing package, or a folder that cannot be written.
         SimulationError: a world diverged.
     """
-    rows: list[Row] = []
-    total = len(robots) * len(supervisors)
-    with staged_folder(out, overwrite=overwrite) as folder:
-        for robot in robots:
-            for supervisor in supervisors:
-                row, trajectory = fly_gate(robot, supervisor, controller)
-                rows.append(row)
-                progress("gate", len(rows), total)
-                if clips and supervisor == supervisors[0]:
-                    show(trajectory, CONTROLLERS[controller](make_robot(robot)), folder, Path(robot).stem)
-        (folder / "gate.md").write_text(gate_table(rows) + "\n")
-        write_json(folder / "gate.json", {"schema": 1, "controller": controller, "rows": [row._asdict() for row in rows]})
-    return rows
+    study = GateStudy(tuple(robots), tuple(supervisors), controller, clips)
+    ended = counting(study.jobs(), lambda job: "gate", progress)
+    return run_study(study, out, overwrite=overwrite, progress=progress, ended=ended)
 
 
 def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str) -> None:

@@ -9,11 +9,12 @@ a figure is that of the loop, not of its call.
 import gc
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,15 +23,17 @@ from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.table import Column, Table, to_markdown
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.families import Field
-from marlbc_mj.studies.perf import interleaved, ratio
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.studies.runner import Conclusion, run_study
+from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 from marlbc_mj.supervisors import make_supervisor, situation
-from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
 SIZES = (4, 8, 16, 32, 64, 128, 256)
-SUPERVISORS = ("fsams", "fms", "layered")
-OBSTACLES = 1  # per agent
+SCALED_SUPERVISORS = ("fsams", "fms", "layered")
+DISCS = 1  # per agent
 AGENT_STEPS = 2560  # agents x mission steps in one burst
 MEMORY_AGENTS = 2048  # agents in all worlds together whose memory is measured
 LEAST_WORLDS = 64  # so that what a plan leaves behind is small beside them
@@ -39,11 +42,11 @@ LEAST_WORLDS = 64  # so that what a plan leaves behind is small beside them
 def mission(agents: int) -> Scenario:
     """A grid of agents on a way with one disc per agent, dense enough that queries matter at every size."""
     length = float(30.0 + 12.0 * np.ceil(np.sqrt(agents)))
-    discs = Field(obstacles=OBSTACLES * agents, radius=(0.3, 0.6), gap=2.5)
+    discs = Field(obstacles=DISCS * agents, radius=(0.3, 0.6), gap=2.5)
     return discs.build(name=f"scale-{agents}", agents=agents, formation="grid", length=length)
 
 
-class Team:
+class SizedTeams:
     """Worlds of one size, all agents under OA>AA>FM."""
 
     def __init__(self, agents: int) -> None:
@@ -52,7 +55,7 @@ class Team:
         self.orders = np.full((self.world.worlds, agents), self.scenario.orders.index("OA>AA>FM"))
         self.steps = max(1, AGENT_STEPS // (self.world.worlds * agents))
         self.agent_steps = self.world.worlds * agents * self.steps
-        self.supervisors = {name: make_supervisor(name) for name in SUPERVISORS}
+        self.supervisors = {name: make_supervisor(name) for name in SCALED_SUPERVISORS}
         self.memories = {name: supervisor.start(self.scenario) for name, supervisor in self.supervisors.items()}
 
     def advance(self) -> None:
@@ -68,34 +71,86 @@ class Team:
         _, self.memories[name] = self.supervisors[name].decide(seen, self.memories[name])
 
 
-def measure_scale(rounds: int = 7, progress: Callable[[str], None] | None = None) -> dict[str, Any]:
-    """All figures of ``marlbc scale``: medians over ``rounds``, growth as the median of per-round ratios.
+class ScaleJob(NamedTuple):
+    """One kind of figure, for every size."""
+
+    part: str  # a key of SCALE_PARTS
+    rounds: int
+
+
+@dataclass(frozen=True)
+class ScaleStudy:
+    """All figures of ``marlbc scale``. Its jobs must have the machine to themselves: one after the other.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
     """
-    if rounds < 5:
-        raise ConfigurationError(f"rounds must be at least 5 for a median to mean something, got {rounds}")
-    say = progress or (lambda message: None)
-    say("missions from 4 to 256 agents")
-    teams = {agents: Team(agents) for agents in SIZES}
+
+    rounds: int = 7
+
+    def __post_init__(self) -> None:
+        check_rounds(self.rounds)
+
+    def jobs(self) -> list[ScaleJob]:
+        return [ScaleJob(part, self.rounds) for part in SCALE_PARTS]
+
+    def run(self, job: ScaleJob, watch: Watch) -> dict[str, Any]:
+        return SCALE_PARTS[job.part](job.rounds, watch.progress)
+
+    def gather(self, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
+        """The figures of all jobs as the file has them."""
+        return {**{name: value for result in results for name, value in result.items()}, "rounds": self.rounds}
+
+    def report(self, results: Sequence[dict[str, Any]], out: Path | None, progress: Progress = silent) -> Report:
+        figures = self.gather(results)
+        if out is not None:
+            write_scale(figures, out)
+        return Report(to_markdown(scale_table(figures)))
+
+
+def run_scale(
+    rounds: int, out: Path | None, *, overwrite: bool = False, progress: Progress = silent
+) -> Conclusion[dict[str, Any]]:
+    """Measure all figures; leaves scale.md, scale.json and figures/scale.{pdf,png} in ``out``.
+
+    Raises:
+        ConfigurationError: fewer than 5 rounds, or ``out`` cannot be written.
+    """
+    return run_study(ScaleStudy(rounds), out, overwrite=overwrite, progress=progress)
+
+
+def measure_times(rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Time of mission steps and decisions: medians over ``rounds``, growth as the median of per-round ratios."""
+    progress("missions from 4 to 256 agents", 0, 2)
+    teams = {agents: SizedTeams(agents) for agents in SIZES}
     taken = interleaved({agents: team.advance for agents, team in teams.items()}, rounds)
     each = {agents: [s / teams[agents].agent_steps for s in seconds] for agents, seconds in taken.items()}
-    say("decisions of supervisors that decide per agent")
+    progress("decisions of supervisors that decide per agent", 1, 2)
     variants: dict[Any, Callable[[], None]] = {
-        (name, agents): partial(team.decide, name) for name in SUPERVISORS for agents, team in teams.items()
+        (name, agents): partial(team.decide, name) for name in SCALED_SUPERVISORS for agents, team in teams.items()
     }
     decisions = interleaved(variants, rounds)
-    say("memory")
-    memory = {agents: _memory(agents) for agents in SIZES}
     return {
         "us_per_agent_and_mission_step": {str(n): 1e6 * median(each[n]) for n in SIZES},
         "growth": {str(n): ratio(each[n], each[SIZES[0]]) for n in SIZES},
-        "decision_us_per_agent": {name: {str(n): 1e6 * median(decisions[name, n]) / n for n in SIZES} for name in SUPERVISORS},
+        "decision_us_per_agent": {
+            name: {str(n): 1e6 * median(decisions[name, n]) / n for n in SIZES} for name in SCALED_SUPERVISORS
+        },
+    }
+
+
+def measure_memory(rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Memory of a world and per agent [KiB]; measured once, whatever ``rounds`` says."""
+    progress("memory", 0, 1)
+    memory = {agents: _memory(agents) for agents in SIZES}
+    return {
         "kib_per_world": {str(n): memory[n] / 1024.0 for n in SIZES},
         "kib_per_agent": {str(n): memory[n] / 1024.0 / n for n in SIZES},
-        "rounds": rounds,
     }
+
+
+SCALE_PARTS: dict[str, Callable[[int, Progress], dict[str, Any]]] = {"times": measure_times, "memory": measure_memory}
+"""What is measured, in this order."""
 
 
 _MEMORY = """
@@ -138,18 +193,18 @@ def scale_table(figures: dict[str, Any]) -> Table:
         Column("", "agents"),
         Column("mission step", "µs per agent"),
         Column("mission step", f"of {SIZES[0]} agents'"),
-        *(Column("decision", f"{name}, µs per agent") for name in SUPERVISORS),
+        *(Column("decision", f"{name}, µs per agent") for name in SCALED_SUPERVISORS),
         Column("memory", "KiB per world"),
         Column("memory", "KiB per agent"),
     )
     rows = []
     for n in map(str, SIZES):
-        decisions = (f"{figures['decision_us_per_agent'][name][n]:.1f}" for name in SUPERVISORS)
+        decisions = (f"{figures['decision_us_per_agent'][name][n]:.1f}" for name in SCALED_SUPERVISORS)
         cost = (f"{figures['us_per_agent_and_mission_step'][n]:.2f}", f"{figures['growth'][n]:.2f} ×")
         rows.append((n, *cost, *decisions, f"{figures['kib_per_world'][n]:.0f}", f"{figures['kib_per_agent'][n]:.1f}"))
     notes = (
         f"Medians of {figures['rounds']} rounds in which all sizes take turns; the ratio is the median of each round's.",
-        f"A grid among {OBSTACLES} disc(s) per agent, everyone under OA>AA>FM, SORLC, 10 substeps a mission step, one thread.",
+        f"A grid among {DISCS} disc(s) per agent, everyone under OA>AA>FM, SORLC, 10 substeps a mission step, one thread.",
         "Memory: what one more World copy adds to the resident memory of a process.",
     )
     return Table("scale", "What a mission step costs, by team size", columns, tuple(rows), notes)

@@ -1,7 +1,19 @@
 """Ablations: what each choice of controller, reading and clock is worth, measured on whole episodes."""
 
-from marlbc_mj.studies.ablation.measure import Case, Figures, Row, Study, run_study
-from marlbc_mj.studies.ablation.page import study_table, write_page
-from marlbc_mj.studies.ablation.studies import STUDIES, select_studies
+from marlbc_mj.studies.ablation.cases import AblationRow, Case, Figures, Question
+from marlbc_mj.studies.ablation.jobs import AblationStudy, run_ablation
+from marlbc_mj.studies.ablation.page import ablation_table, write_ablation_page
+from marlbc_mj.studies.ablation.questions import QUESTIONS, select_questions
 
-__all__ = ["STUDIES", "Case", "Figures", "Row", "Study", "run_study", "select_studies", "study_table", "write_page"]
+__all__ = [
+    "QUESTIONS",
+    "AblationRow",
+    "AblationStudy",
+    "Case",
+    "Figures",
+    "Question",
+    "ablation_table",
+    "run_ablation",
+    "select_questions",
+    "write_ablation_page",
+]

@@ -1,9 +1,8 @@
-"""A study of learners: its variants, and what their runs came to as CSV files, a table and a figure."""
+"""What the runs of a study of learners came to, as lines of its two CSV files."""
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from functools import cache
 from math import isfinite
 from pathlib import Path
@@ -14,22 +13,23 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.studies.learners.variants import VARIANTS
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
-from marlbc_mj.training.methods import CARE, METHODS
+from marlbc_mj.training.config import TrainConfig, from_json
 from marlbc_mj.training.run import rank
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
 
-DONE, FAILED = "DONE", "FAILED"
+DONE_MARK, FAILED_MARK = "DONE", "FAILED"
+"""Files that mark the folder of a run that finished, and of one that failed."""
 GOAL_SWITCHES = (4, 2, 2, 4)
 """Switches per agent that meet the goal on the case study; with no violation and at least the scripted supervisor's return."""
 UNFINISHED = "unfinished"
 """The failure of a run that was interrupted and can go on."""
 
-Record = dict[str, str]
+CsvLine = dict[str, str]
 """A line of a CSV file: what is shown of a run is exactly what its file says."""
-COLUMNS = (
+RUN_COLUMNS = (
     *("variant", "seed", "budget", "goal_return", "best_mission_steps"),
     *("best_return", "best_switches", "best_violation_time", "best_clearance_min", "goal_mission_steps", "goal_wall_s"),
     *(
@@ -42,56 +42,9 @@ COLUMNS = (
         "failure",
     ),
 )
-"""Of study.csv. Switches per agent, clearances in m, times in s; ``goal_*`` is empty for a run that never met the goal."""
+"""Columns of study.csv. Switches per agent, clearances [m], times [s]; ``goal_*`` is empty for a run that never met the goal."""
 CURVE_COLUMNS = ("variant", "seed", "mission_steps", "return", "violation_time", "switches")
-"""Of curves.csv: violation of the worst agent [s], switches of the whole team."""
-
-
-@dataclass(frozen=True)
-class Variant:
-    """One way to learn: a method and a preset with changes. A group has at most ``WIDE`` variants, a row of the figure."""
-
-    line: str
-    group: str
-    """What it is compared for: learner, preset or rival."""
-    method: str = "marlms"
-    preset: str = "fast"
-    changes: Mapping[str, Any] = field(default_factory=dict)
-
-    def config(self, seed: int, budget: int) -> TrainConfig:
-        """The run's configuration, on one thread, so that runs do not compete for cores."""
-        changes = {**METHODS[self.method][0], **self.changes, "method": self.method, "seed": seed, "budget": budget}
-        return make_config(self.preset, **changes, threads=1)
-
-
-_UNCENTRED = {"shaping": replace(PRESETS["fast"][0].shaping, centre=0.0)}
-VARIANTS: dict[str, Variant] = {
-    "marlms": Variant("MARLMS with the fast preset", "learner"),
-    "no-leniency": Variant("every negative TD error counts", "learner", "iql"),
-    "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
-    "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
-    "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
-    "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
-    "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
-    "uniform-starts": Variant(
-        "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
-    ),
-    "no-joint-exploration": Variant(
-        "a random order lasts one decision, of one agent",
-        "preset",
-        changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
-    ),
-    "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
-    "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
-    "paper": Variant("the printed hyper-parameters, state, reward and orders", "preset", preset="paper"),
-    "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
-    "vdn": Variant("value decomposition", "rival", "vdn"),
-    "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
-    "central": Variant("one network over joint orders", "rival", "central"),
-    "rlms": Variant("single agents side by side", "rival", "rlms"),
-    "mappo": Variant("multi-agent PPO", "rival", "mappo"),
-}
-"""Method, preset and changes by name."""
+"""Columns of curves.csv: violation of the worst agent [s], switches of the whole team."""
 
 
 def read_json(path: Path, key: str) -> Any:
@@ -109,21 +62,21 @@ def scripted_return(scenario: str, controller: str) -> float:
     return float(f"{measure(run_episode(world, make_supervisor('scripted', controller)))['team']['return']:.6g}")
 
 
-def collect(out: Path) -> tuple[list[Record], list[Record]]:
+def collect(out: Path) -> tuple[list[CsvLine], list[CsvLine]]:
     """Lines of study.csv and curves.csv from all runs in the study's folder, also those of earlier calls.
 
     Raises:
         ConfigurationError: a file of a run that cannot be read.
     """
-    rows: list[Record] = []
-    curves: list[Record] = []
+    rows: list[CsvLine] = []
+    curves: list[CsvLine] = []
     for name in VARIANTS:
         for folder in sorted((p for p in (out / name).glob("*") if p.name.isdigit()), key=lambda p: int(p.name)):
-            failed = (folder / FAILED).is_file()
+            failed = (folder / FAILED_MARK).is_file()
             if not failed and not (folder / "config.json").is_file():
                 continue
-            config = from_json(read_json(folder / (FAILED if failed else "config.json"), "train"))
-            ended = read_json(folder / FAILED, "failure") if failed else "" if (folder / DONE).is_file() else UNFINISHED
+            config = from_json(read_json(folder / (FAILED_MARK if failed else "config.json"), "train"))
+            ended = read_json(folder / FAILED_MARK, "failure") if failed else "" if (folder / DONE_MARK).is_file() else UNFINISHED
             evaluations = read_csv(folder / "eval.csv", ("return",)) if (folder / "eval.csv").is_file() else []
             rows.append(_row(name, config, evaluations, ended))
             for e in evaluations:
@@ -133,9 +86,9 @@ def collect(out: Path) -> tuple[list[Record], list[Record]]:
     return rows, curves
 
 
-def _row(name: str, config: TrainConfig, evaluations: Sequence[Record], failure: str) -> Record:
+def _row(name: str, config: TrainConfig, evaluations: Sequence[CsvLine], failure: str) -> CsvLine:
     goal = scripted_return(config.scenario, config.controller)
-    row = dict.fromkeys(COLUMNS, "")
+    row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"variant": name, "seed": str(config.seed), "budget": str(config.budget), "goal_return": f"{goal:.6g}"}
     row["failure"] = failure
     if evaluations:
@@ -149,17 +102,17 @@ def _row(name: str, config: TrainConfig, evaluations: Sequence[Record], failure:
     return row
 
 
-def meets_goal(evaluation: Record, least_return: float) -> bool:
+def meets_goal(evaluation: CsvLine, least_return: float) -> bool:
     """Whether no agent violates, none switches more than GOAL_SWITCHES says, and the return is not below the goal's."""
     few = [float(s) <= limit for s, limit in zip(_switches(evaluation), GOAL_SWITCHES, strict=False)]
     return all(few) and float(evaluation["violation_time"]) == 0.0 and float(evaluation["return"]) >= least_return
 
 
-def _switches(evaluation: Record) -> list[str]:
+def _switches(evaluation: CsvLine) -> list[str]:
     return [value for key, value in evaluation.items() if key.startswith("switches_")]
 
 
-def read_csv(path: Path, columns: Sequence[str]) -> list[Record]:
+def read_csv(path: Path, columns: Sequence[str]) -> list[CsvLine]:
     """Lines of a CSV file that has at least these columns; ConfigurationError where it does not."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -171,13 +124,13 @@ def read_csv(path: Path, columns: Sequence[str]) -> list[Record]:
     return lines
 
 
-def read_study(folder: Path) -> tuple[list[Record], list[Record]]:
+def read_study(folder: Path) -> tuple[list[CsvLine], list[CsvLine]]:
     """What :func:`write_csvs` wrote.
 
     Raises:
         ConfigurationError: study.csv or curves.csv is missing, torn, or names an unknown variant.
     """
-    rows = read_csv(folder / "study.csv", COLUMNS)
+    rows = read_csv(folder / "study.csv", RUN_COLUMNS)
     curves = read_csv(folder / "curves.csv", CURVE_COLUMNS) if any(row["wall_s"] for row in rows) else []
     for line in (*rows, *curves):
         if line["variant"] not in VARIANTS:
@@ -195,9 +148,9 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def write_csvs(folder: Path, rows: Sequence[Record], curves: Sequence[Record]) -> None:
-    """study.csv, a line a run, and curves.csv, a line an evaluation."""
-    for name, columns, lines in (("study.csv", COLUMNS, rows), ("curves.csv", CURVE_COLUMNS, curves)):
+def write_csvs(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
+    """study.csv, a line per run, and curves.csv, a line per evaluation."""
+    for name, columns, lines in (("study.csv", RUN_COLUMNS, rows), ("curves.csv", CURVE_COLUMNS, curves)):
         with staged_file(folder / name, overwrite=True) as staging, staging.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n")
             writer.writeheader()

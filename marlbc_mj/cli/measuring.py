@@ -1,29 +1,13 @@
-"""``marlbc list``, ``perf``, ``ablation``, ``calibrate`` and ``oracle``: what there is, how fast, and what is behind it."""
+"""``marlbc perf``, ``scale``, ``ablation``, ``calibrate`` and ``oracle``: how fast it is, and what is behind its numbers."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.cli.terminal import progress_bars, progress_lines
 
 
 @dataclass(frozen=True)
-class ListAll:
-    """List everything that can be selected, one line each."""
-
-    def run(self) -> None:
-        """Print every registry."""
-        from marlbc_mj.cli.listing import selectable
-
-        for kind, entries in selectable().items():
-            print(f"{kind}:")
-            width = max(map(len, entries))
-            for name, line in entries.items():
-                print(f"  {name:<{width}}  {line}")
-
-
-@dataclass(frozen=True)
-class Perf:
+class PerfCommand:
     """Measure this machine: bare mj_step, the closed loop, the Python loop, batches, an episode, a log."""
 
     json: Path | None = None
@@ -33,19 +17,40 @@ class Perf:
 
     def run(self) -> None:
         """Measure, print, and write if asked."""
-        from marlbc_mj.studies.perf import measure_perf, perf_lines
-        from marlbc_mj.util.files import write_json
-        from marlbc_mj.util.provenance import provenance
+        from marlbc_mj.studies.perf import PerfStudy
+        from marlbc_mj.studies.runner import run_jobs
 
-        figures = measure_perf(self.rounds, progress=lambda message: print(f"measuring {message}", file=sys.stderr))
-        print("\n".join(perf_lines(figures)))
+        study = PerfStudy(self.rounds)
+        results = run_jobs(study, progress=progress_lines("measuring "))
+        print(study.report(results, None).text)
         if self.json is not None:
-            write_json(self.json, {**figures, **provenance()})
+            study.report(results, self.json)
             print(self.json)
 
 
 @dataclass(frozen=True)
-class Ablation:
+class ScaleCommand:
+    """Measure what a mission step costs per agent, and the memory of a world, for teams from 4 to 256 agents."""
+
+    out: Path | None = None
+    """Folder for scale.md, scale.json and figures/scale.{pdf,png}."""
+    rounds: int = 7
+    """Rounds, each running every size once; medians are reported."""
+    overwrite: bool = False
+    """Replace what is in the output folder."""
+
+    def run(self) -> None:
+        """Measure, print the table, and write table and figure if asked."""
+        from marlbc_mj.studies.scale import run_scale
+
+        done = run_scale(self.rounds, self.out, overwrite=self.overwrite, progress=progress_lines("measuring "))
+        print(done.report.text)
+        if self.out is not None:
+            print(f"{self.out} holds table, figures and numbers")
+
+
+@dataclass(frozen=True)
+class AblationCommand:
     """Measure what SORLC's basis, its gains and compensator, the reference mode, the avoidance and the substep are worth."""
 
     study: tuple[str, ...] = ()
@@ -57,49 +62,35 @@ class Ablation:
 
     def run(self) -> None:
         """Run the studies, print their tables, and write the page if asked."""
-        from contextlib import nullcontext
+        from marlbc_mj.studies.ablation import run_ablation, select_questions
 
-        from marlbc_mj.report.table import to_markdown
-        from marlbc_mj.studies.ablation import run_study, select_studies, study_table, write_page
-        from marlbc_mj.util.files import staged_folder
-        from marlbc_mj.util.provenance import git_revision, versions
-
-        studies = select_studies(self.study)
-        with nullcontext() if self.out is None else staged_folder(self.out, overwrite=self.overwrite) as folder:
-            with progress_bars() as progress:
-                results = {study.name: (study, run_study(study, progress)) for study in studies}
-            if folder is not None:
-                facts = {"revision": git_revision(), "versions": ", ".join(f"{k} {v}" for k, v in versions().items())}
-                write_page(results, folder, facts)
-        print("\n".join(to_markdown(study_table(study, rows)) for study, rows in results.values()))
+        questions = select_questions(self.study)
+        with progress_bars() as progress:
+            done = run_ablation(questions, self.out, overwrite=self.overwrite, progress=progress)
+        print(done.report.text)
         if self.out is not None:
             print(f"{self.out / 'index.html'} shows it all")
 
 
 @dataclass(frozen=True)
-class Calibrate:
-    """Find the velocity gains that give Table 6's printed maxima, and compare them with the shipped ones."""
+class CalibrateCommand:
+    """Find the velocity gains that give Table 6's published maxima, and compare them with the shipped ones."""
 
     controllers: tuple[str, ...] = ("finite-time", "fixed-time")
     """Controllers to calibrate."""
 
     def run(self) -> None:
         """Search and print the table."""
-        from functools import partial
+        from marlbc_mj.studies.calibration import CalibrationStudy
+        from marlbc_mj.studies.runner import run_study
 
-        from marlbc_mj.studies.calibration import CALIBRATED, calibrate, calibration_lines
-        from marlbc_mj.util.errors import unknown
-
-        for name in self.controllers:
-            if name not in CALIBRATED:
-                raise unknown("calibrated controller", name, CALIBRATED)
         with progress_bars() as progress:
-            results = [calibrate(name, progress=partial(progress, name)) for name in self.controllers]
-        print("\n".join(calibration_lines(results)))
+            done = run_study(CalibrationStudy(self.controllers), None, progress=progress)
+        print(done.report.text)
 
 
 @dataclass(frozen=True)
-class OracleSearch:
+class OracleCommand:
     """Search the best safe switch times on the simulator, for the oracle supervisor; takes minutes."""
 
     scenario: str = "paper"
@@ -107,7 +98,7 @@ class OracleSearch:
     controller: str = "sorlc"
     """Controller that tracks the references."""
     seed: int = 0
-    """Of the search."""
+    """Random seed of the schedule search."""
     budget: int = 4096
     """Episodes that may be simulated."""
     threads: int = 2

@@ -1,4 +1,4 @@
-"""The studies of ``marlbc ablation``, by name."""
+"""The questions of ``marlbc ablation``, by name."""
 
 from collections.abc import Sequence
 from itertools import product
@@ -10,13 +10,13 @@ from marlbc_mj.core.disturbances import PaperDrag
 from marlbc_mj.scenarios import Scenario, cruise, paper
 from marlbc_mj.scenarios.base import REFERENCE_MODES
 from marlbc_mj.scenarios.case_study import SLOTS
-from marlbc_mj.studies.ablation.measure import Case, Figures, Row, Study
+from marlbc_mj.studies.ablation.cases import AblationRow, Case, Figures, Question
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 DRAG_SCALES = (0.0, 1.0, 5.0, 20.0)
 RATES = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0)
 WIDTHS = (2.0, 4.0, 6.0)
-BASES: tuple[Literal["off", "printed", "scaled"], ...] = ("off", "printed", "scaled")
+BASES_COMPARED: tuple[Literal["off", "printed", "scaled"], ...] = ("off", "printed", "scaled")
 SIGNS: dict[str, Literal[-1, 1]] = {"−": -1, "+": 1}
 SUBSTEPS = (0.010, 0.005, 0.002, 0.001)  # [s]
 TRACKING = ("velocity_error", "position_error", "ratio")
@@ -38,8 +38,9 @@ class ExactModel(PD):
 
 
 def half_mission(scale: float) -> Scenario:
-    """The case study's first 50 s from the slots: both points, no jump of the reference that a large drag would turn into a
-    fall; the drag is multiplied by ``scale``.
+    """The case study's first 50 s from the slots, with ``scale`` times the drag.
+
+    Both points are passed, and the reference does not jump, which a large drag would turn into a fall.
     """
     starts = tuple((x - 2.5, y) for x, y in SLOTS)
     return paper(starts=starts, duration=50.0, disturbance=PaperDrag(scale))
@@ -74,7 +75,7 @@ def _sorlc_cases() -> list[Case]:
     made = []
     for scale in DRAG_SCALES:
         scenario = paper(disturbance=PaperDrag(scale))
-        for basis, (mark, sign) in product(BASES, SIGNS.items()):
+        for basis, (mark, sign) in product(BASES_COMPARED, SIGNS.items()):
             law = SORLC.scaled(tau_sign=sign) if basis == "scaled" else SORLC(basis=basis, tau_sign=sign)
             made.append(Case((f"{scale:g}", basis, mark), scenario, law))
     return made
@@ -93,7 +94,7 @@ def _substep_cases() -> list[Case]:
     return [Case((f"{1e3 * substep:g}",), paper(substep=substep), SORLC()) for substep in SUBSTEPS]
 
 
-def _best_of_sweep(rows: Sequence[Row]) -> str:
+def _best_of_sweep(rows: Sequence[AblationRow]) -> str:
     ran = [row for row in rows if row.figures is not None and row.settings[0] != "off"]
     if not ran:
         return "No gain of the grid holds the team."
@@ -105,7 +106,7 @@ def _best_of_sweep(rows: Sequence[Row]) -> str:
     )
 
 
-def _stability(rows: Sequence[Row]) -> str:
+def _stability(rows: Sequence[AblationRow]) -> str:
     """The limit, and what is left to gain below the default step."""
     limit, default = largest_stable_substep(*SORLC().linear_gains), f"{1e3 * paper().substep:g}"
     text = f"The linear loop is stable below {1e3 * limit:.1f} ms."
@@ -117,7 +118,7 @@ def _stability(rows: Sequence[Row]) -> str:
     return f"{text} From the default of {default} ms to {smallest} ms the RMS velocity error changes by {change:+.2%}."
 
 
-def _worth_of_choices(rows: Sequence[Row]) -> str:
+def _worth_of_choices(rows: Sequence[AblationRow]) -> str:
     """How far the sign alone, and the basis alone, move the error and the effort."""
     sign, basis = (_largest_changes(rows, varied) for varied in (2, 1))
     return (
@@ -126,7 +127,7 @@ def _worth_of_choices(rows: Sequence[Row]) -> str:
     )
 
 
-def _largest_changes(rows: Sequence[Row], varied: int) -> tuple[float, float]:
+def _largest_changes(rows: Sequence[AblationRow], varied: int) -> tuple[float, float]:
     """Largest relative change of RMS velocity error and effort between rows that differ in parameter ``varied`` alone."""
     groups: dict[tuple[str, ...], list[Figures]] = {}
     for row in rows:
@@ -138,8 +139,8 @@ def _largest_changes(rows: Sequence[Row], varied: int) -> tuple[float, float]:
     return largest[0], largest[1]
 
 
-_STUDIES = (
-    Study(
+_QUESTIONS = (
+    Question(
         "basis",
         "SORLC's basis against perfect knowledge of the drag",
         "`exact model` is PD that is told the true drag: no identifier can do better. The drag is multiplied by the scale; the "
@@ -149,7 +150,7 @@ _STUDIES = (
         TRACKING,
         block=2,
     ),
-    Study(
+    Question(
         "sweep",
         "Learning rate and width of the scaled basis on the cruise at the largest drag scale",
         "The first row is SORLC without networks.",
@@ -158,7 +159,7 @@ _STUDIES = (
         TRACKING,
         remark=_best_of_sweep,
     ),
-    Study(
+    Question(
         "sorlc",
         "SORLC's basis and sign of the compensator on the case study",
         "The sign is that of τ in (40): the printed one is −, the reading of erratum 2 is +.",
@@ -168,7 +169,7 @@ _STUDIES = (
         block=1,
         remark=_worth_of_choices,
     ),
-    Study(
+    Question(
         "reference",
         "Where behaviors are evaluated, on the case study",
         "At the reference (virtual), or at the measured position (actual), which feeds tracking errors back into the reference.",
@@ -176,7 +177,7 @@ _STUDIES = (
         _reference_cases,
         MISSION,
     ),
-    Study(
+    Question(
         "avoidance",
         "Obstacle avoidance one-sided or as the printed equality task, on the case study",
         "Two-sided avoidance also attracts (erratum 6) and holds an agent on the safe distance, where the reward punishes it.",
@@ -184,7 +185,7 @@ _STUDIES = (
         _avoidance_cases,
         MISSION,
     ),
-    Study(
+    Question(
         "substep",
         "Physics and control step on the case study",
         "A step that is small enough leaves all figures where the next smaller one has them.",
@@ -195,19 +196,19 @@ _STUDIES = (
     ),
 )
 
-STUDIES: dict[str, Study] = {study.name: study for study in _STUDIES}
-"""Every study by name, in the order of the page."""
+QUESTIONS: dict[str, Question] = {question.name: question for question in _QUESTIONS}
+"""Every question by name, in the order of the page."""
 
 
-def select_studies(names: Sequence[str]) -> list[Study]:
-    """The named studies in the order given; all of them for no name.
+def select_questions(names: Sequence[str]) -> tuple[Question, ...]:
+    """The named questions in the order given; all of them for no name.
 
     Raises:
         ConfigurationError: unknown name, or one given twice.
     """
     for name in names:
-        if name not in STUDIES:
-            raise unknown("study", name, STUDIES)
+        if name not in QUESTIONS:
+            raise unknown("study", name, QUESTIONS)
     if len(set(names)) != len(names):
         raise ConfigurationError(f"a study is named twice: {', '.join(names)}")
-    return [STUDIES[name] for name in names or STUDIES]
+    return tuple(QUESTIONS[name] for name in names or QUESTIONS)

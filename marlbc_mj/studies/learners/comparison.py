@@ -16,22 +16,23 @@ from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.formats import DASH, fixed, grouped, interval
 from marlbc_mj.report.table import Column, Table, to_latex, to_markdown
 from marlbc_mj.results.statistics import Estimate, Statistic, bootstrap, iqm, median
-from marlbc_mj.studies.learners import GOAL_SWITCHES, UNFINISHED, VARIANTS, Record
+from marlbc_mj.studies.learners.records import GOAL_SWITCHES, UNFINISHED, CsvLine
+from marlbc_mj.studies.learners.variants import VARIANTS
 from marlbc_mj.util.files import staged_file
 from marlbc_mj.util.palette import AGENT_COLORS
 
 WIDE = 6
 """Variants of a group at most, and panels side by side in the figure."""
-REFERENCE = "marlms"
+REFERENCE_VARIANT = "marlms"
 """The variant that every panel shows beside its own."""
 COLOR, REFERENCE_COLOR, FAILED_COLOR = AGENT_COLORS[0], "#9A9A9A", "#C8102E"
 _GOAL: dict[str, Any] = {"color": AGENT_COLORS[1], "marker": "v", "markersize": 3, "linestyle": "none"}
 _END: dict[str, Any] = {"color": FAILED_COLOR, "marker": "x", "markersize": 4, "linestyle": "none"}
 
 
-def write_report(folder: Path, rows: Sequence[Record], curves: Sequence[Record]) -> None:
+def write_comparison(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
     """study.md, study.tex, curves.pdf and curves.png, from the lines of the CSV files alone."""
-    table = study_table(rows)
+    table = learners_table(rows)
     figure_note = "`curves.pdf`: median and range over the runs that got that far; violation is linear below 0.1 s.\n"
     named = "".join(f"- `{name}`: {VARIANTS[name].line}\n" for name in by_variant(rows))
     for name, text in (("study.md", f"{to_markdown(table)}\n{named}\n{figure_note}"), ("study.tex", to_latex(table) + "\n")):
@@ -44,14 +45,14 @@ def write_report(folder: Path, rows: Sequence[Record], curves: Sequence[Record])
                 figure.savefig(staging, metadata=metadata)
 
 
-def by_variant(lines: Sequence[Record]) -> dict[str, list[Record]]:
+def by_variant(lines: Sequence[CsvLine]) -> dict[str, list[CsvLine]]:
     """Lines by variant, in the order of VARIANTS."""
     found = {name: [line for line in lines if line["variant"] == name] for name in VARIANTS}
     return {name: lines for name, lines in found.items() if lines}
 
 
-def study_table(rows: Sequence[Record]) -> Table:
-    """A row a variant: how many runs met the goal and when, their best evaluation and their last."""
+def learners_table(rows: Sequence[CsvLine]) -> Table:
+    """A row per variant: how many runs met the goal and when, their best evaluation and their last."""
     labels: tuple[tuple[str, str], ...] = (
         ("", "runs"),
         ("goal", "met"),
@@ -81,7 +82,7 @@ def study_table(rows: Sequence[Record]) -> Table:
     )
 
 
-def _cells(rows: Sequence[Record]) -> tuple[str, ...]:
+def _cells(rows: Sequence[CsvLine]) -> tuple[str, ...]:
     ended = [row for row in rows if row["failure"] != UNFINISHED]
     well = [row for row in rows if not row["failure"]]
 
@@ -113,8 +114,8 @@ def _until(estimate: Estimate, digits: int) -> str:
     return value if np.isnan(estimate.low) or value == low == high else f"{value} [{low}, {high}]"
 
 
-def draw_curves(rows: Sequence[Record], curves: Sequence[Record]) -> Figure:
-    """Return and violation time against mission steps, a pair of panels a variant on common axes; see :func:`rows_of_panels`."""
+def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
+    """Return and violation time against mission steps, a pair of panels per variant, placed by :func:`rows_of_panels`."""
     runs, evaluations = by_variant(rows), by_variant(curves)
     blocks = rows_of_panels(list(runs))
     columns = max(3, *map(len, blocks))
@@ -140,7 +141,11 @@ def draw_curves(rows: Sequence[Record], curves: Sequence[Record]) -> Figure:
                 axes = figure.add_axes(at, xlim=(0, 1.03 * steps), ylim=limits[key])
                 corner -= inner
                 _draw_panel(
-                    axes, key, runs[name], evaluations.get(name, []), [] if name == REFERENCE else evaluations.get(REFERENCE, [])
+                    axes,
+                    key,
+                    runs[name],
+                    evaluations.get(name, []),
+                    [] if name == REFERENCE_VARIANT else evaluations.get(REFERENCE_VARIANT, []),
                 )
                 axes.tick_params(labelleft=c == 0, labelbottom=key == "violation_time")
                 axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
@@ -165,7 +170,7 @@ def rows_of_panels(names: Sequence[str]) -> list[list[str]]:
     return blocks
 
 
-def _draw_panel(axes: Axes, key: str, rows: Sequence[Record], curves: Sequence[Record], reference: Sequence[Record]) -> None:
+def _draw_panel(axes: Axes, key: str, rows: Sequence[CsvLine], curves: Sequence[CsvLine], reference: Sequence[CsvLine]) -> None:
     unit = 1e3 if key == "return" else 1.0
     for lines, color, span in ((reference, REFERENCE_COLOR, False), (curves, COLOR, True)):
         at = sorted({float(line["mission_steps"]) for line in lines})
@@ -197,7 +202,7 @@ def _handles() -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=COLOR, label="median"),
         Patch(color=COLOR, alpha=0.25, linewidth=0, label="range of runs"),
-        Line2D([], [], color=REFERENCE_COLOR, label=f"median of {REFERENCE}"),
+        Line2D([], [], color=REFERENCE_COLOR, label=f"median of {REFERENCE_VARIANT}"),
         Line2D([], [], color=pl.GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="scripted supervisor"),
         Line2D([], [], **_GOAL, label="a run meets the goal"),
         Line2D([], [], **_END, label="a run fails"),

@@ -1,4 +1,4 @@
-"""Studies and their rows: one episode a case, or the reason why there is none."""
+"""Questions and their rows: one episode per case, or the reason why there is none."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,13 +13,11 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-Progress = Callable[[str, float, float], None]
-
 
 class Case(NamedTuple):
     """One row to be: what is set, and how to run it."""
 
-    settings: tuple[str, ...]  # one value for each of the study's parameters
+    settings: tuple[str, ...]  # one value for each of the question's parameters
     scenario: Scenario
     controller: Controller
 
@@ -36,7 +34,7 @@ class Figures(NamedTuple):
     rms_position_error: float  # over all agents and substeps [m]
 
 
-class Row(NamedTuple):
+class AblationRow(NamedTuple):
     """One case's figures, or why there are none."""
 
     settings: tuple[str, ...]
@@ -46,8 +44,8 @@ class Row(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Study:
-    """A question and the cases that answer it; run under the scripted supervisor.
+class Question:
+    """A question about one choice, and the cases that answer it, run under the scripted supervisor.
 
     Rows with equal values of the first ``block`` parameters form a block, whose first row the others are compared with.
     """
@@ -57,24 +55,37 @@ class Study:
     about: str  # what varies and why; no number in it
     parameters: tuple[str, ...]
     cases: Callable[[], Sequence[Case]]
-    columns: tuple[str, ...]  # of the printed table, keys of page.COLUMNS; the CSV has all
+    columns: tuple[str, ...]  # of the table, keys of page.ABLATION_COLUMNS; the CSV has all
     block: int = 0
-    remark: Callable[[Sequence[Row]], str] | None = None  # a sentence computed from the rows
+    remark: Callable[[Sequence[AblationRow]], str] | None = None  # a sentence computed from the rows
 
 
-def run_study(study: Study, progress: Progress | None = None) -> list[Row]:
-    """Every case in turn. A setting that is refused and a run that fails are rows with their reason."""
-    rows: list[Row] = []
-    cases = study.cases()
-    first: Row | None = None
-    for case in cases:
-        figures, failure = _attempt(case)
-        if first is None or case.settings[: study.block] != first.settings[: study.block]:
-            first = Row(case.settings, figures, None)
+class Measured(NamedTuple):
+    """What a case came to: figures, or why there are none."""
+
+    figures: Figures | None
+    failure: str = ""
+
+
+def measure_case(case: Case) -> Measured:
+    """One episode. A setting that is refused and a run that fails have their reason in place of figures."""
+    try:
+        return Measured(figures_of(run_episode(World(case.scenario, case.controller, record=True), Scripted())))
+    except SimulationError as error:
+        return Measured(None, "diverged: " + str(error).split(":")[0].removeprefix("world 0, "))
+    except ConfigurationError as error:
+        return Measured(None, f"refused: {error}")
+
+
+def compare_rows(question: Question, measured: Sequence[Measured]) -> list[AblationRow]:
+    """The question's rows, in the order of its cases, each compared with the first of its block."""
+    rows: list[AblationRow] = []
+    first: AblationRow | None = None
+    for case, (figures, failure) in zip(question.cases(), measured, strict=True):
+        if first is None or case.settings[: question.block] != first.settings[: question.block]:
+            first = AblationRow(case.settings, figures, None)
         ratio = first.figures.rms_velocity_error / figures.rms_velocity_error if figures and first.figures else None
-        rows.append(Row(case.settings, figures, ratio, failure))
-        if progress is not None:
-            progress(study.name, len(rows), len(cases))
+        rows.append(AblationRow(case.settings, figures, ratio, failure))
     return rows
 
 
@@ -91,12 +102,3 @@ def figures_of(trajectory: Trajectory) -> Figures:
         rms_velocity_error=scores["rms_velocity_error_rms"],
         rms_position_error=scores["rms_position_error_rms"],
     )
-
-
-def _attempt(case: Case) -> tuple[Figures | None, str]:
-    try:
-        return figures_of(run_episode(World(case.scenario, case.controller, record=True), Scripted())), ""
-    except SimulationError as error:
-        return None, "diverged: " + str(error).split(":")[0].removeprefix("world 0, ")
-    except ConfigurationError as error:
-        return None, f"refused: {error}"

@@ -1,0 +1,51 @@
+"""``marlbc study``: train every variant of the learner on several seeds, in worker processes, and compare them."""
+
+import sys
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from marlbc_mj.cli.terminal import progress_lines
+
+
+@dataclass(frozen=True)
+class StudyCommand:
+    """Compare learners: MARLMS, its ablations and rivals, each on several seeds; the same command goes on where it stopped."""
+
+    variants: tuple[str, ...] = ()
+    """Variants to train; all of them by default."""
+    seeds: int = 5
+    """Runs per variant, with seeds from 0 on."""
+    budget: int | None = None
+    """Mission steps per run; by default those of the preset `fast`."""
+    workers: int = 2
+    """Processes that share the runs, one thread each."""
+    out: Path = Path("runs/study")
+    """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG."""
+    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    """Only make table and figure again, from study.csv and curves.csv in this folder."""
+    set: tuple[str, ...] = ()
+    """Any setting of all runs, name=value, as for `marlbc train`."""
+
+    def run(self) -> None:
+        """Train what is missing, then write and print the comparison; a stopped study compares what there is."""
+        from marlbc_mj.studies.learners.records import read_study
+        from marlbc_mj.studies.learners.trainings import LearnerStudy, compare_learners, train_learners
+
+        if self.source is not None:
+            print(compare_learners(*read_study(self.source), self.source).text)
+            return
+        from marlbc_mj.training.config import with_settings
+
+        adjust = partial(with_settings, settings=self.set)
+        study = LearnerStudy(self.out, self.variants, self.seeds, self.budget, adjust)
+        stopped = train_learners(study, self.workers, progress_lines())
+        text = study.report((), self.out).text
+        if text:
+            print(text)
+        if stopped:
+            print("marlbc: stopped, and every run saved; the same command goes on", file=sys.stderr)
+            sys.exit(128 + stopped)

@@ -1,0 +1,170 @@
+"""Every method on the same draws around a scenario: a job is one method on all seeds, in one world reset from seed to seed."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.report.seed_page import write_seed_report
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.seeds import Instance, MethodRuns, SeedResults, SeedRun, seed_range
+from marlbc_mj.results.summary import method_key
+from marlbc_mj.scenarios import Perturbation, Scenario
+from marlbc_mj.studies.bench import BenchConfig, describe
+from marlbc_mj.studies.episodes import check_free
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.studies.runner import run_jobs, run_study
+from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
+
+CASE_STUDY_PERTURBATION = Perturbation(start_spread=1.0, obstacle_spread=0.5, drag_scale=(0.0, 2.0))
+"""Starts within 1 m, obstacles within 0.5 m per axis, drag from none to twice the published: for scenarios without their own.
+
+A slot of the case study passes its points at 1 m and the gate is 8 m wide, so 0.5 m moves when a supervisor has to act, not
+whether the mission can be done. A schedule fixed in time may violate then; that is an outcome.
+"""
+
+
+class DrawsJob(NamedTuple):
+    """One method on every seed."""
+
+    scenario: Scenario
+    supervisor: str
+    controller: str
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class DrawsStudy:
+    """Methods on the draws of a scenario, compared in tables with intervals. What a method does depends on no other method.
+
+    Raises:
+        ConfigurationError: unknown names, no or repeated methods or seeds.
+    """
+
+    scenario: Scenario
+    """With the perturbation that is drawn from."""
+    methods: tuple[tuple[str, str], ...]
+    """Names of supervisor and controller."""
+    seeds: tuple[int, ...]
+    against: str | None = None
+    """Key of the method that others are compared with; None: the first."""
+    config: BenchConfig | None = None
+    """What was asked for, for the report."""
+
+    def __post_init__(self) -> None:
+        keys = [method_key(*method) for method in self.methods]
+        if not keys:
+            raise ConfigurationError("name at least one supervisor and one controller")
+        if len(set(keys)) != len(keys):
+            raise ConfigurationError(f"a method is named twice: {', '.join(keys)}")
+        if not self.seeds:
+            raise ConfigurationError("name at least one seed")
+        if len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
+            raise ConfigurationError(f"seeds must differ and not be negative, got {list(self.seeds)}")
+        if self.against is not None and self.against not in keys:
+            raise ConfigurationError(f"reference method {self.against!r} is not run; choose from: {', '.join(keys)}")
+        for supervisor, controller in self.methods:
+            make_supervisor(supervisor, controller)
+            make_controller(controller)
+
+    def jobs(self) -> list[DrawsJob]:
+        return [DrawsJob(self.scenario, *method, self.seeds) for method in self.methods]
+
+    def run(self, job: DrawsJob, watch: Watch) -> MethodRuns:
+        return fly_draws(job, watch.progress)
+
+    def gather(self, runs: Sequence[MethodRuns]) -> SeedResults:
+        """The whole matrix from the results of all jobs."""
+        return SeedResults(self.scenario, self.seeds, tuple(runs), self.against or method_key(*self.methods[0]))
+
+    def report(self, results: Sequence[MethodRuns], out: Path | None, progress: Progress = silent) -> Report:
+        if out is not None:
+            config = self.config or BenchConfig()
+            facts = describe(self.scenario, config)
+            write_json(out / "config.json", facts)
+            write_seed_report(self.gather(results), out, config=facts, figures=config.figures, progress=progress)
+        return Report()
+
+
+def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
+    """The whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
+
+    Raises:
+        ConfigurationError: a setting or the output folder; nothing is written then.
+    """
+    seeds = seed_range(config.seeds or 0, config.seed)
+    study = DrawsStudy(perturbed(scenario), tuple(config.methods), seeds, config.against, config)
+    done = run_study(study, out, overwrite=config.overwrite, workers=config.workers, progress=progress or silent)
+    return study.gather(done.results)
+
+
+def run_methods(
+    scenario: Scenario,
+    methods: Sequence[tuple[str, str]],
+    seeds: Sequence[int],
+    progress: Progress | None = None,
+    *,
+    reference: str | None = None,
+    workers: int = 1,
+) -> SeedResults:
+    """Run every method on every seed.
+
+    A run that fails, or a method that cannot start in this scenario, is kept with its reason.
+
+    Args:
+        scenario: drawn from as :func:`perturbed` says.
+        methods: names of supervisor and controller.
+        seeds: one draw each, the same for every method.
+        progress: called with the method, how many seeds of it are done and how many there are.
+        reference: the key of the method that others are compared with; by default the first.
+        workers: processes that share the methods; decision times are best measured with one.
+
+    Raises:
+        ConfigurationError: unknown names, no or repeated methods or seeds; nothing has been run then.
+    """
+    study = DrawsStudy(perturbed(scenario), tuple(methods), tuple(seeds), reference)
+    return study.gather(run_jobs(study, workers=workers, progress=progress or silent))
+
+
+def perturbed(scenario: Scenario) -> Scenario:
+    """The scenario, with the case study's perturbation if it has none of its own and draws no layout."""
+    if scenario.perturbation != Perturbation() or scenario.layout is not None:
+        return scenario
+    return replace(scenario, perturbation=CASE_STUDY_PERTURBATION)
+
+
+def fly_draws(job: DrawsJob, progress: Progress = silent) -> MethodRuns:
+    """One method on every seed; ``progress`` is called with how many seeds are done."""
+    law = make_controller(job.controller)
+    try:
+        world = World(job.scenario, law, record=True)
+    except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
+        refused = tuple(SeedRun(seed, None, failure=str(error)) for seed in job.seeds)
+        return MethodRuns(job.supervisor, job.controller, refused)
+    runs = []
+    for done, seed in enumerate(job.seeds):
+        runs.append(fly_seed(world, law, job.supervisor, job.controller, seed))
+        progress(method_key(job.supervisor, job.controller), done + 1, len(job.seeds))
+    return MethodRuns(job.supervisor, job.controller, tuple(runs))
+
+
+def fly_seed(world: World, law: Controller, supervisor: str, controller: str, seed: int) -> SeedRun:
+    """One episode in a world made with ``record=True``; its trajectory is measured and let go."""
+    try:
+        world.reset(seed)
+    except ConfigurationError as error:  # no layout was found for this seed
+        return SeedRun(seed, None, failure=str(error))
+    state = world.state
+    instance = Instance(state.position[0].copy(), state.obstacles[0, :, :3].copy(), float(state.disturbance_params[0, 0]))
+    try:
+        trajectory = run_episode(world, make_supervisor(supervisor, controller), seed=seed, names=(supervisor, controller))
+        check_free(trajectory, law)
+        return SeedRun(seed, instance, metrics=measure(trajectory))
+    except (ConfigurationError, SimulationError) as error:  # a supervisor that cannot start here is an outcome too
+        return SeedRun(seed, instance, failure=str(error))

@@ -1,0 +1,173 @@
+"""One episode of one method: made ready, flown, logged, and checked for a law that never left its force limit."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Frame, Trajectory, run_episode
+from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.results.summary import Result, method_key
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors import Decision, Situation, Supervisor, make_supervisor
+from marlbc_mj.util.errors import MarlbcError, SimulationError
+from marlbc_mj.util.progress import Progress, silent
+
+STUCK = 0.1
+"""A limited law whose force is at its limit throughout this last share of an episode has failed: saturated forever."""
+TELL_EVERY = 50  # mission steps
+
+
+class EpisodeJob(NamedTuple):
+    """One method on one draw of a scenario."""
+
+    scenario: Scenario
+    supervisor: str
+    controller: str
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """The method's name in every file."""
+        return method_key(self.supervisor, self.controller)
+
+
+class Stopwatch:
+    """A supervisor that has started already, with the time of its solver.
+
+    Its first ``start`` gives the memory that it was made with, so that a check whether a supervisor can start and the episode
+    share one start, which may assemble a whole MuJoCo model. Memory may tell, as ``solver_ms``, how long a network or solver took
+    in the last decision [ms].
+    """
+
+    def __init__(self, supervisor: Supervisor, scenario: Scenario) -> None:
+        self.supervisor = supervisor
+        self.solver_ms: list[float] = []
+        self.memory: list[Any] = [supervisor.start(scenario)]
+
+    def start(self, scenario: Scenario) -> Any:
+        """The supervisor's memory."""
+        return self.memory.pop() if self.memory else self.supervisor.start(scenario)
+
+    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
+        """The supervisor's orders."""
+        orders, memory = self.supervisor.decide(situation, memory)
+        spent = getattr(memory, "solver_ms", None)
+        if spent is not None:
+            self.solver_ms.append(float(spent))
+        return orders, memory
+
+    def share(self, decision_ms: np.ndarray) -> float | None:
+        """Solver's time over the whole decisions' (M,); None where the supervisor did not tell."""
+        return sum(self.solver_ms) / float(decision_ms.sum()) if self.solver_ms else None
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A method that is ready to fly one episode."""
+
+    job: EpisodeJob
+    law: Controller
+    world: World
+    supervisor: Stopwatch
+
+
+def name_method(job: EpisodeJob) -> tuple[Controller, Supervisor]:
+    """Controller and supervisor of these names; ConfigurationError for unknown ones."""
+    return make_controller(job.controller), make_supervisor(job.supervisor, job.controller)
+
+
+def prepare(job: EpisodeJob, law: Controller, supervisor: Supervisor) -> Flight:
+    """World and memory of one episode, each made once.
+
+    Raises:
+        ConfigurationError: the controller or the supervisor does not suit the scenario.
+    """
+    world = World(job.scenario, law, record=True)
+    return Flight(job, law, world, Stopwatch(supervisor, job.scenario))
+
+
+def fly(flight: Flight, folder: Path | None, progress: Progress = silent, *, overwrite: bool = False) -> Result:
+    """The episode, logged to ``folder/logs`` if there is a folder; an episode that cannot be finished has failed.
+
+    Raises:
+        ConfigurationError: a log that may not be written.
+    """
+    job, scenario = flight.job, flight.job.scenario
+    names = (job.supervisor, job.controller)
+    try:
+        with nullcontext() if folder is None else open_log(flight, folder, overwrite=overwrite) as log:
+            on_frame = _frame_observer(job, log, progress)
+            trajectory = run_episode(flight.world, flight.supervisor, seed=job.seed, names=names, on_frame=on_frame)
+        check_free(trajectory, flight.law)
+    except SimulationError as error:
+        return Result.failed(*names, str(error))
+    progress(job.key, scenario.duration, scenario.duration)
+    return Result.of(trajectory, flight.supervisor.share(trajectory.decision_ms))
+
+
+def fly_or_fail(job: EpisodeJob, folder: Path | None, progress: Progress = silent) -> Result:
+    """:func:`prepare` and :func:`fly`; a method that cannot start has failed, too.
+
+    Raises:
+        ConfigurationError: unknown names, or a log that may not be written.
+    """
+    law, supervisor = name_method(job)
+    try:
+        flight = prepare(job, law, supervisor)
+    except MarlbcError as error:
+        return Result.failed(job.supervisor, job.controller, f"cannot start: {error}")
+    return fly(flight, folder, progress)
+
+
+def _frame_observer(job: EpisodeJob, log: LogWriter | None, progress: Progress) -> Callable[[Frame], None]:
+    """What is done with every frame: it goes into the log, and now and then its time to who watches."""
+
+    def observe(frame: Frame) -> None:
+        if log is not None:
+            log.write(frame)
+        if round(frame.time / job.scenario.mission_step) % TELL_EVERY == 0:
+            progress(job.key, frame.time, job.scenario.duration)
+
+    return observe
+
+
+def open_log(flight: Flight, folder: Path, *, overwrite: bool = False) -> LogWriter:
+    """A log writer for one method, with everything that defines the run in its configuration."""
+    job = flight.job
+    return LogWriter(
+        folder / "logs" / f"{job.key}.mcap",
+        job.scenario,
+        flight.law,
+        supervisor=job.supervisor,
+        controller_name=job.controller,
+        seed=job.seed,
+        config={
+            "scenario": job.scenario,
+            "controller": flight.law,
+            "supervisor": flight.supervisor.supervisor,
+            "seed": job.seed,
+        },
+        overwrite=overwrite,
+        model=flight.world.plan.xml,
+    )
+
+
+def check_free(trajectory: Trajectory, law: Controller) -> None:
+    """Raise SimulationError for an agent of a limited law that was at its force limit throughout the end of the episode."""
+    scenario = trajectory.scenario
+    if not law.limited:
+        return
+    last = max(1, round(STUCK * len(trajectory.force)))
+    at_limit = (np.abs(trajectory.force[-last:]) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).all(axis=0)
+    if at_limit.any():
+        agents = ", ".join(str(i + 1) for i in np.flatnonzero(at_limit))
+        raise SimulationError(
+            f"saturated forever: agent {agents} at the force limit of {scenario.force_limit:g} N "
+            f"throughout the last {last * scenario.substep:g} s"
+        )

@@ -1,0 +1,51 @@
+"""Supervisors on held-out layouts of a scenario family: how often the mission succeeds, and what goes wrong where it does not."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from marlbc_mj.results.seeds import SeedResults
+from marlbc_mj.results.summary import method_key
+from marlbc_mj.scenarios import Scenario, held_out
+from marlbc_mj.studies.bench import BenchConfig
+from marlbc_mj.studies.draws import run_bench_seeds
+from marlbc_mj.supervisors import UNLEARNED
+from marlbc_mj.util.progress import Progress
+
+AGAINST = "fsams-hysteresis"
+"""The supervisor that others are compared with, where it is one of those that run."""
+
+
+def run_evaluation(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
+    """The methods of :func:`evaluation` on layouts that no training draws; writes what ``bench --seeds`` writes.
+
+    Raises:
+        ConfigurationError: a scenario that draws no layouts, a setting, or the output folder; nothing is written then.
+    """
+    return run_bench_seeds(held_out(scenario), config, out, progress=progress)
+
+
+def evaluation(
+    supervisors: Sequence[str] | None = None,
+    controller: str = "sorlc",
+    *,
+    seeds: int = 200,
+    seed: int = 0,
+    workers: int = 1,
+    overwrite: bool = False,
+) -> BenchConfig:
+    """Supervisors with one controller on ``seeds`` layouts, from ``seed`` on; by default every supervisor without learning.
+
+    Raises:
+        ConfigurationError: unknown or repeated names, or a number that cannot be.
+    """
+    names = UNLEARNED if supervisors is None else tuple(supervisors)
+    against = AGAINST if AGAINST in names or not names else names[0]
+    return BenchConfig(
+        supervisors=names,
+        controllers=(controller,),
+        seed=seed,
+        seeds=seeds,
+        workers=workers,
+        overwrite=overwrite,
+        against=method_key(against, controller),
+    )

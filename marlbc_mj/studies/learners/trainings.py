@@ -1,0 +1,214 @@
+"""The study of learners: one training per variant and seed, in a folder of its own, where it goes on after a stop.
+
+A run that finished leaves ``DONE`` with the hash of its configuration, one that failed ``FAILED`` with its reason.
+"""
+
+import shutil
+import signal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from marlbc_mj.report.table import to_markdown
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.studies.learners import records
+from marlbc_mj.studies.learners.comparison import learners_table, write_comparison
+from marlbc_mj.studies.learners.records import DONE_MARK, FAILED_MARK, CsvLine, read_json
+from marlbc_mj.studies.learners.variants import VARIANTS
+from marlbc_mj.studies.protocol import Report, Stopped, Watch
+from marlbc_mj.studies.runner import run_jobs
+from marlbc_mj.training import run as training
+from marlbc_mj.training.config import TrainConfig, from_json, make_config
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, unknown
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import config_hash
+from marlbc_mj.util.text import one_line
+
+
+class TrainingJob(NamedTuple):
+    """One run: what is trained, and in which folder."""
+
+    variant: str
+    config: TrainConfig
+    folder: Path
+
+    @property
+    def key(self) -> str:
+        """The run's name in every message."""
+        return f"{self.variant} seed {self.config.seed}"
+
+    @property
+    def hash(self) -> str:
+        """Hash of the configuration, by which a folder tells whether it holds this run."""
+        return config_hash({"train": self.config})
+
+
+class TrainingEnd(NamedTuple):
+    """How a run ended: ``finished``, ``found`` (finished before) or ``failed``, and why it failed."""
+
+    how: str
+    reason: str = ""
+
+
+def unchanged(config: TrainConfig) -> TrainConfig:
+    """The configuration as it is."""
+    return config
+
+
+@dataclass(frozen=True)
+class LearnerStudy:
+    """Every variant on seeds 0 to ``seeds - 1``, and their comparison."""
+
+    out: Path
+    """Folder of the study; a run's is ``out/VARIANT/SEED``."""
+    variants: tuple[str, ...] = ()
+    """Names in VARIANTS; none stands for all."""
+    seeds: int = 5
+    """Runs per variant."""
+    budget: int | None = None
+    """Mission steps per run; None: those of the preset ``fast``."""
+    adjust: Callable[[TrainConfig], TrainConfig] = unchanged
+    """Changes every configuration."""
+
+    def jobs(self) -> list[TrainingJob]:
+        """Seed by seed, so that a study that is stopped compares all variants.
+
+        Raises:
+            ConfigurationError: an unknown variant or one named twice, a number below 1, a setting that cannot be run, or a folder
+                with a run of another configuration.
+        """
+        for name in self.variants:
+            if name not in VARIANTS:
+                raise unknown("variant", name, VARIANTS)
+        if len(set(self.variants)) != len(self.variants):
+            raise ConfigurationError(f"a variant is named twice: {', '.join(self.variants)}")
+        budget = make_config("fast").budget if self.budget is None else self.budget
+        jobs = [
+            TrainingJob(name, self.adjust(VARIANTS[name].config(seed, budget)), self.out / name / str(seed))
+            for seed in seed_range(self.seeds)
+            for name in self.variants or VARIANTS
+        ]
+        for job in jobs:
+            found = _trained(job.folder)
+            if found is not None and found != job.hash:
+                raise ConfigurationError(f"{job.folder} was trained with other settings; remove it or choose another --out")
+        if self.out.is_file():
+            raise ConfigurationError(f"output folder {self.out} is a file")
+        return jobs
+
+    def run(self, job: TrainingJob, watch: Watch) -> TrainingEnd:
+        return train_job(job, watch)
+
+    def report(self, results: Sequence[TrainingEnd], out: Path | None, progress: Progress = silent) -> Report:
+        """CSV files, table and figure of all runs in the study's folder, also those of earlier calls."""
+        rows, curves = records.collect(self.out)
+        if not rows:
+            return Report()
+        records.write_csvs(self.out, rows, curves)
+        return compare_learners(rows, curves, self.out)
+
+
+def compare_learners(rows: Sequence[CsvLine], curves: Sequence[CsvLine], folder: Path) -> Report:
+    """Table and figure from the lines of the CSV files alone."""
+    write_comparison(folder, rows, curves)
+    table = to_markdown(learners_table(rows))
+    return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show it all")
+
+
+def train_learners(study: LearnerStudy, workers: int, progress: Progress = silent) -> int:
+    """Train what is missing; returns the signal that stopped the study, or 0.
+
+    Args:
+        study: what is trained.
+        workers: processes that share the runs.
+        progress: called with a line per event, how many runs have ended, and how many there are.
+
+    Raises:
+        ConfigurationError: fewer than one worker, a setting, or a folder that cannot be written.
+        SimulationError: a worker died; what was saved goes on with the next call.
+    """
+    total, count = len(study.jobs()), 0
+
+    def ended(job: TrainingJob, end: TrainingEnd) -> None:
+        nonlocal count
+        count += 1
+        progress(f"[{count}/{total}] {job.key}: {end.how}{': ' if end.reason else ''}{end.reason}", count, total)
+
+    with training.stopper() as stop:
+        try:
+            run_jobs(study, workers=workers, progress=progress, ended=ended, stop=stop)
+        except Stopped as stopped:
+            return stopped.signal
+    return 0
+
+
+def train_job(job: TrainingJob, watch: Watch) -> TrainingEnd:
+    """Train, or go on training; a run that fails is kept with its reason, and tried again by the next call.
+
+    Args:
+        job: what to run; finished before, it is left as it is.
+        watch: told a line at the start and after every tenth of the budget; asked after every decision whether to stop.
+
+    Raises:
+        ConfigurationError: the outcome cannot be written.
+        Stopped: the run has saved itself, or has not begun.
+    """
+    if (job.folder / DONE_MARK).is_file():
+        _prune(job.folder)
+        return TrainingEnd("found")
+    if watch.stopping():
+        raise Stopped
+    begun = training.resumable(job.folder)
+    (job.folder / FAILED_MARK).unlink(missing_ok=True)
+    watch.progress(f"{job.key}: {'goes on' if begun else 'begins'}", 0, job.config.budget)
+    observe = _observer(job, watch)
+    try:
+        if begun:
+            ended = training.resume(job.folder, progress=observe)
+        else:
+            ended = training.train(job.config, job.folder, overwrite=True, progress=observe)
+    except Exception as error:  # whatever stops one learner must not stop the others
+        reason = one_line(str(error) if isinstance(error, MarlbcError) else f"{type(error).__name__}: {error}")
+        write_json(job.folder / FAILED_MARK, {"failure": reason, "train": job.config})
+        return TrainingEnd("failed", reason)
+    if isinstance(ended, training.Interrupted):
+        raise Stopped(ended.signal)
+    write_json(job.folder / DONE_MARK, {"config_hash": job.hash})
+    _prune(job.folder)
+    return TrainingEnd("finished")
+
+
+def _observer(job: TrainingJob, watch: Watch) -> Callable[[Any, Mapping[str, float]], None]:
+    """What is done after every decision of a training: a line after every tenth, and a stop where one is asked for."""
+    tenth = 0
+
+    def observe(trainer: Any, row: Mapping[str, float]) -> None:
+        nonlocal tenth
+        if watch.stopping():
+            signal.raise_signal(signal.SIGTERM)  # noted by the run, which saves itself
+        share = min(1.0, trainer.steps / job.config.budget)
+        if int(10 * share) > tenth:
+            tenth = int(10 * share)
+            scores = f"return {row['return']:.0f}, violation of the worst agent {row['violation_time']:.2f} s"
+            line = f"{job.key}: {share:4.0%}, {trainer.steps / 1e6:.2f} M steps, {scores}"
+            watch.progress(line, trainer.steps, job.config.budget)
+
+    return observe
+
+
+def _trained(folder: Path) -> str | None:
+    """Hash of the configuration that the folder's run finished with, or goes on with."""
+    if (folder / DONE_MARK).is_file():
+        return str(read_json(folder / DONE_MARK, "config_hash"))
+    if (folder / training.RESUME).is_file():
+        return config_hash({"train": from_json(read_json(folder / "config.json", "train"))})
+    return None
+
+
+def _prune(folder: Path) -> None:
+    """Leave evaluations, progress, configuration and the best checkpoint of a finished run."""
+    for path in (folder / training.RESUME, folder / FAILED_MARK, *(folder / "checkpoint").glob("last.*")):
+        path.unlink(missing_ok=True)
+    shutil.rmtree(folder / "tensorboard", ignore_errors=True)

@@ -1,0 +1,55 @@
+"""The variants that a study of learners compares: MARLMS, its ablations, its presets and its rivals."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from marlbc_mj.training.config import PRESETS, TrainConfig, make_config
+from marlbc_mj.training.methods import CARE, METHODS
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to learn: a method and a preset with changes. A group has at most ``WIDE`` variants, a row of the figure."""
+
+    line: str
+    group: str
+    """What it is compared for: learner, preset or rival."""
+    method: str = "marlms"
+    preset: str = "fast"
+    changes: Mapping[str, Any] = field(default_factory=dict)
+
+    def config(self, seed: int, budget: int) -> TrainConfig:
+        """The run's configuration, on one thread, so that runs do not compete for cores."""
+        changes = {**METHODS[self.method][0], **self.changes, "method": self.method, "seed": seed, "budget": budget}
+        return make_config(self.preset, **changes, threads=1)
+
+
+_UNCENTRED = {"shaping": replace(PRESETS["fast"][0].shaping, centre=0.0)}
+VARIANTS: dict[str, Variant] = {
+    "marlms": Variant("MARLMS with the fast preset", "learner"),
+    "no-leniency": Variant("every negative TD error counts", "learner", "iql"),
+    "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
+    "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
+    "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
+    "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
+    "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
+    "uniform-starts": Variant(
+        "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
+    ),
+    "no-joint-exploration": Variant(
+        "a random order lasts one decision, of one agent",
+        "preset",
+        changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
+    ),
+    "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
+    "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
+    "paper": Variant("the printed hyper-parameters, state, reward and orders", "preset", preset="paper"),
+    "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
+    "vdn": Variant("value decomposition", "rival", "vdn"),
+    "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
+    "central": Variant("one network over joint orders", "rival", "central"),
+    "rlms": Variant("single agents side by side", "rival", "rlms"),
+    "mappo": Variant("multi-agent PPO", "rival", "mappo"),
+}
+"""Method, preset and changes by name."""

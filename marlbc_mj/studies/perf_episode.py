@@ -1,0 +1,79 @@
+"""How long a whole episode of one world takes on this machine, and its log."""
+
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.controllers import SORLC
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import Frame, run_episode
+from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.studies.timing import interleaved
+from marlbc_mj.supervisors import Scripted, situation
+from marlbc_mj.util.progress import Progress, silent
+
+
+def measure_episode(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Seconds for a whole 100 s episode of one world: its supervisor deciding at every mission step, all orders known
+    beforehand, and writing its log at mission rate. One thread, whatever ``threads`` says.
+    """
+    progress("one episode, and its log", 0, 1)
+    scenario = paper()
+    world = World(scenario)
+    schedule = np.ascontiguousarray(scripted_orders(scenario)[:, None])
+    frames: list[Frame] = []
+    run_episode(World(scenario, record=True), Scripted(), on_frame=frames.append)
+    with tempfile.TemporaryDirectory() as folder:
+        variants: dict[Any, Callable[[], None]] = {
+            "episode": lambda: _episode(world),
+            "rollout": lambda: _rollout(world, schedule),
+            "record": lambda: _write(scenario, frames, Path(folder) / "perf.mcap"),
+        }
+        taken = interleaved(variants, rounds)
+    return {f"{name}_s": median(seconds) for name, seconds in taken.items()}
+
+
+def _rollout(world: World, schedule: np.ndarray) -> None:
+    world.reset()
+    world.rollout(schedule)
+
+
+def _episode(world: World) -> None:
+    scenario, supervisor = world.scenario, Scripted()
+    memory = supervisor.start(scenario)
+    observation = world.reset()
+    done = False
+    while not done:
+        orders, memory = supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
+        step = world.step(orders[None])
+        observation, done = step.observation, bool(step.done[0])
+
+
+def _write(scenario: Scenario, frames: list[Frame], path: Path) -> None:
+    with LogWriter(
+        path,
+        scenario,
+        SORLC(),
+        supervisor="scripted",
+        controller_name="sorlc",
+        seed=0,
+        config={},
+        overwrite=True,
+    ) as log:
+        for frame in frames:
+            log.write(frame)
+
+
+def scripted_orders(scenario: Scenario) -> np.ndarray:
+    """(M, N) orders of the scripted supervisor at every mission step."""
+    supervisor = Scripted()
+    memory = supervisor.start(scenario)
+    world = World(scenario)
+    start = situation(world.observe(), world.state.obstacles[0], scenario.mission_step)
+    times = np.arange(scenario.mission_steps) * scenario.mission_step
+    return np.array([supervisor.decide(start._replace(time=float(t)), memory)[0] for t in times])

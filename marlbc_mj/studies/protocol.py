@@ -1,0 +1,67 @@
+"""What a study is: independent jobs, each a pure function of its configuration, and a report made from their results.
+
+A job is data: everything that its result depends on, and picklable, so that it can run in this process, in another one or on
+another machine, in any order. A result is data too. Only large files, logs and checkpoints, go into a folder beside it.
+:mod:`marlbc_mj.studies.runner` runs the jobs of any study.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple, Protocol, TypeVar
+
+from marlbc_mj.util.progress import Progress, silent
+
+JobT = TypeVar("JobT")
+ResultT = TypeVar("ResultT")
+
+
+class Stopped(Exception):
+    """A job or a study that was asked to stop, and whose state is saved."""
+
+    def __init__(self, signal: int = 0) -> None:
+        super().__init__(signal)
+        self.signal = signal
+
+
+def never() -> bool:
+    """What a job is told that nobody will ask to stop."""
+    return False
+
+
+class Watch(NamedTuple):
+    """What a job may use besides its configuration; its result depends on none of it."""
+
+    progress: Progress = silent
+    stopping: Callable[[], bool] = never
+    """Whether the job should save itself and raise :class:`Stopped`; one that cannot need not ask."""
+    folder: Path | None = None
+    """Where large files go; None: nowhere."""
+
+
+class Report(NamedTuple):
+    """What a study says of itself."""
+
+    text: str = ""
+    """For the terminal."""
+    problems: tuple[str, ...] = ()
+    """What could not be written, a video without GL for example; one line each."""
+
+
+class Study(Protocol[JobT, ResultT]):
+    """Independent jobs and the report made from their results. Implementations are frozen, picklable dataclasses."""
+
+    def jobs(self) -> Sequence[JobT]:
+        """All jobs, in the order of the report.
+
+        Raises:
+            ConfigurationError: a setting that cannot be run; nothing has been run or written then.
+        """
+        ...
+
+    def run(self, job: JobT, watch: Watch) -> ResultT:
+        """The job's result. A failure that belongs in the report is a result; any other is raised and ends the study."""
+        ...
+
+    def report(self, results: Sequence[ResultT], out: Path | None, progress: Progress = silent) -> Report:
+        """Write what the study leaves into ``out``, where that is given, and say what came out."""
+        ...

@@ -1,0 +1,221 @@
+"""The runner of studies: the same results, progress and errors in one process and in several."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from marlbc_mj.studies.protocol import Report, Stopped, Watch
+from marlbc_mj.studies.runner import counting, run_jobs, run_study
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.progress import silent
+
+WORKERS = pytest.mark.parametrize("workers", [1, 2])
+
+
+@dataclass
+class Request:
+    """A stop that may be asked for."""
+
+    signal: int = 0
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Squares of numbers; ``trouble`` is what happens instead at number 3."""
+
+    count: int = 4
+    trouble: str = ""
+
+    def jobs(self) -> list[int]:
+        return list(range(self.count))
+
+    def run(self, job: int, watch: Watch) -> int:
+        time.sleep(0.02 * (self.count - job))  # the first ends last
+        if job == 3 and self.trouble:
+            self.fail(watch)
+        if watch.folder is not None:
+            (watch.folder / f"{job}.txt").write_text(str(job))
+        for step in (1, 2):
+            watch.progress(f"job {job}", step, 2)
+        return job * job
+
+    def fail(self, watch: Watch) -> None:
+        if self.trouble == "death":
+            os._exit(9)
+        if self.trouble == "stop":
+            while not watch.stopping():
+                time.sleep(0.01)
+            raise Stopped
+        raise SimulationError(self.trouble)
+
+    def report(self, results: Sequence[int], out: Path | None, progress=silent) -> Report:
+        if out is not None:
+            (out / "sum.txt").write_text(str(sum(results)))
+        return Report(f"sum {sum(results)}", ("no picture",))
+
+
+@WORKERS
+def test_results_are_in_the_order_of_the_jobs(workers: int) -> None:
+    """Whoever ends first, each is told as it ends, with its own job; every job's progress arrives in its order."""
+    ended, told = [], []
+    results = run_jobs(
+        Squares(),
+        workers=workers,
+        progress=lambda *step: told.append(step),
+        ended=lambda job, result: ended.append((job, result)),
+    )
+    assert results == [0, 1, 4, 9] and sorted(ended) == [(0, 0), (1, 1), (2, 4), (3, 9)]
+    for job in range(4):
+        assert [step for step in told if step[0] == f"job {job}"] == [(f"job {job}", 1, 2), (f"job {job}", 2, 2)]
+
+
+@WORKERS
+def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
+    """Large files of the jobs beside the report, or nothing at all."""
+    done = run_study(Squares(), tmp_path / "out", workers=workers)
+    assert done.results == [0, 1, 4, 9] and done.report == Report("sum 14", ("no picture",))
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sum.txt", *(f"{k}.txt" for k in range(4))}
+    with pytest.raises(SimulationError, match="it fell"):
+        run_study(Squares(trouble="it fell"), tmp_path / "other", workers=workers)
+    with pytest.raises(ConfigurationError, match="is not empty"):
+        run_study(Squares(), tmp_path / "out", workers=workers)
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert run_study(Squares(), None, workers=workers).report.text == "sum 14"
+
+
+def test_a_dead_worker_is_an_error() -> None:
+    """And whoever saves as he goes is told that he may go on."""
+    with pytest.raises(SimulationError, match=r"a worker process died \(out of memory\?\)$"):
+        run_jobs(Squares(trouble="death"), workers=2)
+    with pytest.raises(SimulationError, match="the same command goes on"):
+        run_jobs(Squares(trouble="death"), workers=2, stop=Request())
+
+
+@WORKERS
+def test_a_stop_reaches_the_jobs(workers: int) -> None:
+    """Asked for while they run: what has ended is kept, the runner says which signal it was."""
+    request, ended = Request(), []
+
+    def note(job: int, result: int) -> None:
+        ended.append(job)
+        request.signal = signal.SIGTERM if len(ended) == 3 else 0
+
+    with pytest.raises(Stopped) as stopped:
+        run_jobs(Squares(trouble="stop"), workers=workers, ended=note, stop=request)
+    assert stopped.value.signal == signal.SIGTERM and sorted(ended) == [0, 1, 2]
+
+
+def test_a_job_that_stops_by_itself_stops_the_study() -> None:
+    """In this process, where the signal reaches the job first; without anybody to tell it is passed on."""
+
+    @dataclass(frozen=True)
+    class Interrupted(Squares):
+        def run(self, job: int, watch: Watch) -> int:
+            if job == 1:
+                raise Stopped(signal.SIGINT)
+            assert watch.stopping() == (job > 1)
+            return job
+
+    for request in (Request(), None):
+        with pytest.raises(Stopped) as stopped:
+            run_jobs(Interrupted(), stop=request)
+        assert stopped.value.signal == signal.SIGINT
+
+
+def test_fewer_than_one_worker_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="workers must be at least 1, got 0"):
+        run_jobs(Squares(), workers=0)
+
+
+def test_counting_tells_how_much_of_a_stage_is_done() -> None:
+    told = []
+    tell = counting([1, 2, 3, 4], lambda job: "even" if job % 2 == 0 else "odd", lambda *step: told.append(step))
+    for job in (2, 1, 4):
+        tell(job, None)
+    assert told == [("even", 1, 2), ("odd", 1, 2), ("even", 2, 2)]
+
+
+PARENT = """
+import sys, time
+from pathlib import Path
+from marlbc_mj.studies.runner import run_jobs
+sys.path.insert(0, sys.argv[2])
+from orphans import Patient
+run_jobs(Patient(Path(sys.argv[1]), sys.argv[3] == "heeds"), workers=2)
+"""
+ORPHANS = """
+import os, time
+from dataclasses import dataclass
+from pathlib import Path
+
+@dataclass(frozen=True)
+class Patient:
+    out: Path
+    heeds: bool
+
+    def jobs(self):
+        return [1, 2] if self.heeds else [1, 2, 3, 4]
+
+    def run(self, job, watch):
+        (self.out / f"{job}.begun").write_text(str(os.getpid()))
+        while not (self.heeds and watch.stopping()):
+            time.sleep(0.02)
+        (self.out / f"{job}.saved").touch()
+"""
+
+
+@pytest.fixture
+def patient(tmp_path: Path, request: pytest.FixtureRequest):
+    """A study of jobs that never end by themselves, in a process group of its own, once two workers have begun."""
+    (tmp_path / "orphans.py").write_text(ORPHANS)
+    command = [sys.executable, "-c", PARENT, str(tmp_path), str(tmp_path), request.param]
+    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    try:
+        wait_for(lambda: len([p for p in tmp_path.glob("*.begun") if p.read_text()]) == 2)
+        yield parent
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(parent.pid, signal.SIGKILL)
+        parent.wait()
+
+
+@pytest.mark.parametrize("patient", ["heeds"], indirect=True)
+def test_workers_do_not_outlive_their_study(patient: subprocess.Popen, tmp_path: Path) -> None:
+    """Killed without a chance to say so: its workers are asked to stop, save themselves and end."""
+    workers = [int(path.read_text()) for path in tmp_path.glob("*.begun")]
+    patient.kill()
+    patient.wait()
+    wait_for(lambda: len(list(tmp_path.glob("*.saved"))) == 2)
+    wait_for(lambda: not any(alive(worker) for worker in workers))
+
+
+@pytest.mark.parametrize("patient", ["hurries"], indirect=True)
+def test_after_ctrl_c_no_job_begins(patient: subprocess.Popen, tmp_path: Path) -> None:
+    """Also none that waits in a worker's queue: the study ends at once."""
+    os.killpg(patient.pid, signal.SIGINT)
+    assert patient.wait(60) != 0
+    assert len(list(tmp_path.glob("*.begun"))) == 2 and not list(tmp_path.glob("*.saved"))
+
+
+def wait_for(condition, seconds: float = 60.0) -> None:
+    """Until it holds."""
+    until = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < until
+        time.sleep(0.05)
+
+
+def alive(process: int) -> bool:
+    """Whether it runs; one that has ended may wait for whoever adopted it."""
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
+    except FileNotFoundError:
+        return False
