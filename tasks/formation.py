@@ -111,7 +111,7 @@ class FormationTask(composer.Task):
             self._drag,
             self._force,
         )
-        weaken(self.plan.senses, now, self._force)
+        weaken(self.plan.scenario.imperfections.params(), now, self._force)
         failed = failed or actuate(
             self._body, state.robot[0], self._indices, data.qpos, data.qvel, self._force, scenario.substep, data.ctrl
         )

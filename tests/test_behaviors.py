@@ -6,6 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Behavior, Formation, ObstacleAvoidance, nearest_obstacle
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -24,9 +25,9 @@ def evaluate(behavior: Behavior, p, *, path=None, obstacles=None, agent=0):
     path = np.zeros((2, 2)) if path is None else path
     obstacles = np.zeros((0, 3)) if obstacles is None else obstacles
     velocity, jacobian = np.full(2, np.nan), np.full((2, 2), np.nan)
-    params = np.array(behavior.params(agent), dtype=np.float64)
+    gains = laws.as_gains(behavior.law, behavior.params(agent))
     team = np.tile(p, (4, 1))
-    rows = behavior.law(params, np.array(p, dtype=np.float64), path, obstacles, team, agent, velocity, jacobian)
+    rows = behavior.law(gains, np.array(p, dtype=np.float64), path, obstacles, team, agent, velocity, jacobian)
     return velocity, jacobian[:rows]
 
 

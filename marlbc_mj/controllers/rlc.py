@@ -7,10 +7,9 @@ that its velocity error takes to converge. No convergence theorem is claimed.
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from marlbc_mj.controllers.base import require_gains
 from marlbc_mj.controllers.sorlc import SORLC, sorlc
+from marlbc_mj.core import laws
 
 
 @dataclass(frozen=True)
@@ -36,11 +35,12 @@ class RLC:
 
     @property
     def decay_rates(self) -> tuple[float, ...]:
-        """Of the networks [1/s]."""
+        """Decay rates of the networks [1/s]."""
         return self.networks.decay_rates
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        return (self.position_gain, self.damping, *self.networks.params(agent, limit)[2:])
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        gains = self.networks.params(agent, limit)
+        return {**gains, "position_error_gain": self.position_gain, "velocity_error_gain": self.damping}
 
-    def initial_state(self, agent: int) -> np.ndarray:
+    def initial_state(self, agent: int) -> laws.Numbers:
         return self.networks.initial_state(agent)

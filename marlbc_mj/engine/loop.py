@@ -16,7 +16,7 @@ from numba.extending import register_jitable
 
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE, nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
-from marlbc_mj.core.imperfections import sense, weaken
+from marlbc_mj.core.imperfections import sense, senses_of, weaken
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.nullspace import add_behavior
@@ -204,7 +204,7 @@ def run_substeps(  # type: ignore[no-untyped-def]
         if failed:
             return failed + agents * k
         if senses[2] > 0.0:
-            weaken(senses, t + k * h, force)
+            weaken(senses_of(senses), t + k * h, force)
         failed = actuate(body, robot_state, indices, qpos, qvel, force, h, ctrl)
         if failed:
             return failed + agents * k
@@ -226,7 +226,7 @@ def run_substeps(  # type: ignore[no-untyped-def]
                     record[k, i, 8 + axis] = actuator_force[indices[2, i, axis]] if direct else force[i, axis]
                 p_r[i, axis] += h * v_r[i, axis]
         if sensed.shape[0] > 0:
-            sense(senses, seed, count + k + 1, history, p, v, sensed)
+            sense(senses_of(senses), seed, count + k + 1, history, p, v, sensed)
     return 0
 
 

@@ -128,6 +128,7 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
     model = mujoco.MjModel.from_xml_string(xml)
     agents = range(scenario.agents)
     behavior_laws, behavior_params = behavior_arrays(scenario.behaviors, scenario.agents)
+    gains = [controller.params(i, limit / scenario.unit_force) for i in agents]
     return Plan(
         scenario=scenario,
         controller=controller,
@@ -138,9 +139,9 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         behavior_laws=behavior_laws,
         behavior_params=behavior_params,
         sees=sees_array(scenario.behaviors),
-        controller_params=_padded([[controller.params(i, limit / scenario.unit_force) for i in agents]])[0],
-        initial_state=np.array([controller.initial_state(i) for i in agents], dtype=np.float64),
-        disturbance_params=np.array(scenario.disturbance.params(), dtype=np.float64),
+        controller_params=_padded([[laws.pack_gains(controller.law, one, laws.CONTROLLER) for one in gains]])[0],
+        initial_state=np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in agents]),
+        disturbance_params=laws.pack_gains(scenario.disturbance.law, scenario.disturbance.params(), laws.DISTURBANCE),
         path=np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64),
         settings=np.array(
             [
@@ -154,7 +155,7 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         ),
         robot=robot,
         spans=find_spans(model, scenario),
-        robot_params=np.tile(np.array(robot.params, dtype=np.float64), (scenario.agents, 1)),
+        robot_params=np.tile(robot.params_row(), (scenario.agents, 1)),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
         limits=np.array([scenario.speed_limit, scenario.acceleration_limit, scenario.unit_force]),
         senses=np.array(scenario.imperfections.params(), dtype=np.float64),
@@ -208,9 +209,9 @@ def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndar
     Raises:
         ConfigurationError: a law that is not compiled, or not a behavior's.
     """
-    params = _padded([[b.params(i) for i in range(agents)] for b in behaviors])
+    params = _padded([[laws.pack_gains(b.law, b.params(i), laws.BEHAVIOR) for i in range(agents)] for b in behaviors])
     if numba.config.DISABLE_JIT:
-        return np.array([b.law for b in behaviors], dtype=object), params
+        return np.array([laws.for_team(b.law, laws.BEHAVIOR) for b in behaviors], dtype=object), params
     return np.array([laws.address(b.law, laws.BEHAVIOR) for b in behaviors], dtype=np.uint64), params
 
 
@@ -226,7 +227,7 @@ def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
     return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)
 
 
-def _padded(rows: Sequence[Sequence[Sequence[float]]]) -> np.ndarray:
+def _padded(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """(M, N, P) float64 from ragged numbers, zeros at the end of the shorter ones."""
     width = max(len(numbers) for row in rows for numbers in row)
     out = np.zeros((len(rows), len(rows[0]), width))

@@ -62,7 +62,7 @@ class TeamState:
         self.scratch = np.zeros((worlds, loop.SCRATCH + 2 * agents, 2))
         self.grid = np.zeros((worlds, plan.grid_room))
         imperfections, substep = plan.scenario.imperfections, plan.scenario.substep
-        self.robot = np.zeros((worlds, agents, len(plan.robot.state)))  # the robots' laws' own
+        self.robot = np.zeros((worlds, agents, len(plan.robot.state_row())))  # the robots' laws' own
         self.history = np.zeros((worlds, imperfections.depth(substep), 2, agents, 2))  # p and v, for delays
         self.sensed = np.zeros((worlds, 2 if imperfections.sensing else 0, agents, 2))  # measured p and v, where they differ
         self.noise_seed = np.zeros(worlds, dtype=np.int64)
@@ -80,7 +80,7 @@ class TeamState:
             self.anchors[b], self.motions[b] = draw.obstacles, draw.motions
         self.disturbance_params[b] = self.plan.disturbance_params
         self.disturbance_params[b, 0] *= draw.drag_scale
-        self.robot[b] = self.plan.robot.state
+        self.robot[b] = self.plan.robot.state_row()
         self.noise_seed[b] = rng.integers(2**32)
         self.steps[b] = self.command[b] = self.reward[b] = 0
         self._judge(b)
@@ -117,9 +117,8 @@ class TeamState:
             self._sense(b, int(self.steps[b]) * self.plan.scenario.substeps)
 
     def _sense(self, b: int, count: int) -> None:
-        sense(
-            self.plan.senses, self.noise_seed[b], count, self.history[b], self.position[b], self.velocity[b], self.sensed[b]
-        )  # fmt: skip
+        senses = self.plan.scenario.imperfections.params()
+        sense(senses, self.noise_seed[b], count, self.history[b], self.position[b], self.velocity[b], self.sensed[b])
 
     def after_substep(self, b: int, substep: int) -> None:
         """Measure world ``b`` after its ``substep``-th substep of this mission step, counted from 0."""
@@ -137,7 +136,7 @@ class TeamState:
         self.position[b] = self.reference[b] = position
         self.velocity[b] = self.reference_velocity[b] = velocity
         self.controller[b] = self.plan.initial_state
-        self.robot[b] = self.plan.robot.state
+        self.robot[b] = self.plan.robot.state_row()
         self.steps[b], self.command[b], self.reward[b] = step, command, 0.0
         self._judge(b)
 
