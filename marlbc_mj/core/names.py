@@ -47,10 +47,10 @@ class Names:
 
     def _check(self) -> None:
         for name in self.names:
-            if not name.isidentifier() or hasattr(np.record, name) or hasattr(np.recarray, name):
-                raise ConfigurationError(
-                    f"{name!r} cannot name a law's number: no identifier, or an attribute of NumPy's records"
-                )
+            if not name.isidentifier():
+                raise ConfigurationError(f"{name!r} cannot name a number of a law: it is no identifier")
+            if hasattr(np.record, name) or hasattr(np.recarray, name):
+                raise ConfigurationError(f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name")
             if self.names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} names two numbers of a law")
 
