@@ -98,7 +98,7 @@ def test_one_sided_avoidance_begins_exactly_at_the_safe_distance(excess, angle, 
 
 @given(points, obstacle_fields)
 def test_two_sided_avoidance_attracts_from_beyond(p, obstacles):
-    """The printed equality task: along n the velocity is Lambda (d_OA - d), negative outside (erratum 6)."""
+    """The published equality task: along n the velocity is Lambda (d_OA - d), negative outside (erratum 6)."""
     clearance, normal = clearance_of(p, obstacles)
     velocity, _ = evaluate(ObstacleAvoidance(gain=20.0, safe_distance=2.0, two_sided=True), p, obstacles=obstacles)
     assert velocity @ normal == pytest.approx(20.0 * (2.0 - clearance), rel=1e-9, abs=1e-9)

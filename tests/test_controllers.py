@@ -32,7 +32,7 @@ def start(controller: Controller, agent: int = 0) -> np.ndarray:
 
 
 class Textbook:
-    """One agent's SORLC as printed: (12, 2) weight matrices, one exponential for every Gaussian, explicit Euler."""
+    """One agent's SORLC as published: (12, 2) weight matrices, one exponential for every Gaussian, explicit Euler."""
 
     def __init__(self, gains: SORLC, agent: int) -> None:
         self.gains = gains

@@ -135,7 +135,7 @@ def test_gains_are_packed_in_the_order_of_their_names():
     [
         (laws.pack_gains, {"limit": 1.0, "pul": 2.0}, "law 'named' has no gain named 'pul'; its names: limit, pull"),
         (laws.pack_gains, {"limit": 1.0}, "law 'named' is not given its gain 'pull'; its names: limit, pull"),
-        (laws.pack_gains, (1.0, 2.0, 3.0), r"law 'named' takes gain by name, got \(1.0, 2.0, 3.0\); its names: limit, pull"),
+        (laws.pack_gains, (1.0, 2.0, 3.0), r"law 'named' takes its gains by name, got \(1.0, 2.0, 3.0\); its names: limit, pull"),
         (laws.pack_gains, {"limit": 1.0, "pull": (1, 2, 3)}, r"gain 'pull' of law 'named' has shape \(2,\), got \(3,\)"),
         (laws.pack_state, {"cuont": 1.0}, "law 'named' has no state named 'cuont'; its names: count, memory"),
     ],

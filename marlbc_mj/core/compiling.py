@@ -13,7 +13,7 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
 Law = Callable[..., Any]
-"""A compiled law, or a plain Python function with the same arguments (controllers only)."""
+"""A compiled law, or, of every kind but behaviors, a plain Python function with the same arguments."""
 
 
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:

@@ -49,8 +49,8 @@ from marlbc_mj.core.names import (
     name_of,
     pack_gains,
     pack_state,
+    refuse_undeclared,
     require_kind,
-    undeclared,
 )
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -140,7 +140,6 @@ _ON_ROWS = {
     READING: (TEAM_READING, _reading_team),
 }
 """What the loop calls for each kind of law: its signature, and the template of the function."""
-_WITH_STATE = (CONTROLLER, DRIVE, READING)
 
 
 def _reader(names: Names) -> Law:
@@ -184,15 +183,16 @@ def for_team(law: Law, signature: Any) -> Law:
         try:
             return team(*arguments)
         except (AttributeError, KeyError) as error:
-            raise undeclared(law, error) or error from error
+            refuse_undeclared(law, error)
+            raise
 
     return checked if any(names.shapes for names in interface(law)[1:]) else team
 
 
 def _declare(function: Law, signature: Any, gains: Declared, state: Declared = ()) -> Law:
-    """Compile a law, and for the loop what it calls: an indirect call costs more than most laws, so it makes one per team.
+    """Compile a law, and the team form that the loop calls: an indirect call costs more than most laws, so it makes one per team.
 
-    A law that closes over values stays out of the cache there, as its code says nothing of them.
+    The team form of a law that closes over values is not cached on disk, since numba cannot see those values there.
     """
     vars(function)["interface"] = Interface(signature, Names.of(gains), Names.of(state))
     law: Any = allocation_free(function)
@@ -256,7 +256,8 @@ def address(law: Law, signature: Any) -> int:
         law.compile(_arguments(interface(law)))
         entry.compile(kind.args)
     except KeyError as error:
-        raise undeclared(law, error) or error from error
+        refuse_undeclared(law, error)
+        raise
     except NumbaError as error:
         raise ConfigurationError(f"law {name!r} does not compile as {signature}: {_last_line(error)}") from error
     result = entry.get_compile_result(kind)

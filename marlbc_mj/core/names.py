@@ -50,7 +50,9 @@ class Names:
             if not name.isidentifier():
                 raise ConfigurationError(f"{name!r} cannot name a number of a law: it is no identifier")
             if hasattr(np.record, name) or hasattr(np.recarray, name):
-                raise ConfigurationError(f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name")
+                raise ConfigurationError(
+                    f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name"
+                )
             if self.names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} names two numbers of a law")
 
@@ -71,7 +73,7 @@ class Names:
 
     def at(self, name: str) -> int:
         """Where in the row a field begins."""
-        return int(self.dtype.fields[name][1]) // 8 if self.dtype.fields else 0
+        return int(dict(self.dtype.fields or {})[name][1]) // 8
 
     def view(self, rows: np.ndarray) -> Any:
         """One row (S or more,) as a record with these fields; a stack (..., S) as an array of records.
@@ -108,7 +110,7 @@ class Names:
         """Numbers without names, for a law that declares none."""
         if self.shapes:
             raise ConfigurationError(
-                f"law {owner.law!r} takes {owner.word} by name, got {tuple(numbers)}; its names: {', '.join(self.names)}"
+                f"law {owner.law!r} takes its {owner.word}s by name, got {tuple(numbers)}; its names: {', '.join(self.names)}"
             )
         return np.array(numbers, dtype=np.float64)
 
@@ -199,8 +201,8 @@ def name_of(law: Law) -> str:
     return str(getattr(law, "__name__", repr(law)))
 
 
-def undeclared(law: Law, error: Exception) -> ConfigurationError | None:
-    """The error for a name that a law reads or sets and does not declare; None where the error says something else.
+def refuse_undeclared(law: Law, error: Exception) -> None:
+    """Raise ConfigurationError if an error means that a law uses a name that it does not declare; else do nothing.
 
     NumPy's records say so by AttributeError, numba's compiler by KeyError.
     """
@@ -208,8 +210,8 @@ def undeclared(law: Law, error: Exception) -> ConfigurationError | None:
     wrong = said.group(1) if said else error.args[0] if isinstance(error, KeyError) else None
     declared = interface(law)
     if wrong is None or wrong in (*declared.gains.names, *declared.state.names):
-        return None
+        return
     names = (
         f"{word}: {', '.join(names.names) or 'none'}" for word, names in (("gains", declared.gains), ("state", declared.state))
     )
-    return ConfigurationError(f"law {name_of(law)!r} uses {wrong!r}, which it does not declare; {'; '.join(names)}")
+    raise ConfigurationError(f"law {name_of(law)!r} uses {wrong!r}, which it does not declare; {'; '.join(names)}") from error

@@ -16,7 +16,7 @@ MODELS = Path(str(files("marlbc_mj") / "models"))
 """Folder of the MJCF files; in the repository a link to ``models/``."""
 
 
-def names(law: laws.Law) -> tuple[laws.Names, laws.Names]:
+def _names(law: laws.Law) -> tuple[laws.Names, laws.Names]:
     """Names of a law's gains and state."""
     declared = laws.interface(law)
     return declared.gains, declared.state
@@ -73,7 +73,7 @@ class Robot:
                 raise ConfigurationError(f"robot {self.name!r}: {name} must be positive, got {value}")
         if (self.drive is None) != (self.reading is None):
             raise ConfigurationError(f"robot {self.name!r} has one of drive and reading; it needs both, or neither and motors")
-        if self.drive is not None and self.reading is not None and names(self.drive) != names(self.reading):
+        if self.drive is not None and self.reading is not None and _names(self.drive) != _names(self.reading):
             raise ConfigurationError(f"robot {self.name!r}: drive and reading must declare the same names of gains and state")
         if self.drive is None and len(self.motors) != 2:
             raise ConfigurationError(f"robot {self.name!r} needs two motors, or a drive and a reading; got {self.motors}")
