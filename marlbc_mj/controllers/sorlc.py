@@ -68,7 +68,10 @@ class Weights(NamedTuple):
 def sorlc(gains, state, p, v, p_r, v_r, drag, h, force_out):
     """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler."""
     learning = gains.learns != 0.0 and fill_basis(gains, state, p, v, p_r, v_r)
-    leak = 1.0 - h * gains.identifier_rate * gains.identifier_leak
+    xi_p, xi_v, xi_tau = gains.position_error_gain, gains.velocity_error_gain, gains.compensator_gain
+    gamma_f, gamma_c, gamma_a = gains.identifier_rate, gains.critic_rate, gains.actor_rate
+    half, sign = 0.5 / gains.control_weight, gains.tau_sign
+    leak = 1.0 - h * gamma_f * gains.identifier_leak
     if gains.learns != 0.0 and not learning:
         state.scale *= leak  # (37) with Psi_f = 0 only leaks
     elif state.scale != 1.0:
@@ -80,17 +83,16 @@ def sorlc(gains, state, p, v, p_r, v_r, drag, h, force_out):
         f_hat = dot(w_f, psi_f) if learning else 0.0  # (36)
         actor = dot(w_a, psi_v) if learning else 0.0  # omega_a^T Psi_V of (40), (41)
         critic = dot(w_c, psi_v) if learning else 0.0  # (38)
-        pd = -gains.position_error_gain * e_p - gains.velocity_error_gain * e_v
-        u_0 = pd + gains.tau_sign * tau[axis] + (-f_hat - 0.5 / gains.control_weight * actor)  # (40)
+        u_0 = -xi_p * e_p - xi_v * e_v + sign * tau[axis] + (-f_hat - half * actor)  # (40)
         u = laws.clip(u_0, gains.limit)  # (2)
-        tau[axis] += h * (u - u_0 - gains.compensator_gain * tau[axis])  # (30)
+        tau[axis] += h * (u - u_0 - xi_tau * tau[axis])  # (30)
         force_out[axis] = u
         if not learning:
             continue
         for k in range(NEURONS):
-            w_f[k] = leak * w_f[k] + h * gains.identifier_rate * (e_p + e_v) * psi_f[k]  # (37)
-            w_c[k] -= h * gains.critic_rate * critic * psi_v[k]  # (39)
-            w_a[k] -= h * (gains.actor_rate * (actor - critic) + gains.critic_rate * critic) * psi_v[k]  # (41)
+            w_f[k] = leak * w_f[k] + h * gamma_f * (e_p + e_v) * psi_f[k]  # (37)
+            w_c[k] -= h * gamma_c * critic * psi_v[k]  # (39)
+            w_a[k] -= h * (gamma_a * (actor - critic) + gamma_c * critic) * psi_v[k]  # (41)
 
 
 @laws.allocation_free
