@@ -12,13 +12,12 @@ from marlbc_mj.robots import make_robot
 from marlbc_mj.studies.robot_check import step_scenario
 
 
-@laws.controller
-def pushed(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """A constant force per unit mass up to a time: ``params`` = x, y [m/s^2], until [s]; state: the clock."""
-    on = state[0] < params[2] - 1e-9
-    force_out[0] = params[0] if on else 0.0
-    force_out[1] = params[1] if on else 0.0
-    state[0] += h
+@laws.controller(gains={"acceleration": 2, "until": ()}, state="clock")
+def pushed(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """A constant force per unit mass [m/s^2] up to a time [s]."""
+    for axis in range(2):
+        force_out[axis] = gains.acceleration[axis] if state.clock < gains.until - 1e-9 else 0.0
+    state.clock += h
 
 
 @dataclass(frozen=True)
@@ -32,10 +31,10 @@ class Push:
     law = staticmethod(pushed)
 
     def params(self, agent, limit):
-        return *self.acceleration, self.until
+        return laws.gains_of(self)
 
     def initial_state(self, agent):
-        return np.zeros(1)
+        return {}
 
 
 def push(name: str, acceleration: tuple[float, float], until: float, duration: float, drag: float = 0.0, **changes: Any):

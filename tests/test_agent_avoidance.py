@@ -8,6 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import AgentAvoidance
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -24,8 +25,8 @@ PATH = np.array([[0.0, 0.0], [1.0, -0.5]])
 def evaluate(team: np.ndarray, agent: int, behavior: AgentAvoidance):
     """Rows, velocity and Jacobian of one agent."""
     velocity, jacobian = np.full(2, np.nan), np.full((2, 2), np.nan)
-    params = np.array(behavior.params(agent), dtype=np.float64)
-    rows = behavior.law(params, team[agent], PATH, np.zeros((0, 3)), team, agent, velocity, jacobian)
+    gains = laws.as_gains(behavior.law, behavior.params(agent))
+    rows = behavior.law(gains, team[agent], PATH, np.zeros((0, 3)), team, agent, velocity, jacobian)
     return rows, velocity, jacobian
 
 

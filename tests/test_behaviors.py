@@ -6,6 +6,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Behavior, Formation, ObstacleAvoidance, nearest_obstacle
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -24,9 +25,9 @@ def evaluate(behavior: Behavior, p, *, path=None, obstacles=None, agent=0):
     path = np.zeros((2, 2)) if path is None else path
     obstacles = np.zeros((0, 3)) if obstacles is None else obstacles
     velocity, jacobian = np.full(2, np.nan), np.full((2, 2), np.nan)
-    params = np.array(behavior.params(agent), dtype=np.float64)
+    gains = laws.as_gains(behavior.law, behavior.params(agent))
     team = np.tile(p, (4, 1))
-    rows = behavior.law(params, np.array(p, dtype=np.float64), path, obstacles, team, agent, velocity, jacobian)
+    rows = behavior.law(gains, np.array(p, dtype=np.float64), path, obstacles, team, agent, velocity, jacobian)
     return velocity, jacobian[:rows]
 
 
@@ -97,7 +98,7 @@ def test_one_sided_avoidance_begins_exactly_at_the_safe_distance(excess, angle, 
 
 @given(points, obstacle_fields)
 def test_two_sided_avoidance_attracts_from_beyond(p, obstacles):
-    """The printed equality task: along n the velocity is Lambda (d_OA - d), negative outside (erratum 6)."""
+    """The published equality task: along n the velocity is Lambda (d_OA - d), negative outside (erratum 6)."""
     clearance, normal = clearance_of(p, obstacles)
     velocity, _ = evaluate(ObstacleAvoidance(gain=20.0, safe_distance=2.0, two_sided=True), p, obstacles=obstacles)
     assert velocity @ normal == pytest.approx(20.0 * (2.0 - clearance), rel=1e-9, abs=1e-9)

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.controllers import CONTROLLERS, PD, SORLC, Controller, largest_stable_substep, make_controller
-from marlbc_mj.controllers.sorlc import NEURONS, weights
+from marlbc_mj.controllers.sorlc import NEURONS, STATE, weights
+from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError
 
 H = 0.005  # [s]
@@ -17,14 +18,21 @@ BASIS_TOLERANCE = 2e-13
 
 
 def call(controller: Controller, state, p, v, p_r, v_r, *, limit=200.0, h=H, agent=0) -> np.ndarray:
-    params = np.array(controller.params(agent, limit), dtype=np.float64)
-    force = np.full(2, np.nan)
-    controller.law(params, state, p, v, p_r, v_r, ZERO, h, force)
+    """Force of one substep; ``state`` is the law's row, which it changes."""
+    law, force = controller.law, np.full(2, np.nan)
+    law(
+        laws.as_gains(law, controller.params(agent, limit)), laws.interface(law).state.view(state), p, v, p_r, v_r, ZERO, h, force
+    )
     return force
 
 
+def start(controller: Controller, agent: int = 0) -> np.ndarray:
+    """The row of a law's state at t = 0."""
+    return laws.pack_state(controller.law, controller.initial_state(agent))
+
+
 class Textbook:
-    """One agent's SORLC as printed: (12, 2) weight matrices, one exponential for every Gaussian, explicit Euler."""
+    """One agent's SORLC as published: (12, 2) weight matrices, one exponential for every Gaussian, explicit Euler."""
 
     def __init__(self, gains: SORLC, agent: int) -> None:
         self.gains = gains
@@ -84,7 +92,7 @@ def test_sorlc_is_the_textbook_law(basis, tau_sign):
         gains = SORLC.scaled(tau_sign=tau_sign) if basis == "scaled" else SORLC(basis=basis, tau_sign=tau_sign)
     rng = np.random.default_rng(0)
     agent, limit = 2, 150.0
-    textbook, state = Textbook(gains, agent), gains.initial_state(agent)
+    textbook, state = Textbook(gains, agent), start(gains, agent)
     saturated = 0
     for _ in range(2000):
         p, v = rng.uniform(-4, 4, 2), rng.uniform(-4, 4, 2)
@@ -105,7 +113,7 @@ def test_sorlc_off_is_pd_with_the_compensator():
     """Without networks: u = clip(-100 e_p - 100 e_v - tau), and plain PD as long as nothing saturates."""
     rng = np.random.default_rng(1)
     off, pd = SORLC(basis="off"), PD()
-    state = off.initial_state(0)
+    state = start(off)
     for _ in range(200):
         p, v, p_r, v_r = rng.uniform(-0.4, 0.4, (4, 2))
         np.testing.assert_allclose(call(off, state, p, v, p_r, v_r), call(pd, np.zeros(0), p, v, p_r, v_r), rtol=1e-14)
@@ -115,7 +123,7 @@ def test_sorlc_off_is_pd_with_the_compensator():
 def test_far_from_its_centres_the_printed_basis_is_silent():
     """Positions beyond [-6, 6]: Psi = 0, actor and critic stand still and the identifier only leaks (erratum 13)."""
     gains = SORLC()
-    state = gains.initial_state(0)
+    state = start(gains)
     p = np.array([100.0, 6.0])
     force = call(gains, state, p, ZERO, p - 0.1, ZERO)
     np.testing.assert_allclose(force, [-10.0, -10.0], rtol=1e-12)
@@ -127,7 +135,7 @@ def test_far_from_its_centres_the_printed_basis_is_silent():
 def gaussians_of(gains: SORLC, p, v) -> np.ndarray:
     """Psi_f(chi), read off one identifier step (37) from zero weights without leak, with h Gamma_f (e_p + e_v) = 1."""
     gains = replace(gains, identifier_weights=(0.0,), identifier_leak=0.0, identifier_rate=1.0 / H)
-    state = gains.initial_state(0)
+    state = start(gains)
     call(gains, state, p, v, p - 0.5, v - 0.5)
     return weights(state).identifier
 
@@ -160,7 +168,7 @@ def test_narrow_gaussians_are_right_or_refused(width):
 def test_compensator_under_constant_saturation(tau_sign):
     """At the limit L: tau_k = (L - w) (1 - (1 - h (xi_tau + s))^k) / (xi_tau + s), s the sign of tau in (40), w = u_0 - s tau."""
     gains = SORLC(basis="off", tau_sign=tau_sign)
-    state = gains.initial_state(0)
+    state = start(gains)
     p = np.array([-5.0, 7.0])
     wish, limit = -100.0 * p, np.array([200.0, -200.0])
     rate = gains.compensator_gain + tau_sign
@@ -174,8 +182,8 @@ def test_compensator_under_constant_saturation(tau_sign):
 def test_tau_decays_once_the_input_is_free():
     """tau_{k+1} = (1 - h xi_tau) tau_k without saturation (30)."""
     gains = SORLC(basis="off")
-    state = gains.initial_state(0)
-    state[-2:] = (1.0, -2.0)
+    state = start(gains)
+    STATE.view(state).tau[:] = (1.0, -2.0)
     for k in range(1, 50):
         call(gains, state, ZERO, ZERO, ZERO, ZERO)
         np.testing.assert_allclose(weights(state).tau, np.array([1.0, -2.0]) * (1.0 - 50.0 * H) ** k, rtol=1e-12)
@@ -263,8 +271,8 @@ def test_every_named_controller_keeps_the_protocol(name):
     """Factory, law, finite parameters for any agent, a state that belongs to the caller."""
     controller = make_controller(name)
     assert isinstance(controller, Controller)
-    assert np.isfinite(controller.params(7, 200.0)).all()
-    first, second = controller.initial_state(0), controller.initial_state(0)
+    assert np.isfinite(laws.pack_gains(controller.law, controller.params(7, 200.0))).all()
+    first, second = start(controller), start(controller)
     assert first is not second and (first == second).all()
     force = call(controller, first, np.ones(2), ZERO, ZERO, ZERO)
     assert (force < 0).all() and (np.abs(force).max() <= 200.0 or not controller.limited)
@@ -273,6 +281,6 @@ def test_every_named_controller_keeps_the_protocol(name):
 def test_weights_start_as_the_paper_fills_them():
     """Table of section 4.1: constant matrices, agent by agent; tau(0) = 0."""
     for agent, (f, a, c) in enumerate([(1, 0.5, 1), (0.98, 0.48, 0.96), (0.96, 0.46, 0.92), (0.94, 0.44, 0.88)]):
-        w_f, w_a, w_c, tau = weights(SORLC().initial_state(agent))
+        w_f, w_a, w_c, tau = weights(start(SORLC(), agent))
         assert w_f.shape == w_a.shape == w_c.shape == (12, 2)
         assert (w_f == f).all() and (w_a == a).all() and (w_c == c).all() and not tau.any()

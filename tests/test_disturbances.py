@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from marlbc_mj.core import laws
 from marlbc_mj.core.disturbances import ConstantWind, LinearDrag, PaperDrag, QuadraticDrag
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -29,7 +30,7 @@ CLOSED_FORMS = [
 
 def force_of(disturbance, p, v, t=0.0) -> np.ndarray:
     out = np.full(2, np.nan)
-    disturbance.law(np.array(disturbance.params(), dtype=np.float64), t, p, v, out)
+    disturbance.law(laws.as_gains(disturbance.law, disturbance.params()), t, p, v, out)
     return out
 
 
@@ -57,9 +58,9 @@ def test_passive_drag_takes_energy(kind, v):
 
 
 @pytest.mark.parametrize("kind", [kind for kind, _, _ in CLOSED_FORMS])
-def test_params_begin_with_the_scale(kind):
-    """``params()[0]`` is what a perturbation draw multiplies."""
-    assert kind(scale=0.25).params()[0] == 0.25
+def test_gains_begin_with_the_scale(kind):
+    """The first number of the row is what a perturbation draw multiplies."""
+    assert laws.pack_gains(kind.law, kind(scale=0.25).params())[0] == 0.25
     assert not force_of(kind(scale=0.0), np.ones(2), np.ones(2)).any()
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.controllers import PD, SORLC, make_controller
-from marlbc_mj.controllers.pd import pd
+from marlbc_mj.controllers.lqr import state_feedback
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation, ObstacleAvoidance
 from marlbc_mj.core.disturbances import PaperDrag, constant_wind, linear_drag
@@ -538,7 +538,7 @@ def test_a_learners_batch_takes_a_plain_python_law_too():
     ("scenario", "controller", "name"),
     [
         (paper(), replace(UserPD(), law=linear_drag), "linear_drag"),
-        (paper(disturbance=Pulse(law=pd)), PD(), "pd"),
+        (paper(disturbance=Pulse(law=state_feedback)), PD(), "state_feedback"),
         (user_scenario(behaviors=(Line(3.0, law=constant_wind), *paper().behaviors)), PD(), "constant_wind"),
     ],
 )

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.core.disturbances import LinearDrag, WindGusts
 from marlbc_mj.core.motion import moved
@@ -356,7 +357,7 @@ def test_gusts_depend_on_time_and_seed_alone(seed, t, scale):
 
     def force(gusts: WindGusts, p: float = 0.0) -> np.ndarray:
         out = np.empty(2)
-        gusts.law(np.array(gusts.params()), t, np.full(2, p), np.full(2, p), out)
+        gusts.law(laws.as_gains(gusts.law, gusts.params()), t, np.full(2, p), np.full(2, p), out)
         return out
 
     np.testing.assert_array_equal(force(WindGusts(seed=seed)), force(WindGusts(seed=seed), 3.0))
@@ -371,7 +372,7 @@ def test_gusts_have_the_strength_and_the_mean_that_they_say():
     gusts, out = WindGusts(steady=(3.0, -1.0), strength=8.0, seed=5), np.empty(2)
     rows = []
     for t in np.arange(0.0, 3600.0, 0.5):
-        gusts.law(np.array(gusts.params()), t, np.zeros(2), np.zeros(2), out)
+        gusts.law(laws.as_gains(gusts.law, gusts.params()), t, np.zeros(2), np.zeros(2), out)
         rows.append(out.copy())
     np.testing.assert_allclose(np.mean(rows, axis=0), (3.0, -1.0), atol=0.3)
     np.testing.assert_allclose(np.std(rows, axis=0), 8.0, rtol=0.1)

@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.controllers import SORLC
+from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import ObstacleAvoidance, clearances
 from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.core.motion import MOVING, drift, move, moved, obstacles_at
@@ -63,8 +64,8 @@ def test_avoidance_keeps_its_rate_relative_to_an_obstacle_that_moves(vx, vy, x, 
     p, velocity, jacobian = (2.0 - error + 1.0) * normal, np.empty(2), np.empty((2, 2))
     disc = np.array([[0.0, 0.0, 1.0, vx, vy]])
     behavior = ObstacleAvoidance()
-    law, params = behavior.law, np.array(behavior.params(0))
-    assert law(params, p, np.zeros((2, 2)), disc, np.zeros((2, 2)), 0, velocity, jacobian) == 1
+    law, gains = behavior.law, laws.as_gains(behavior.law, behavior.params(0))
+    assert law(gains, p, np.zeros((2, 2)), disc, np.zeros((2, 2)), 0, velocity, jacobian) == 1
     assert jacobian[0] @ (velocity - [vx, vy]) == pytest.approx(20.0 * error, abs=1e-6)
 
 

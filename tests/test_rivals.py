@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from marlbc_mj.controllers import CONTROLLERS, LQR, FiniteTime, PredefinedTime, TerminalSliding, make_controller
 from marlbc_mj.controllers.lqr import riccati_gains
+from marlbc_mj.core import laws
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.results.metrics import convergence_time, measure
@@ -80,7 +81,9 @@ def test_every_law_is_its_formula(name, e_p, e_v, drag):
     p, v = np.array([60.0, 70.0]), np.array([3.0, -4.0])
     p_r, v_r = p - e_p, v - e_v
     f, force = np.array([drag, -0.5 * drag]), np.full(2, np.nan)
-    controller.law(np.array(controller.params(0, limit)), controller.initial_state(0), p, v, p_r, v_r, f, H, force)
+    law = controller.law
+    gains, state = laws.as_gains(law, controller.params(0, limit)), laws.as_state(law, controller.initial_state(0))
+    law(gains, state, p, v, p_r, v_r, f, H, force)
     wish = np.array([FORMULAS[bare](x, y) for x, y in zip(p - p_r, v - v_r, strict=True)]) - (f if bare in EXACT else 0.0)
     np.testing.assert_allclose(force, np.clip(wish, -limit, limit), rtol=1e-12, atol=1e-11)
 
@@ -97,11 +100,11 @@ def test_sliding_and_predefined_time_laws_are_odd_and_finite(e_p, e_v):
     """u(-e) = -u(e), far beyond the 96 m/s of the largest jump of v_r."""
     zero = np.zeros(2)
     for controller in (TerminalSliding(), PredefinedTime()):
-        params, state = np.array(controller.params(0, np.inf)), np.zeros(0)
+        gains, state = laws.as_gains(controller.law, controller.params(0, np.inf)), np.zeros(0)
         forces = []
         for sign in (1.0, -1.0):
             force = np.empty(2)
-            controller.law(params, state, np.full(2, sign * e_p), np.full(2, sign * e_v), zero, zero, zero, H, force)
+            controller.law(gains, state, np.full(2, sign * e_p), np.full(2, sign * e_v), zero, zero, zero, H, force)
             forces.append(force)
         assert np.isfinite(forces).all() and (forces[0] == -forces[1]).all()
 
@@ -110,9 +113,9 @@ def test_sliding_and_predefined_time_laws_are_odd_and_finite(e_p, e_v):
 def test_linear_gains_bound_the_predefined_time_law(layer, power, exponent_limit):
     """Phi(x) <= slope x everywhere: the step-size check is on the safe side."""
     controller = PredefinedTime(layer=layer, power=power, exponent_limit=exponent_limit)
-    params, zero, force = np.array(controller.params(0, np.inf)), np.zeros(2), np.empty(2)
+    gains, zero, force = laws.as_gains(controller.law, controller.params(0, np.inf)), np.zeros(2), np.empty(2)
     for e_v in np.geomspace(1e-4, 1e3, 60):
-        controller.law(params, np.zeros(0), zero, np.array([e_v, -e_v]), zero, zero, zero, H, force)
+        controller.law(gains, np.zeros(0), zero, np.array([e_v, -e_v]), zero, zero, zero, H, force)
         assert np.abs(force).max() <= controller.linear_gains[1] * e_v * (1 + 1e-12)
 
 

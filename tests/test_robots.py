@@ -163,11 +163,11 @@ def test_crazyflie_has_the_measured_numbers_and_keeps_its_thrust_limits():
     least, most = data.actuator_force.min(), data.actuator_force.max()
     assert drone["thrust_min"] * (1 - 1e-5) <= least < most <= drone["thrust_max"] * (1 + 1e-5)
     robot = make_robot("crazyflie")
-    state, ctrl = np.array(robot.state), np.zeros(4)
+    gains, state, ctrl = laws.as_gains(robot.drive, robot.params), laws.as_state(robot.drive, robot.state), np.zeros(4)
     deep = np.array([0.0, 0.0, -5.0, 1.0, 0.0, 0.0, 0.0])
     for _ in range(200):
-        robot.drive(np.array(robot.params), state, deep, np.zeros(6), np.zeros(2), 0.0025, ctrl)
-    assert (ctrl == drone["thrust_max"]).all() and state[robot.diagnostics["saturated"]] > 100
+        robot.drive(gains, state, deep, np.zeros(6), np.zeros(2), 0.0025, ctrl)
+    assert (ctrl == drone["thrust_max"]).all() and state.saturated > 100
 
 
 # One law, three paths ----------------------------------------------------------------------------------------------------------

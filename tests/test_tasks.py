@@ -10,6 +10,7 @@ from dm_env import specs
 
 from marlbc_mj import tasks
 from marlbc_mj.controllers import SORLC
+from marlbc_mj.core.laws import plain
 from marlbc_mj.engine.assembly import assemble
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, paper
@@ -76,7 +77,7 @@ def test_plain_python_controller_runs() -> None:
     """A controller that is not compiled gives the same episode as the compiled one."""
 
     class Plain(SORLC):
-        law = staticmethod(getattr(SORLC.law, "py_func", SORLC.law))
+        law = staticmethod(plain(SORLC.law))
 
     finals = []
     for controller in (SORLC(), Plain()):

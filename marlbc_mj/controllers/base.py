@@ -27,12 +27,12 @@ class Controller(Protocol):
         """Largest position and velocity gain [1/s^2, 1/s] per unit mass, for the step-size check; None if unbounded."""
         ...
 
-    def params(self, agent: int, limit: float) -> Sequence[float]:
-        """Numbers handed to the law as ``params``; ``limit`` [N] is the actuator's, infinite when unlimited."""
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        """The law's gains by name; ``limit`` [N] is the actuator's, infinite when unlimited. See :func:`laws.gains_of`."""
         ...
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        """(S,) controller state at t = 0, weights for example."""
+    def initial_state(self, agent: int) -> laws.Numbers:
+        """The law's state at t = 0 by name, weights for example; what is left out starts at 0."""
         ...
 
 

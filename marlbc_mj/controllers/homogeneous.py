@@ -14,28 +14,45 @@ import numpy as np
 from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.core import laws
 
+GAINS = (
+    "model_weight",  # of f^
+    "velocity_gain",  # a
+    "position_gain",  # b
+    "position_power",  # q, below 1
+    "outer_position_gain",  # c
+    "outer_position_power",  # r, above 1
+    "bounded_power",  # s
+    "outer_velocity_gain",  # d
+    "outer_velocity_power",  # t, above 1
+    "limit",  # [N]
+)
+
 
 @laws.inlined
-def sig(x, power):  # type: ignore[no-untyped-def]
+def sig(x, power):
     """sign(x) |x|^power."""
     return np.sign(x) * abs(x) ** power
 
 
-@laws.controller
-def homogeneous(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
-    """u = -f^ - a e_v - b sig(e_p)^q - c sig(e_p)^r - phi_s(e_v) - d sig(e_v)^t, then the limit; no state.
+@laws.inlined
+def phi(x, power):
+    """sign(x) min(|x|, 1)^power."""
+    return np.sign(x) * (abs(x) if abs(x) < 1.0 else 1.0) ** power
 
-    ``params`` = weight of f^, a, b, q, c, r, s, d, t, limit [N].
-    """
+
+@laws.controller(gains=GAINS)
+def homogeneous(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """u = -f^ - a e_v - b sig(e_p)^q - phi_s(e_v) - c sig(e_p)^r - d sig(e_v)^t, then the limit; no state."""
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
-        bounded = np.sign(e_v) * (abs(e_v) if abs(e_v) < 1.0 else 1.0) ** params[6]
-        wish = -params[0] * drag[axis] - params[1] * e_v - params[2] * sig(e_p, params[3]) - bounded
-        if params[4] != 0.0:
-            wish -= params[4] * sig(e_p, params[5])
-        if params[7] != 0.0:
-            wish -= params[7] * sig(e_v, params[8])
-        force_out[axis] = laws.clip(wish, params[9])
+        wish = -gains.model_weight * drag[axis] - gains.velocity_gain * e_v
+        wish -= gains.position_gain * sig(e_p, gains.position_power)
+        wish -= phi(e_v, gains.bounded_power)
+        if gains.outer_position_gain != 0.0:
+            wish -= gains.outer_position_gain * sig(e_p, gains.outer_position_power)
+        if gains.outer_velocity_gain != 0.0:
+            wish -= gains.outer_velocity_gain * sig(e_v, gains.outer_velocity_power)
+        force_out[axis] = laws.clip(wish, gains.limit)
 
 
 @dataclass(frozen=True)
@@ -53,8 +70,8 @@ class _Homogeneous:
         """Unbounded near zero: powers below 1 have no largest gain."""
         return
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        return np.zeros(0)
+    def initial_state(self, agent: int) -> laws.Numbers:
+        return {}
 
 
 @dataclass(frozen=True)
@@ -68,9 +85,10 @@ class FiniteTime(_Homogeneous):
     velocity_gain: float = 8.0  # [1/s]
     position_gain: float = 4.0
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        weight = model_weight(self.model)
-        return weight, self.velocity_gain, self.position_gain, 0.6, 0.0, 1.0, 0.75, 0.0, 1.0, limit
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        outer = {"outer_position_gain": 0.0, "outer_position_power": 1.0, "outer_velocity_gain": 0.0, "outer_velocity_power": 1.0}
+        powers = {"position_power": 0.6, "bounded_power": 0.75, **outer}
+        return laws.gains_of(self, limit=limit, model_weight=model_weight(self.model), **powers)
 
 
 @dataclass(frozen=True)
@@ -86,6 +104,7 @@ class FixedTime(_Homogeneous):
     outer_position_gain: float = 1.0
     outer_velocity_gain: float = 0.02
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        outer = self.outer_position_gain, 1.4, 0.75, self.outer_velocity_gain, 7.0 / 6.0, limit
-        return model_weight(self.model), self.velocity_gain, self.position_gain, 0.6, *outer
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        outer = {"outer_position_power": 1.4, "outer_velocity_power": 7.0 / 6.0}
+        powers = {"position_power": 0.6, "bounded_power": 0.75, **outer}
+        return laws.gains_of(self, limit=limit, model_weight=model_weight(self.model), **powers)

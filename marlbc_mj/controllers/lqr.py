@@ -9,20 +9,20 @@ from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.core import laws
 
 
-@laws.controller
-def state_feedback(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
-    """u = clip(-w f - k_p e_p - k_v e_v, +-limit); ``params`` = w, k_p, k_v, limit; no state."""
+@laws.controller(gains=("model_weight", "position_gain", "velocity_gain", "limit"))
+def state_feedback(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """u = clip(-w f - k_p e_p - k_v e_v, +-limit), w the model weight; no state."""
     for axis in range(2):
-        wish = -params[0] * drag[axis] - params[1] * (p[axis] - p_r[axis]) - params[2] * (v[axis] - v_r[axis])
-        force_out[axis] = laws.clip(wish, params[3])
+        e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
+        wish = -gains.model_weight * drag[axis] - gains.position_gain * e_p - gains.velocity_gain * e_v
+        force_out[axis] = laws.clip(wish, gains.limit)
 
 
 def riccati_gains(state_weight: float, control_weight: float) -> tuple[float, float]:
     """(k_p, k_v) that minimise the integral of alpha |e|^2 + beta |u|^2 for e_p' = e_v, e_v' = u.
 
-    The algebraic Riccati equation has the closed solution k_p = sqrt(alpha/beta), k_v = sqrt(alpha/beta + 2 k_p); (1, sqrt
-    3) for the
-    paper's weights.
+    The algebraic Riccati equation has the closed solution k_p = sqrt(alpha/beta), k_v = sqrt(alpha/beta + 2 k_p);
+    (1, sqrt 3) for the paper's weights.
     """
     k_p = float(np.sqrt(state_weight / control_weight))
     return k_p, float(np.sqrt(state_weight / control_weight + 2.0 * k_p))
@@ -46,8 +46,9 @@ class LQR:
     def linear_gains(self) -> tuple[float, float]:
         return riccati_gains(self.state_weight, self.control_weight)
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        return (model_weight(self.model), *self.linear_gains, limit)
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        k_p, k_v = self.linear_gains
+        return {"model_weight": model_weight(self.model), "position_gain": k_p, "velocity_gain": k_v, "limit": limit}
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        return np.zeros(0)
+    def initial_state(self, agent: int) -> laws.Numbers:
+        return {}

@@ -22,7 +22,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 @laws.allocation_free
-def predefined(x, power, time, exponent_limit, layer):  # type: ignore[no-untyped-def]
+def predefined(x, power, time, exponent_limit, layer):
     """Phi(x) = exp(min(|x|^m, limit)) sig(x)^(1 - m) / (m T), linear through zero for |x| below the layer."""
     size = abs(x) if abs(x) > layer else layer
     exponent = size**power
@@ -31,18 +31,28 @@ def predefined(x, power, time, exponent_limit, layer):  # type: ignore[no-untype
     return np.exp(exponent) * size ** (-power) * x / (power * time)
 
 
-@laws.controller
-def predefined_time(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
-    """u = -w f - b Phi(sigma / b; m, T_s), sigma = e_v + a Phi(e_p / a; m, T_p), then the limit; no state.
-
-    ``params`` = w, T_p [s], T_s [s], m, a [m], b [m/s], largest exponent, layer, limit [N].
-    """
-    power, top, layer = params[3], params[6], params[7]
+@laws.controller(
+    gains=(
+        "model_weight",  # w
+        "position_time",  # T_p [s]
+        "velocity_time",  # T_s [s]
+        "power",  # m
+        "position_scale",  # a [m]
+        "velocity_scale",  # b [m/s]
+        "exponent_limit",
+        "layer",
+        "limit",  # [N]
+    )
+)
+def predefined_time(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """u = -w f - b Phi(sigma / b; m, T_s), sigma = e_v + a Phi(e_p / a; m, T_p), then the limit; no state."""
+    power, top, layer = gains.power, gains.exponent_limit, gains.layer
+    a, b = gains.position_scale, gains.velocity_scale
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
-        sigma = e_v + params[4] * predefined(e_p / params[4], power, params[1], top, layer)
-        wish = -params[0] * drag[axis] - params[5] * predefined(sigma / params[5], power, params[2], top, layer)
-        force_out[axis] = laws.clip(wish, params[8])
+        sigma = e_v + a * predefined(e_p / a, power, gains.position_time, top, layer)
+        wish = -gains.model_weight * drag[axis] - b * predefined(sigma / b, power, gains.velocity_time, top, layer)
+        force_out[axis] = laws.clip(wish, gains.limit)
 
 
 @dataclass(frozen=True)
@@ -79,9 +89,8 @@ class PredefinedTime:
         end = max(self.exponent_limit, at)
         return float(max(np.exp(min(at, end)) / at, np.exp(end) / end) / (self.power * time))
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        scales = self.position_scale, self.velocity_scale, self.exponent_limit, self.layer, limit
-        return model_weight(self.model), self.position_time, self.velocity_time, self.power, *scales
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        return laws.gains_of(self, limit=limit, model_weight=model_weight(self.model))
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        return np.zeros(0)
+    def initial_state(self, agent: int) -> laws.Numbers:
+        return {}

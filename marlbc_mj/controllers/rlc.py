@@ -1,23 +1,22 @@
 """RLC, the single-agent reinforcement learning controller that SORLC is compared with (Zhang et al. 2022), reconstructed.
 
 u = -xi_p e_p - f^ - omega_a^T Psi_V / 2 - c e_v: SORLC's law without compensator and limit, and with next to no damping.
-The cited law has no velocity error at all, which leaves the loop undamped; c = 2.35 is what reproduces the printed 3.4 s
+The cited law has no velocity error at all, which leaves the loop undamped; c = 2.35 is what reproduces the published 3.4 s
 that its velocity error takes to converge. No convergence theorem is claimed.
 """
 
 from dataclasses import dataclass, field
 
-import numpy as np
-
 from marlbc_mj.controllers.base import require_gains
 from marlbc_mj.controllers.sorlc import SORLC, sorlc
+from marlbc_mj.core import laws
 
 
 @dataclass(frozen=True)
 class RLC:
-    """Identifier, actor and critic as in SORLC with the printed basis.
+    """Identifier, actor and critic as in SORLC with the basis ``printed``.
 
-    Source: ``position_gain`` and the networks from Table 2; ``damping`` fitted to the printed time of convergence.
+    Source: ``position_gain`` and the networks from Table 2; ``damping`` fitted to the published time of convergence.
     """
 
     position_gain: float = 100.0  # xi_p [1/s^2]
@@ -36,11 +35,12 @@ class RLC:
 
     @property
     def decay_rates(self) -> tuple[float, ...]:
-        """Of the networks [1/s]."""
+        """Decay rates of the networks [1/s]."""
         return self.networks.decay_rates
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        return (self.position_gain, self.damping, *self.networks.params(agent, limit)[2:])
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        gains = self.networks.params(agent, limit)
+        return {**gains, "position_error_gain": self.position_gain, "velocity_error_gain": self.damping}
 
-    def initial_state(self, agent: int) -> np.ndarray:
+    def initial_state(self, agent: int) -> laws.Numbers:
         return self.networks.initial_state(agent)

@@ -6,7 +6,7 @@ exponentials give all twelve values, equal to the textbook form to 1e-13.
 """
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -15,9 +15,41 @@ from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 NEURONS = 12
-_F, _A, _C, _PSI_F, _PSI_V, _SCALE = (row * NEURONS for row in (0, 2, 4, 6, 7, 8))  # offsets in the state; weights axis by axis
-_TAU = _SCALE + 1  # omega_f is the stored numbers times state[_SCALE]: a leak of them all is one multiplication
-STATE_SIZE = _TAU + 2
+GAINS = laws.Names.of(
+    (
+        "position_error_gain",  # xi_p [1/s^2]
+        "velocity_error_gain",  # xi_v [1/s]
+        "compensator_gain",  # xi_tau [1/s]
+        "identifier_rate",  # Gamma_f = rate * I [1/s]
+        "identifier_leak",  # nu_f
+        "critic_rate",  # gamma_c [1/s]
+        "actor_rate",  # gamma_a [1/s]
+        "control_weight",  # beta_V
+        "tau_sign",  # of tau in (40)
+        "limit",  # [N]
+        "learns",  # 0: no networks
+        "relative",  # 1: the basis gets errors over the scales below instead of p and v
+        "position_scale",  # [m]
+        "velocity_scale",  # [m/s]
+        "tau_scale",  # [N]
+        "first_centre",
+        "centre_distance",
+        "precision",  # 1 / width^2
+        "chi_factor",  # of diagonal_gaussians for the 4 numbers of chi
+        "tau_factor",  # and for the 2 of tau
+    )
+)
+STATE = laws.Names.of(
+    {
+        "w_f": (2, NEURONS),  # omega_f [N] of each axis, but for ``scale``
+        "w_a": (2, NEURONS),  # omega_a [N]
+        "w_c": (2, NEURONS),  # omega_c [N]
+        "psi_f": NEURONS,  # Psi_f(chi) of this substep
+        "psi_v": NEURONS,  # Psi_V(chi, tau)
+        "scale": (),  # omega_f = scale * w_f: a leak of all weights at once is one multiplication
+        "tau": 2,  # compensator [N] of each axis
+    }
+)
 
 BASES = ("printed", "scaled", "off")
 NEGLIGIBLE = 45.0  # exp(-45) = 3e-20 is taken as zero
@@ -32,14 +64,81 @@ class Weights(NamedTuple):
     tau: np.ndarray  # (2,) compensator of (30)
 
 
-@laws.allocation_free
-def diagonal_gaussians(square, total, n, first, step, precision, factor, out, at):  # type: ignore[no-untyped-def]
-    """exp(-precision |z - c_k 1|^2) for c_k = first + k step, from |z|^2, sum(z) and the dimension n of z.
+@laws.controller(gains=GAINS, state=STATE)
+def sorlc(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler."""
+    learning = gains.learns != 0.0 and fill_basis(gains, state, p, v, p_r, v_r)
+    xi_p, xi_v, xi_tau = gains.position_error_gain, gains.velocity_error_gain, gains.compensator_gain
+    gamma_f, gamma_c, gamma_a = gains.identifier_rate, gains.critic_rate, gains.actor_rate
+    half, sign = 0.5 / gains.control_weight, gains.tau_sign
+    leak = 1.0 - h * gamma_f * gains.identifier_leak
+    if gains.learns != 0.0 and not learning:
+        state.scale *= leak  # (37) with Psi_f = 0 only leaks
+    elif state.scale != 1.0:
+        unscale(state)
+    psi_f, psi_v, tau = state.psi_f, state.psi_v, state.tau
+    for axis in range(2):
+        e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]  # (18), (19)
+        w_f, w_a, w_c = state.w_f[axis], state.w_a[axis], state.w_c[axis]
+        f_hat = dot(w_f, psi_f) if learning else 0.0  # (36)
+        actor = dot(w_a, psi_v) if learning else 0.0  # omega_a^T Psi_V of (40), (41)
+        critic = dot(w_c, psi_v) if learning else 0.0  # (38)
+        u_0 = -xi_p * e_p - xi_v * e_v + sign * tau[axis] + (-f_hat - half * actor)  # (40)
+        u = laws.clip(u_0, gains.limit)  # (2)
+        tau[axis] += h * (u - u_0 - xi_tau * tau[axis])  # (30)
+        force_out[axis] = u
+        if not learning:
+            continue
+        for k in range(NEURONS):
+            w_f[k] = leak * w_f[k] + h * gamma_f * (e_p + e_v) * psi_f[k]  # (37)
+            w_c[k] -= h * gamma_c * critic * psi_v[k]  # (39)
+            w_a[k] -= h * (gamma_a * (actor - critic) + gamma_c * critic) * psi_v[k]  # (41)
 
-    ``precision`` = 1 / width^2, ``factor`` = exp(-2 n step^2 precision). Written to ``out[at : at + 12]``; returns False
-    and leaves it
-    alone where every value is below 3e-20, which no force can feel.
+
+@laws.allocation_free
+def dot(weights, psi):
+    """Scalar product of the weights of one axis with a basis."""
+    total = 0.0
+    for k in range(NEURONS):
+        total += weights[k] * psi[k]
+    return total
+
+
+@laws.inlined
+def unscale(state):
+    """Multiply the stored identifier weights by their scale, so that they are omega_f themselves."""
+    for axis in range(2):
+        for k in range(NEURONS):
+            state.w_f[axis, k] *= state.scale
+    state.scale = 1.0
+
+
+@laws.inlined
+def fill_basis(gains, state, p, v, p_r, v_r):
+    """Fill Psi_f(chi) and Psi_V(chi, tau) in the state; False, and nothing filled, where both vanish."""
+    if gains.relative != 0.0:
+        z0, z1 = (p[0] - p_r[0]) / gains.position_scale, (p[1] - p_r[1]) / gains.position_scale
+        z2, z3 = (v[0] - v_r[0]) / gains.velocity_scale, (v[1] - v_r[1]) / gains.velocity_scale
+    else:
+        z0, z1, z2, z3 = p[0], p[1], v[0], v[1]
+    square, total = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3, z0 + z1 + z2 + z3
+    if not diagonal_gaussians(gains, square, total, 4.0, gains.chi_factor, state.psi_f):
+        return False
+    t0, t1 = state.tau[0] / gains.tau_scale, state.tau[1] / gains.tau_scale
+    tau_felt = diagonal_gaussians(gains, t0 * t0 + t1 * t1, t0 + t1, 2.0, gains.tau_factor, state.psi_v)
+    for k in range(NEURONS):  # a Gaussian of (chi, tau) is the product of one of chi and one of tau
+        state.psi_v[k] = (state.psi_v[k] if tau_felt else 0.0) * state.psi_f[k]
+    return True
+
+
+@laws.allocation_free
+def diagonal_gaussians(gains, square, total, n, factor, psi):
+    """exp(-precision |z - c_k 1|^2) for the centres c_k on the diagonal, from |z|^2, sum(z) and the dimension n of z.
+
+    ``factor`` = exp(-2 n distance^2 precision), by which the ratio of neighbours falls. Written to ``psi`` (12,); returns False
+    and leaves it alone where every value is below 3e-20, which no force can feel.
     """
+    first, step, precision = gains.first_centre, gains.centre_distance, gains.precision
     last = first + (NEURONS - 1) * step
     closest = min(max(total, n * first), n * last)  # n times the centre nearest to z
     if precision * (square * n - closest * (2.0 * total - closest)) > NEGLIGIBLE * n:
@@ -47,84 +146,17 @@ def diagonal_gaussians(square, total, n, first, step, precision, factor, out, at
     value = np.exp(-precision * (square - first * (2.0 * total - n * first)))
     ratio = np.exp(precision * step * (2.0 * total - n * (2.0 * first + step)))
     for k in range(NEURONS):
-        out[at + k] = value
+        psi[k] = value
         value *= ratio
         ratio *= factor
     return True
 
 
-@laws.controller
-def sorlc(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
-    """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler.
-
-    ``params`` = xi_p, xi_v, xi_tau, Gamma_f, nu_f, gamma_c, gamma_a, 1 / (2 beta_V), sign of tau, limit [N], networks on
-    (0 or 1), basis relative to the reference (0 or 1), scale of p [m], of v [m/s], of tau [N], first centre, distance of
-    centres, 1 / width^2, and the factors of :func:`diagonal_gaussians` for n = 4 and n = 2.
-    """
-    active = params[10] != 0.0 and _basis(params, state, p, v, p_r, v_r)
-    leak = 1.0 - h * params[3] * params[4]
-    if params[10] != 0.0 and not active:
-        state[_SCALE] *= leak  # with Psi_f = 0 (37) only leaks
-    elif state[_SCALE] != 1.0:
-        for k in range(2 * NEURONS):
-            state[_F + k] *= state[_SCALE]
-        state[_SCALE] = 1.0
-    for axis in range(2):
-        position_error = p[axis] - p_r[axis]
-        velocity_error = v[axis] - v_r[axis]
-        nominal = -params[0] * position_error - params[1] * velocity_error + params[8] * state[_TAU + axis]
-        if active:
-            nominal += _actor_critic(params, state, axis, h)
-            gain = h * params[3] * (position_error + velocity_error)
-            for k in range(NEURONS):
-                state[_F + axis * NEURONS + k] = leak * state[_F + axis * NEURONS + k] + gain * state[_PSI_F + k]
-        force = laws.clip(nominal, params[9])
-        force_out[axis] = force
-        state[_TAU + axis] += h * (force - nominal - params[2] * state[_TAU + axis])
-
-
-@laws.inlined
-def _actor_critic(params, state, axis, h):  # type: ignore[no-untyped-def]
-    """-f^ - actor / (2 beta_V) of (40) for one axis, then one Euler step of critic (39) and actor (41)."""
-    f_hat, actor, critic = 0.0, 0.0, 0.0
-    for k in range(NEURONS):
-        f_hat += state[_F + axis * NEURONS + k] * state[_PSI_F + k]
-        actor += state[_A + axis * NEURONS + k] * state[_PSI_V + k]
-        critic += state[_C + axis * NEURONS + k] * state[_PSI_V + k]
-    d_actor = h * (params[6] * (actor - critic) + params[5] * critic)
-    d_critic = h * params[5] * critic
-    for k in range(NEURONS):
-        state[_A + axis * NEURONS + k] -= d_actor * state[_PSI_V + k]
-        state[_C + axis * NEURONS + k] -= d_critic * state[_PSI_V + k]
-    return -f_hat - params[7] * actor
-
-
-@laws.inlined
-def _basis(params, state, p, v, p_r, v_r):  # type: ignore[no-untyped-def]
-    """Fill Psi_f(chi) and Psi_V(chi, tau) in the state; False, and nothing filled, where both vanish."""
-    if params[11] != 0.0:
-        z0, z1 = (p[0] - p_r[0]) / params[12], (p[1] - p_r[1]) / params[12]
-        z2, z3 = (v[0] - v_r[0]) / params[13], (v[1] - v_r[1]) / params[13]
-    else:
-        z0, z1, z2, z3 = p[0], p[1], v[0], v[1]
-    first, step, precision = params[15], params[16], params[17]
-    square = z0 * z0 + z1 * z1 + z2 * z2 + z3 * z3
-    if not diagonal_gaussians(square, z0 + z1 + z2 + z3, 4.0, first, step, precision, params[18], state, _PSI_F):
-        return False
-    t0, t1 = state[_TAU] / params[14], state[_TAU + 1] / params[14]
-    if not diagonal_gaussians(t0 * t0 + t1 * t1, t0 + t1, 2.0, first, step, precision, params[19], state, _PSI_V):
-        for k in range(NEURONS):
-            state[_PSI_V + k] = 0.0
-    for k in range(NEURONS):
-        state[_PSI_V + k] *= state[_PSI_F + k]
-    return True
-
-
 def weights(state: np.ndarray) -> Weights:
     """Read one agent's state (S,), or a stack of them (..., S), as weight matrices (..., 12, 2)."""
-    shape = (*state.shape[:-1], 2, NEURONS)
-    identifier, actor, critic = (state[..., at : at + 2 * NEURONS].reshape(shape).swapaxes(-1, -2) for at in (_F, _A, _C))
-    return Weights(identifier * state[..., _SCALE, None, None], actor, critic, state[..., _TAU:])
+    read = STATE.view(state)
+    w_f, w_a, w_c = (matrix.swapaxes(-1, -2) for matrix in (read.w_f, read.w_a, read.w_c))
+    return Weights(w_f * np.asarray(read.scale)[..., None, None], w_a, w_c, read.tau)
 
 
 @dataclass(frozen=True)
@@ -132,9 +164,8 @@ class SORLC:
     """Gains of Table 2, and the readings of the basis.
 
     ``printed`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law.
-    ``scaled``
-    feeds the basis the tracking errors over ``position_scale`` and ``velocity_scale`` instead, so the identifier sees
-    signals inside its range along the whole run; ``off`` has no networks. With the printed Gamma_f and nu_f the leak
+    ``scaled`` feeds the basis the tracking errors over ``position_scale`` and ``velocity_scale`` instead, so the identifier
+    sees signals inside its range along the whole run; ``off`` has no networks. With the published Gamma_f and nu_f the leak
     holds the identifier below a fifth of the PD terms, so ``scaled`` has its own: see :meth:`scaled`.
     """
 
@@ -197,15 +228,13 @@ class SORLC:
             raise ConfigurationError(f"SORLC gains break condition (42): {', '.join(broken) or 'not finite'} ({self})")
 
     @classmethod
-    def scaled(cls, **changes: object) -> "SORLC":
+    def scaled(cls, **changes: Any) -> "SORLC":
         """The scaled basis with learning gains of its own, chosen from the sweep that ``marlbc ablation`` prints.
 
         Gamma_f Psi^T Psi / 100 is the identifier's bandwidth: 1000 and width 6 make it about 90 rad/s, a factor 8 below
-        where a substep of
-        5 ms starts to oscillate.
+        where a substep of 5 ms starts to oscillate.
         """
-        gains: dict[str, object] = {"identifier_rate": 1000.0, "identifier_leak": 1e-3, "width": 6.0}
-        return cls(basis="scaled", **{**gains, **changes})  # type: ignore[arg-type]
+        return cls(**{"basis": "scaled", "identifier_rate": 1000.0, "identifier_leak": 1e-3, "width": 6.0, **changes})
 
     @property
     def linear_gains(self) -> tuple[float, float]:
@@ -213,42 +242,25 @@ class SORLC:
 
     @property
     def decay_rates(self) -> tuple[float, ...]:
-        """Of the compensator (30) and of the identifier's leak (37) [1/s]."""
+        """Decay rates of the compensator (30) and of the identifier's leak (37) [1/s]."""
         return self.compensator_gain, self.identifier_rate * self.identifier_leak
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
+    def params(self, agent: int, limit: float) -> dict[str, Any]:
         relative = self.basis == "scaled"
-        step = 2.0 * self.centre_range / (NEURONS - 1)
-        return (
-            self.position_error_gain,
-            self.velocity_error_gain,
-            self.compensator_gain,
-            self.identifier_rate,
-            self.identifier_leak,
-            self.critic_rate,
-            self.actor_rate,
-            0.5 / self.control_weight,
-            float(self.tau_sign),
-            limit,
-            float(self.basis != "off"),
-            float(relative),
-            self.position_scale,
-            self.velocity_scale,
-            self.tau_scale if relative else 1.0,
-            -self.centre_range,
-            step,
-            1.0 / self.width**2,
-            float(np.exp(-8.0 * (step / self.width) ** 2)),
-            float(np.exp(-4.0 * (step / self.width) ** 2)),
+        distance = 2.0 * self.centre_range / (NEURONS - 1)
+        return laws.gains_of(
+            self,
+            limit=limit,
+            learns=self.basis != "off",
+            relative=relative,
+            tau_scale=self.tau_scale if relative else 1.0,
+            first_centre=-self.centre_range,
+            centre_distance=distance,
+            precision=1.0 / self.width**2,
+            chi_factor=np.exp(-8.0 * (distance / self.width) ** 2),
+            tau_factor=np.exp(-4.0 * (distance / self.width) ** 2),
         )
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        state = np.zeros(STATE_SIZE)
-        state[_SCALE] = 1.0
-        for at, fills in (
-            (_F, self.identifier_weights),
-            (_A, self.actor_weights),
-            (_C, self.critic_weights),
-        ):
-            state[at : at + 2 * NEURONS] = fills[agent % len(fills)]
-        return state
+    def initial_state(self, agent: int) -> dict[str, Any]:
+        fills = {"w_f": self.identifier_weights, "w_a": self.actor_weights, "w_c": self.critic_weights}
+        return {"scale": 1.0, **{name: values[agent % len(values)] for name, values in fills.items()}}

@@ -11,26 +11,21 @@ grows without bound near zero, so a sampled loop ends in a small limit cycle ins
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.controllers.homogeneous import sig
 from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError
 
 
-@laws.controller
-def terminal_sliding(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
-    """u = -w f - (beta/gamma) sig(e_v)^(2 - gamma) - k sat(s/phi), s = e_p + sig(e_v)^gamma / beta, then the limit; no state.
-
-    ``params`` = w, beta, gamma, k [N], phi [m], limit [N].
-    """
-    beta, gamma = params[1], params[2]
+@laws.controller(gains=("model_weight", "surface_gain", "power", "reaching_gain", "boundary_layer", "limit"))
+def terminal_sliding(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """u = -w f - (beta/gamma) sig(e_v)^(2 - gamma) - k sat(s/phi), s = e_p + sig(e_v)^gamma / beta, then the limit; no state."""
+    beta, gamma, k, phi = gains.surface_gain, gains.power, gains.reaching_gain, gains.boundary_layer
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
         s = e_p + sig(e_v, gamma) / beta
-        wish = -params[0] * drag[axis] - beta / gamma * sig(e_v, 2.0 - gamma) - params[3] * laws.clip(s / params[4], 1.0)
-        force_out[axis] = laws.clip(wish, params[5])
+        wish = -gains.model_weight * drag[axis] - beta / gamma * sig(e_v, 2.0 - gamma) - k * laws.clip(s / phi, 1.0)
+        force_out[axis] = laws.clip(wish, gains.limit)
 
 
 @dataclass(frozen=True)
@@ -56,9 +51,8 @@ class TerminalSliding:
         """Unbounded near zero: powers below 1 have no largest gain."""
         return
 
-    def params(self, agent: int, limit: float) -> tuple[float, ...]:
-        gains = self.surface_gain, self.power, self.reaching_gain, self.boundary_layer
-        return model_weight(self.model), *gains, limit
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        return laws.gains_of(self, limit=limit, model_weight=model_weight(self.model))
 
-    def initial_state(self, agent: int) -> np.ndarray:
-        return np.zeros(0)
+    def initial_state(self, agent: int) -> laws.Numbers:
+        return {}

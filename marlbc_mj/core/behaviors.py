@@ -5,7 +5,6 @@ Each is closed-loop inverse kinematics (8): v = J^+ (rho_d' + Lambda rho~). The 
 project's: the paper has none, so its agents are free to collide.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -21,18 +20,19 @@ EVERYTHING, NEAREST_OBSTACLE, NEAREST_NEIGHBOR = 0, 1, 2
 
 @laws.allocation_free
 def nearest_obstacle(p: np.ndarray, obstacles: np.ndarray, normal: np.ndarray) -> float:
-    """Clearance d = min_k (|p - o_k| - radius_k) [m], negative inside (errata 7), and the outward unit normal.
+    """Clearance d = min_k (|p - o_k| - radius_k) [m], negative inside (erratum 7), and the outward unit normal.
 
     Args:
         p: (2,) [m].
         obstacles: (K, 3 or more), rows x, y, radius [m]; K = 0 gives an infinite clearance and a zero normal.
         normal: (2,), written in place; (1, 0) at the very centre of an obstacle, where no direction is defined.
     """
-    return _nearest(p, obstacles, normal)[0]  # type: ignore[no-any-return]
+    clearance: float = _nearest(p, obstacles, normal)[0]
+    return clearance
 
 
 @laws.allocation_free
-def _nearest(p, obstacles, normal):  # type: ignore[no-untyped-def]
+def _nearest(p, obstacles, normal):
     """:func:`nearest_obstacle`, and which one it is (-1: there is none)."""
     clearance, nearest = np.inf, -1
     normal[0] = 0.0
@@ -49,7 +49,7 @@ def _nearest(p, obstacles, normal):  # type: ignore[no-untyped-def]
 
 
 @laws.compiled
-def _fill_clearances(positions, obstacles, out):  # type: ignore[no-untyped-def]
+def _fill_clearances(positions, obstacles, out):
     normal = np.empty(2)
     for k in range(positions.shape[0]):
         out[k] = nearest_obstacle(positions[k], obstacles, normal)
@@ -64,7 +64,7 @@ def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
 
 
 @laws.compiled
-def _fill_clearances_among(positions, obstacles, out):  # type: ignore[no-untyped-def]
+def _fill_clearances_among(positions, obstacles, out):
     normal = np.empty(2)
     for t in range(positions.shape[0]):
         for i in range(positions.shape[1]):
@@ -79,19 +79,19 @@ def clearances_among(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray
     return out
 
 
-@laws.behavior
-def obstacle_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
-    """OA (9): v = n Lambda max(0, d_OA - d), J = n^T; ``params`` = Lambda [1/s], d_OA [m], two-sided (0 or 1).
+@laws.behavior(gains=("gain", "safe_distance", "two_sided"))
+def obstacle_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
+    """OA (9): v = n Lambda max(0, d_OA - d), J = n^T.
 
-    One-sided by default: the equality task as printed attracts agents from beyond d_OA (erratum 6). Where obstacles move,
+    One-sided by default: the equality task as published attracts agents from beyond d_OA (erratum 6). Where obstacles move,
     d' = n^T (v - o'), so that n n^T o' is fed forward; ``obstacles`` then is (K, 5), with o' in its last columns.
     """
     clearance, k = _nearest(p, obstacles, jacobian_out[0])
-    error = params[1] - clearance
-    if clearance == np.inf or (params[2] == 0.0 and error < 0.0):
+    error = gains.safe_distance - clearance
+    if clearance == np.inf or (gains.two_sided == 0.0 and error < 0.0):
         error = 0.0
-    velocity_out[0] = jacobian_out[0, 0] * params[0] * error
-    velocity_out[1] = jacobian_out[0, 1] * params[0] * error
+    velocity_out[0] = jacobian_out[0, 0] * gains.gain * error
+    velocity_out[1] = jacobian_out[0, 1] * gains.gain * error
     if k >= 0 and obstacles.shape[1] > 3:
         along = jacobian_out[0, 0] * obstacles[k, 3] + jacobian_out[0, 1] * obstacles[k, 4]
         velocity_out[0] += jacobian_out[0, 0] * along
@@ -99,9 +99,9 @@ def obstacle_avoidance(params, p, path, obstacles, team, agent, velocity_out, ja
     return 1
 
 
-@laws.behavior
-def agent_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
-    """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T; ``params`` = Lambda [1/s], d_AA [m]. The project's own.
+@laws.behavior(gains=("gain", "distance"))
+def agent_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
+    """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T. The project's own.
 
     d = |p - p_j| to the nearest other agent j and n = (p - p_j) / d. The rate d' = n^T (v - p_j') has the neighbor's velocity in
     it, which an agent does not know; the path's, which the team has in common, stands in for it. One-sided, and more so than OA:
@@ -114,7 +114,7 @@ def agent_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacob
         between = np.sqrt(x * x + y * y)
         if other != agent and between < distance:
             nearest, distance = other, between
-    if nearest < 0 or distance >= params[1]:
+    if nearest < 0 or distance >= gains.distance:
         velocity_out[0] = velocity_out[1] = 0.0
         return 0
     normal = jacobian_out[0]
@@ -122,27 +122,25 @@ def agent_avoidance(params, p, path, obstacles, team, agent, velocity_out, jacob
         normal[0], normal[1] = (p[0] - team[nearest, 0]) / distance, (p[1] - team[nearest, 1]) / distance
     else:
         normal[0], normal[1] = (1.0 if agent > nearest else -1.0), 0.0
-    along = normal[0] * path[1, 0] + normal[1] * path[1, 1] + params[0] * (params[1] - distance)
+    along = normal[0] * path[1, 0] + normal[1] * path[1, 1] + gains.gain * (gains.distance - distance)
     velocity_out[0] = normal[0] * along
     velocity_out[1] = normal[1] * along
     return 1
 
 
-@laws.behavior
-def formation(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):  # type: ignore[no-untyped-def]
-    """FM (10) and FR (11): v = p_cd' + Lambda (p_cd + offset - p), J = I; ``params`` = Lambda [1/s], offset x, y [m]."""
-    velocity_out[0] = path[1, 0] + params[0] * (path[0, 0] + params[1] - p[0])
-    velocity_out[1] = path[1, 1] + params[0] * (path[0, 1] + params[2] - p[1])
-    jacobian_out[0, 0] = 1.0
-    jacobian_out[0, 1] = 0.0
-    jacobian_out[1, 0] = 0.0
-    jacobian_out[1, 1] = 1.0
+@laws.behavior(gains={"gain": (), "slot": 2})
+def formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
+    """FM (10) and FR (11): v = p_cd' + Lambda (p_cd + slot - p), J = I; the slot is an offset from the centroid [m]."""
+    for axis in range(2):
+        velocity_out[axis] = path[1, axis] + gains.gain * (path[0, axis] + gains.slot[axis] - p[axis])
+        for other in range(2):
+            jacobian_out[axis, other] = 1.0 if other == axis else 0.0
     return 2
 
 
 @runtime_checkable
 class Behavior(Protocol):
-    """What the engine asks of a behavior: a name, its law, whether J has full rank, and its numbers per agent."""
+    """What the engine asks of a behavior: a name, its law, whether J has full rank, and its gains."""
 
     @property
     def name(self) -> str: ...
@@ -150,8 +148,8 @@ class Behavior(Protocol):
     def law(self) -> laws.Law: ...
     @property
     def complete(self) -> bool: ...
-    def params(self, agent: int) -> Sequence[float]:
-        """Numbers handed to the law as ``params`` for this agent."""
+    def params(self, agent: int) -> laws.Numbers:
+        """The law's gains by name, for this agent."""
         ...
 
 
@@ -161,7 +159,7 @@ class ObstacleAvoidance:
 
     gain: float = 20.0  # Lambda_OA [1/s]
     safe_distance: float = 2.0  # d_OA [m]
-    two_sided: bool = False  # the printed equality task (erratum 6)
+    two_sided: bool = False  # the published equality task (erratum 6)
     name: str = "OA"
     complete = False
     sees = NEAREST_OBSTACLE
@@ -171,8 +169,8 @@ class ObstacleAvoidance:
         _require_positive(f"{self.name} gain", self.gain)
         _require_positive(f"{self.name} safe_distance", self.safe_distance)
 
-    def params(self, agent: int) -> tuple[float, ...]:
-        return (self.gain, self.safe_distance, float(self.two_sided))
+    def params(self, agent: int) -> laws.Numbers:
+        return laws.gains_of(self)
 
 
 @dataclass(frozen=True)
@@ -190,8 +188,8 @@ class AgentAvoidance:
         _require_positive(f"{self.name} gain", self.gain)
         _require_positive(f"{self.name} distance", self.distance)
 
-    def params(self, agent: int) -> tuple[float, ...]:
-        return (self.gain, self.distance)
+    def params(self, agent: int) -> laws.Numbers:
+        return laws.gains_of(self)
 
 
 @dataclass(frozen=True)
@@ -199,7 +197,7 @@ class Formation:
     """Hold one's slot around the moving desired centroid: FM (10), and with the column's offsets FR (11)."""
 
     name: str
-    offsets: tuple[tuple[float, float], ...]  # one (x, y) per agent [m]
+    offsets: tuple[tuple[float, float], ...]  # (x, y) of each agent [m]
     gain: float = 8.0  # Lambda_FM, Lambda_FR [1/s]
     complete = True
     law = staticmethod(formation)
@@ -209,8 +207,8 @@ class Formation:
         if not np.isfinite(self.offsets).all():
             raise ConfigurationError(f"{self.name} offsets must be finite, got {self.offsets}")
 
-    def params(self, agent: int) -> tuple[float, ...]:
-        return (self.gain, *self.offsets[agent])
+    def params(self, agent: int) -> laws.Numbers:
+        return laws.gains_of(self, slot=self.offsets[agent])
 
 
 def _require_positive(what: str, value: float) -> None:

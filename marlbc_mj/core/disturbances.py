@@ -1,87 +1,88 @@
 """Unknown dynamics f(chi) of the plant (1): what the controllers do not know. One law and one dataclass each."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import ClassVar, Protocol, runtime_checkable
 
 import numpy as np
 
 from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
+HARMONICS = 12
+"""Sines of wind gusts, on each axis."""
 
-@laws.disturbance
-def paper_drag(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
-    """(43): f = scale [v1 sin^2(p2) + v2 cos^2(p1), v1 sin^2(p2) - v2 cos^2(p1)]; ``params`` = scale."""
+
+@laws.disturbance(gains="scale")
+def paper_drag(gains, t, p, v, force_out):
+    """(43): f = scale [v1 sin^2(p2) + v2 cos^2(p1), v1 sin^2(p2) - v2 cos^2(p1)]."""
     sine = np.sin(p[1])
     cosine = np.cos(p[0])
     first = v[0] * sine * sine
     second = v[1] * cosine * cosine
-    force_out[0] = params[0] * (first + second)
-    force_out[1] = params[0] * (first - second)
+    force_out[0] = gains.scale * (first + second)
+    force_out[1] = gains.scale * (first - second)
 
 
-@laws.disturbance
-def linear_drag(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
-    """f = -scale c v; ``params`` = scale, c [N s/m]."""
-    force_out[0] = -params[0] * params[1] * v[0]
-    force_out[1] = -params[0] * params[1] * v[1]
-
-
-@laws.disturbance
-def quadratic_drag(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
-    """f = -scale c |v| v; ``params`` = scale, c [N s^2/m^2]."""
-    factor = params[0] * params[1] * np.sqrt(v[0] * v[0] + v[1] * v[1])
-    force_out[0] = -factor * v[0]
-    force_out[1] = -factor * v[1]
-
-
-@laws.disturbance
-def constant_wind(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
-    """f = scale w; ``params`` = scale, w_x, w_y [N]."""
-    force_out[0] = params[0] * params[1]
-    force_out[1] = params[0] * params[2]
-
-
-@laws.disturbance
-def wind_gusts(params, t, p, v, force_out):  # type: ignore[no-untyped-def]
-    """f = scale (w + sum_k a_k sin(w_k t + phase_k)), alike for all agents; ``params`` = scale, w_x, w_y [N], then for each of
-    the harmonics of x and then of y: a_k [N], w_k [rad/s], phase_k.
-    """
+@laws.disturbance(gains=("scale", "coefficient"))
+def linear_drag(gains, t, p, v, force_out):
+    """f = -scale c v, c the coefficient [N s/m]."""
     for axis in range(2):
-        force_out[axis] = params[1 + axis]
-    harmonics = (params.shape[0] - 3) // 6
-    for k in range(2 * harmonics):
-        axis = k // harmonics
-        force_out[axis] += params[3 + 3 * k] * np.sin(params[4 + 3 * k] * t + params[5 + 3 * k])
+        force_out[axis] = -gains.scale * gains.coefficient * v[axis]
+
+
+@laws.disturbance(gains=("scale", "coefficient"))
+def quadratic_drag(gains, t, p, v, force_out):
+    """f = -scale c |v| v, c the coefficient [N s^2/m^2]."""
+    factor = gains.scale * gains.coefficient * np.sqrt(v[0] * v[0] + v[1] * v[1])
     for axis in range(2):
-        force_out[axis] *= params[0]
+        force_out[axis] = -factor * v[axis]
+
+
+@laws.disturbance(gains={"scale": (), "force": 2})
+def constant_wind(gains, t, p, v, force_out):
+    """f = scale w, w the force [N]."""
+    for axis in range(2):
+        force_out[axis] = gains.scale * gains.force[axis]
+
+
+SINES = (2, HARMONICS)
+GUSTS = {"scale": (), "steady": 2, "amplitude": SINES, "frequency": SINES, "phase": SINES}  # [1, N, N, rad/s, rad]
+
+
+@laws.disturbance(gains=GUSTS)
+def wind_gusts(gains, t, p, v, force_out):
+    """f = scale (w + sum_k a_k sin(w_k t + phase_k)), alike for all agents; w is steady, each axis has its own sines."""
+    for axis in range(2):
+        force_out[axis] = gains.steady[axis]
+        for k in range(HARMONICS):
+            force_out[axis] += gains.amplitude[axis, k] * np.sin(gains.frequency[axis, k] * t + gains.phase[axis, k])
+        force_out[axis] *= gains.scale
 
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """What the engine asks of a disturbance. ``params()[0]`` is its scale, which a perturbation draw multiplies."""
+    """What the engine asks of a disturbance. Its first gain is ``scale``, which a perturbation draw multiplies."""
 
     @property
     def law(self) -> laws.Law: ...
-    def params(self) -> Sequence[float]:
-        """Numbers handed to the law as ``params``."""
+    def params(self) -> laws.Numbers:
+        """The law's gains by name."""
         ...
-
-
-HARMONICS = 12  # of wind gusts, on each axis
 
 
 @dataclass(frozen=True)
 class _Scaled:
     scale: float = 1.0  # multiplies the whole force; 0 switches the disturbance off
+    law: ClassVar[laws.Law]
 
     def __post_init__(self) -> None:
-        if not np.isfinite(self.params()).all():
-            raise ConfigurationError(f"{type(self).__name__} needs finite numbers, got {tuple(self.params())}")
+        numbers = laws.pack_gains(self.law, self.params())
+        if not np.isfinite(numbers).all():
+            raise ConfigurationError(f"{type(self).__name__} needs finite numbers, got {tuple(numbers.tolist())}")
 
-    def params(self) -> tuple[float, ...]:
-        return (self.scale,)
+    def params(self) -> laws.Numbers:
+        return laws.gains_of(self)
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,6 @@ class LinearDrag(_Scaled):
     coefficient: float = 1.0  # c [N s/m]
     law = staticmethod(linear_drag)
 
-    def params(self) -> tuple[float, ...]:
-        return (self.scale, self.coefficient)
-
 
 @dataclass(frozen=True)
 class QuadraticDrag(_Scaled):
@@ -109,9 +107,6 @@ class QuadraticDrag(_Scaled):
     coefficient: float = 0.1  # c [N s^2/m^2]
     law = staticmethod(quadratic_drag)
 
-    def params(self) -> tuple[float, ...]:
-        return (self.scale, self.coefficient)
-
 
 @dataclass(frozen=True)
 class ConstantWind(_Scaled):
@@ -119,9 +114,6 @@ class ConstantWind(_Scaled):
 
     force: tuple[float, float] = (5.0, 0.0)  # w [N]
     law = staticmethod(constant_wind)
-
-    def params(self) -> tuple[float, ...]:
-        return (self.scale, *self.force)
 
 
 @dataclass(frozen=True)
@@ -147,15 +139,14 @@ class WindGusts(_Scaled):
             raise ConfigurationError(f"WindGusts seed must not be negative, got {self.seed}")
         super().__post_init__()
 
-    def params(self) -> tuple[float, ...]:
+    def params(self) -> laws.Numbers:
         rng = np.random.default_rng(self.seed)
         place = (np.arange(HARMONICS) + rng.uniform(0.0, 1.0, (2, HARMONICS))) / HARMONICS  # one frequency in each band
         ratio = np.exp(np.log(0.2) + np.log(50.0) * place)  # w_k T, from 0.2 to 10
         amplitude = 1.0 / np.sqrt(1.0 + ratio**2)
         amplitude *= self.strength * np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
         phase = rng.uniform(0.0, 2.0 * np.pi, (2, HARMONICS))
-        rows = np.stack([amplitude, ratio / self.time, phase], axis=-1)
-        return (self.scale, *self.steady, *rows.ravel().tolist())
+        return laws.gains_of(self, amplitude=amplitude, frequency=ratio / self.time, phase=phase)
 
 
 DISTURBANCES: dict[str, tuple[Callable[..., Disturbance], str]] = {

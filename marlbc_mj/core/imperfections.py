@@ -1,13 +1,24 @@
 """What a plant does worse than its model: noise and age of measurements, lost actuation. Off by default, and free when off."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free
+from marlbc_mj.core.compiling import allocation_free
 from marlbc_mj.util.errors import ConfigurationError
 
 _WORD = 0xFFFFFFFF
+
+
+class Senses(NamedTuple):
+    """What :func:`sense` and :func:`weaken` read of :class:`Imperfections`, as numbers."""
+
+    position_noise: float  # [m]
+    velocity_noise: float  # [m/s]
+    loss: float  # share of the force
+    loss_agent: float  # -1: everybody's
+    loss_start: float  # [s]
 
 
 @dataclass(frozen=True)
@@ -55,16 +66,16 @@ class Imperfections:
         """Rows of history that a delay needs; none without sensing errors."""
         return round(self.delay / substep) + 1 if self.sensing else 0
 
-    def params(self) -> tuple[float, ...]:
+    def params(self) -> Senses:
         """Numbers for :func:`sense` and :func:`weaken`."""
-        return self.position_noise, self.velocity_noise, self.loss, float(self.loss_agent), self.loss_start
+        return Senses(self.position_noise, self.velocity_noise, self.loss, float(self.loss_agent), self.loss_start)
 
 
 NO_IMPERFECTIONS = Imperfections()
 
 
 @allocation_free
-def _mixed(word):  # type: ignore[no-untyped-def]
+def _mixed(word):
     """A 32-bit integer hash (constants of the hash-prospector project): every input bit moves every output bit."""
     word = ((word ^ (word >> 16)) * 0x21F0AAAD) & _WORD
     word = ((word ^ (word >> 15)) * 0x735A2D97) & _WORD
@@ -72,7 +83,7 @@ def _mixed(word):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def normal(seed, count, stream):  # type: ignore[no-untyped-def]
+def normal(seed, count, stream):
     """A standard normal number that is a function of three integers: Box and Muller on two hashes. No state, so no order."""
     base = _mixed(_mixed(_mixed(seed & _WORD) ^ (count & _WORD)) ^ (2 * stream + 1))
     angle = _mixed(base ^ 0x9E3779B9)
@@ -80,7 +91,7 @@ def normal(seed, count, stream):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def sense(params, seed, count, history, p, v, sensed):  # type: ignore[no-untyped-def]
+def sense(senses, seed, count, history, p, v, sensed):
     """What is measured at substep ``count``: the true p, v (N, 2) of D - 1 substeps ago, with noise, in ``sensed`` (2, N, 2).
 
     ``history`` (D, 2, N, 2) is a ring that this call adds the present to.
@@ -92,16 +103,17 @@ def sense(params, seed, count, history, p, v, sensed):  # type: ignore[no-untype
             history[count % depth, 1, i, axis] = v[i, axis]
             for which in range(2):
                 value = history[(count + 1) % depth, which, i, axis]
-                if params[which] > 0.0:
-                    value += params[which] * normal(seed, count, 4 * i + 2 * which + axis)
+                noise = senses.position_noise if which == 0 else senses.velocity_noise
+                if noise > 0.0:
+                    value += noise * normal(seed, count, 4 * i + 2 * which + axis)
                 sensed[which, i, axis] = value
 
 
 @allocation_free
-def weaken(params, t, force):  # type: ignore[no-untyped-def]
+def weaken(senses, t, force):
     """Take the lost share off the forces (N, 2) at ``t`` [s]."""
-    if params[2] > 0.0 and t >= params[4] - 1e-9:
+    if senses.loss > 0.0 and t >= senses.loss_start - 1e-9:
         for i in range(force.shape[0]):
-            if params[3] < 0.0 or params[3] == i:
+            if senses.loss_agent < 0.0 or senses.loss_agent == i:
                 for axis in range(2):
-                    force[i, axis] *= 1.0 - params[2]
+                    force[i, axis] *= 1.0 - senses.loss

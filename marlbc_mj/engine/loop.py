@@ -56,7 +56,11 @@ class Plant(NamedTuple):
     robot_params: np.ndarray  # (N, P) of drive and reading
     controller_params: np.ndarray  # (N, P)
     unit_force: float  # in which controllers count [N]
-    senses: np.ndarray  # (5,) Imperfections.params()
+    position_noise: float  # of sensors, see Senses [m]
+    velocity_noise: float  # [m/s]
+    loss: float  # share of the force that is lost
+    loss_agent: float  # whose; negative: everybody's
+    loss_start: float  # from then on [s]
 
 
 class Native(NamedTuple):
@@ -235,7 +239,8 @@ def apply(b, k, mission, native, plant, team):
     failed = set_forces(b, t, h, native, plant, team)
     if not failed:
         force = team.force[b]
-        weaken(plant.senses, t, force)
+        if plant.loss > 0.0:
+            weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
         failed = actuate(native.drive, plant, team.robot[b], qpos, qvel, force, h, doubles(native.ctrl[b], plant.nu))
     if failed:
@@ -269,7 +274,7 @@ def settle(b, k, mission, native, plant, team, record):
             p_r[i, axis] += mission.substep * v_r[i, axis]
     if team.sensed.shape[1] > 0:
         count = team.steps[b] * mission.substeps + k + 1
-        sense(plant.senses, team.noise_seed[b], count, team.history[b], p, v, team.sensed[b])
+        sense(plant, team.noise_seed[b], count, team.history[b], p, v, team.sensed[b])
 
 
 @allocation_free

@@ -105,8 +105,8 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         mission=make_mission(scenario),
         behaviors=make_behaviors(scenario),
         plant=_make_plant(scenario, controller, limit, model),
-        initial_state=np.array([controller.initial_state(i) for i in range(scenario.agents)], dtype=np.float64),
-        disturbance_params=np.array(scenario.disturbance.params(), dtype=np.float64),
+        initial_state=np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in range(scenario.agents)]),
+        disturbance_params=laws.pack_gains(scenario.disturbance.law, scenario.disturbance.params(), laws.DISTURBANCE),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
     )
 
@@ -144,7 +144,8 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel) -> Plant:
-    params = [controller.params(i, limit / scenario.unit_force) for i in range(scenario.agents)]
+    gains = [controller.params(i, limit / scenario.unit_force) for i in range(scenario.agents)]
+    params = [laws.pack_gains(controller.law, one, laws.CONTROLLER) for one in gains]
     qpos_index, qvel_index, ctrl_index = find_indices(model, scenario)
     return Plant(
         qpos_index=qpos_index,
@@ -154,10 +155,10 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
         nv=int(model.nv),
         nu=int(model.nu),
         spans=find_spans(model, scenario),
-        robot_params=np.tile(np.array(make_robot(scenario.robot).params, dtype=np.float64), (scenario.agents, 1)),
+        robot_params=np.tile(make_robot(scenario.robot).params_row(), (scenario.agents, 1)),
         controller_params=_padded([params])[0],
         unit_force=float(scenario.unit_force),
-        senses=np.array(scenario.imperfections.params(), dtype=np.float64),
+        **{name: float(value) for name, value in scenario.imperfections.params()._asdict().items()},
     )
 
 
@@ -208,9 +209,9 @@ def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndar
     Raises:
         ConfigurationError: a law that is not compiled, or not a behavior's.
     """
-    params = _padded([[b.params(i) for i in range(agents)] for b in behaviors])
+    params = _padded([[laws.pack_gains(b.law, b.params(i), laws.BEHAVIOR) for i in range(agents)] for b in behaviors])
     if numba.config.DISABLE_JIT:
-        return np.array([b.law for b in behaviors], dtype=object), params
+        return np.array([laws.for_team(b.law, laws.BEHAVIOR) for b in behaviors], dtype=object), params
     return np.array([laws.address(b.law, laws.BEHAVIOR) for b in behaviors], dtype=np.uint64), params
 
 
@@ -226,7 +227,7 @@ def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
     return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)
 
 
-def _padded(rows: Sequence[Sequence[Sequence[float]]]) -> np.ndarray:
+def _padded(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """(M, N, P) float64 from ragged numbers, zeros at the end of the shorter ones."""
     width = max(len(numbers) for row in rows for numbers in row)
     out = np.zeros((len(rows), len(rows[0]), width))

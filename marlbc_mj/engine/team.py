@@ -42,7 +42,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         anchors=np.zeros((*tracks, 3)),
         motions=np.zeros((*tracks, NUMBERS)),
         disturbance_params=np.zeros((worlds, len(plan.disturbance_params))),
-        robot=np.zeros((*each, len(plan.robot.state))),
+        robot=np.zeros((*each, len(plan.robot.state_row()))),
         history=np.zeros((worlds, imperfections.depth(scenario.substep), 2, agents, 2)),
         sensed=np.zeros((worlds, 2 if imperfections.sensing else 0, agents, 2)),
         noise_seed=np.zeros(worlds, dtype=np.int64),
@@ -98,7 +98,7 @@ def place(
     team.position[b] = team.reference[b] = position
     team.velocity[b] = team.reference_velocity[b] = velocity
     team.controller[b] = plan.initial_state
-    team.robot[b] = plan.robot.state
+    team.robot[b] = plan.robot.state_row()
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     judge(b, plan.mission, team)
 
@@ -124,7 +124,7 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     if team.sensed.shape[1] > 0:  # the past that delays look into is the present
         team.history[b] = np.stack([team.position[b], team.velocity[b]])
         count = int(team.steps[b]) * plan.mission.substeps
-        sense(plant.senses, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
+        sense(plant, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
 
 
 def lasting(team: Team) -> dict[str, np.ndarray]:

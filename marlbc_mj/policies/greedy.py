@@ -113,7 +113,7 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
 
 
 @compiled
-def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
+def best_actions(values, last, fresh, margin):
     """(B, N) actions as :func:`greedy` chooses them, for values (B, N, A)."""
     best = np.empty(last.shape, dtype=np.int64)
     for b in range(last.shape[0]):
@@ -127,7 +127,7 @@ def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def action_values(state, scale, weights, biases, dueling, actions, limit):  # type: ignore[no-untyped-def]
+def action_values(state, scale, weights, biases, dueling, actions, limit):
     """(B, N, A) action values of a ``Policy``'s networks in states (B, S), all float32; -inf where an action is too risky.
 
     ``limit`` is the largest admissible risk, 0 for networks without risks. For one team, loops take less time than one BLAS call
@@ -165,7 +165,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):  # ty
 
 
 @compiled
-def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
+def dense(x, weight, bias, out):
     """Write ``x @ weight + bias`` into ``out``, summed in the order of the inputs; inputs that are 0 are left out."""
     out[:] = bias
     for j in range(len(x)):
@@ -176,7 +176,7 @@ def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rectify(x):  # type: ignore[no-untyped-def]
+def rectify(x):
     """Replace ``x`` by max(x, 0), in place; NaN passes through."""
     for j in range(len(x)):
         if x[j] < 0.0:

@@ -21,6 +21,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import register_schema
 
 from marlbc_mj.controllers import Controller, sorlc
+from marlbc_mj.core import laws
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import Frame
 from marlbc_mj.recording import schemas
@@ -91,7 +92,7 @@ class LogWriter:
         attachments = _attachments(scenario, model or make_plan(scenario, controller).xml, config)
         self._scene = Scene(scenario, draw.obstacles, draw.motions)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
-        self._weighted = controller.initial_state(0).shape == (sorlc.STATE_SIZE,)
+        self._weighted = laws.interface(controller.law).state == sorlc.STATE
         self._posed = len(make_robot(scenario.robot).joints) == 1
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]

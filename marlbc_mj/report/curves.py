@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from marlbc_mj.controllers.sorlc import STATE_SIZE, Weights, weights
+from marlbc_mj.controllers.sorlc import STATE, Weights, weights
 from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
@@ -245,7 +245,7 @@ def network_weights(trajectory: Trajectory) -> Weights:
 def has_weights(trajectory: Trajectory) -> bool:
     """Whether this controller's state is that of SORLC with networks."""
     name, state = trajectory.controller, trajectory.controller_state
-    return name.startswith("sorlc") and name != "sorlc-off" and state.shape[-1] == STATE_SIZE
+    return name.startswith("sorlc") and name != "sorlc-off" and state.shape[-1] == STATE.size
 
 
 def flat_after(trajectory: Trajectory) -> float:

@@ -17,6 +17,12 @@ MODELS = Path(str(files("marlbc_mj") / "models"))
 """Folder of the MJCF files; in the repository a link to ``models/``."""
 
 
+def _names(law: laws.Law) -> tuple[laws.Names, laws.Names]:
+    """Names of a law's gains and state."""
+    declared = laws.interface(law)
+    return declared.gains, declared.state
+
+
 def _as_it_is(spec: mujoco.MjSpec) -> None:
     """A file that needs no change."""
 
@@ -45,9 +51,9 @@ class Robot:
     motors: tuple[str, ...] = ()  # direct robots: the actuators of x and y
     drive: laws.Law | None = None  # as laws.DRIVE
     reading: laws.Law | None = None  # as laws.READING
-    params: tuple[float, ...] = ()  # numbers for both laws
-    state: tuple[float, ...] = ()  # what the laws remember, at the start
-    diagnostics: dict[str, int] = field(default_factory=dict)  # named entries of the state, "saturated" for example
+    params: laws.Numbers = field(default_factory=dict)  # gains of both laws, by name
+    state: laws.Numbers = field(default_factory=dict)  # what the laws remember, by name; what is left out starts at 0
+    report: tuple[str, ...] = ()  # names in the state that diagnostics show, "saturated" for example
     mass: float | None = None  # what a planar force accelerates, wheels and rotors included [kg]
     force_limit: float = np.inf  # per axis [N]
     speed_limit: float = np.inf  # of references [m/s]
@@ -68,6 +74,8 @@ class Robot:
                 raise ConfigurationError(f"robot {self.name!r}: {name} must be positive, got {value}")
         if (self.drive is None) != (self.reading is None):
             raise ConfigurationError(f"robot {self.name!r} has one of drive and reading; it needs both, or neither and motors")
+        if self.drive is not None and self.reading is not None and _names(self.drive) != _names(self.reading):
+            raise ConfigurationError(f"robot {self.name!r}: drive and reading must declare the same names of gains and state")
         if self.drive is None and len(self.motors) != 2:
             raise ConfigurationError(f"robot {self.name!r} needs two motors, or a drive and a reading; got {self.motors}")
         if len(self.joints) not in (1, 2):
@@ -77,6 +85,27 @@ class Robot:
     def direct(self) -> bool:
         """Whether the planar force goes to the motors as it is."""
         return self.drive is None
+
+    def params_row(self) -> np.ndarray:
+        """(P,) gains as the loop hands them to both laws; empty for a direct robot.
+
+        Raises:
+            ConfigurationError: a name that is missing or unknown.
+        """
+        return np.zeros(0) if self.drive is None else laws.pack_gains(self.drive, self.params)
+
+    def state_row(self) -> np.ndarray:
+        """(S,) state of both laws at the start, in the loop's order; empty for a direct robot.
+
+        Raises:
+            ConfigurationError: an unknown name.
+        """
+        return np.zeros(0) if self.drive is None else laws.pack_state(self.drive, self.state)
+
+    @property
+    def diagnostics(self) -> dict[str, int]:
+        """Where in the state each number is that ``report`` names."""
+        return {} if self.drive is None else {name: laws.interface(self.drive).state.at(name) for name in self.report}
 
     def spec(self) -> mujoco.MjSpec:
         """The MJCF, ready to be attached.

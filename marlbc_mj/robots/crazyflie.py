@@ -13,7 +13,8 @@ from typing import Any
 import mujoco
 
 from marlbc_mj.robots.base import MODELS, Robot
-from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
+from marlbc_mj.robots.multirotor import REPORT, rotor_drive, rotor_reading
+from marlbc_mj.robots.rotors import Attitude, rotor_numbers
 from marlbc_mj.util.errors import ConfigurationError
 
 CRAZYFLIE = "Crazyflie 2.x at a held height, measured parameters and thrust limits (extra `robots`)"
@@ -71,7 +72,7 @@ def crazyflie() -> Robot:
         reading=rotor_reading,
         params=params,
         state=state,
-        diagnostics=DIAGNOSTICS,
+        report=REPORT,
         mass=mass,
         force_limit=0.3 * mass * 9.81,
         speed_limit=1.0,
@@ -81,5 +82,5 @@ def crazyflie() -> Robot:
         substep=0.0025,
         contact=True,
         prepare=_prepare,
-        height=params[2],
+        height=params["height"],
     )

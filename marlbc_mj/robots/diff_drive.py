@@ -17,32 +17,42 @@ WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, how
 _MJCF = MODELS / "robots" / "diff_drive.xml"
 
 
-@laws.drive
-def diff_drive_drive(params, state, qpos, qvel, force, h, ctrl_out):  # type: ignore[no-untyped-def]
-    """Torques of the left and right wheel for p'' = F / m. ``params`` = r, half track b, l, m, I (both with spinning wheels),
-    m d, torque limit. ``state`` = heading, u, w, saturated substeps.
-    """
-    r, b, ahead, mass, turn, offset = params[0], params[1], params[2], params[3], params[4], params[5]
+GAINS = (
+    "wheel",  # r, radius of a wheel [m]
+    "half_track",  # b [m]
+    "ahead",  # l, of the point in front of the axle [m]
+    "mass",  # m, spinning wheels included [kg]
+    "inertia",  # I about z, spinning wheels included [kg m^2]
+    "offset",  # m d [kg m]
+    "torque_limit",  # [N m]
+)
+STATE = ("heading", "speed", "turn_rate", "saturated")  # t [rad], u [m/s], w [rad/s], substeps in which a torque was at its limit
+
+
+@laws.drive(gains=GAINS, state=STATE)
+def diff_drive_drive(gains, state, qpos, qvel, force, h, ctrl_out):
+    """Torques of the left and right wheel for p'' = F / m."""
+    r, b, ahead, mass, turn, offset = gains.wheel, gains.half_track, gains.ahead, gains.mass, gains.inertia, gains.offset
     t = heading(qpos[3:7])
     u, w = np.cos(t) * qvel[0] + np.sin(t) * qvel[1], qvel[5]
     along, across = np.cos(t) * force[0] + np.sin(t) * force[1], np.cos(t) * force[1] - np.sin(t) * force[0]
     push = mass * (along / mass + ahead * w * w) - offset * w * w
     moment = turn * (across / mass - u * w) / ahead + offset * u * w
-    state[0], state[1], state[2] = t, u, w
+    state.heading, state.speed, state.turn_rate = t, u, w
     for k in range(2):
         wish = 0.5 * r * (push + (2 * k - 1) * moment / b)
-        ctrl_out[k] = laws.clip(wish, params[6])
-        state[3] += 0.5 if ctrl_out[k] != wish else 0.0
+        ctrl_out[k] = laws.clip(wish, gains.torque_limit)
+        state.saturated += 0.5 if ctrl_out[k] != wish else 0.0
 
 
-@laws.reading
-def diff_drive_reading(params, state, qpos, qvel, actuator_force, p_out, v_out, force_out):  # type: ignore[no-untyped-def]
+@laws.reading(gains=GAINS, state=STATE)
+def diff_drive_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
     """p, v of the point ahead; force = m p'' for the torques given, at the motion that the drive saw."""
-    r, b, ahead, mass, turn, offset = params[0], params[1], params[2], params[3], params[4], params[5]
+    r, b, ahead, mass, turn, offset = gains.wheel, gains.half_track, gains.ahead, gains.mass, gains.inertia, gains.offset
     t, w = heading(qpos[3:7]), qvel[5]
     p_out[0], p_out[1] = qpos[0] + ahead * np.cos(t), qpos[1] + ahead * np.sin(t)
     v_out[0], v_out[1] = qvel[0] - ahead * w * np.sin(t), qvel[1] + ahead * w * np.cos(t)
-    t, u, w = state[0], state[1], state[2]
+    t, u, w = state.heading, state.speed, state.turn_rate
     push, moment = (actuator_force[0] + actuator_force[1]) / r, (actuator_force[1] - actuator_force[0]) * b / r
     along = push + offset * w * w - mass * ahead * w * w
     across = mass * (ahead * (moment - offset * u * w) / turn + u * w)
@@ -63,9 +73,16 @@ def diff_drive() -> Robot:
         description=DIFF_DRIVE,
         drive=diff_drive_drive,
         reading=diff_drive_reading,
-        params=(WHEEL, TRACK, AHEAD, mass, turn, own.mass * own.ahead, 0.8),
-        state=(0.0, 0.0, 0.0, 0.0),
-        diagnostics={"heading": 0, "saturated": 3},
+        params={
+            "wheel": WHEEL,
+            "half_track": TRACK,
+            "ahead": AHEAD,
+            "mass": mass,
+            "inertia": turn,
+            "offset": own.mass * own.ahead,
+            "torque_limit": 0.8,
+        },
+        report=("heading", "saturated"),
         mass=mass,
         force_limit=10.0,
         speed_limit=1.2,

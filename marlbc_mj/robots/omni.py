@@ -13,42 +13,43 @@ STIFFNESS, DAMPING = 60.0, 15.0  # of the heading [1/s^2, 1/s]
 _MJCF = MODELS / "robots" / "omni.xml"
 
 
-@laws.drive
-def omni_drive(params, state, qpos, qvel, force, h, ctrl_out):  # type: ignore[no-untyped-def]
-    """tau_k = r (2/3 t_k . F + M / (3 R)), t_k the direction that wheel k drives in; M turns the heading back to zero.
+GAINS = ("wheel", "arm", "inertia", "torque_limit", "stiffness", "damping")  # [m, m, kg m^2, N m, 1/s^2, 1/s]
+STATE = ("heading", "saturated")  # [rad], substeps in which a torque was at its limit
 
-    ``params`` = r, R, turning inertia, torque limit, stiffness, damping. ``state`` = heading, saturated substeps.
-    """
-    state[0] = heading(qpos[3:7])
-    moment = -params[2] * (params[4] * state[0] + params[5] * qvel[5])
+
+@laws.drive(gains=GAINS, state=STATE)
+def omni_drive(gains, state, qpos, qvel, force, h, ctrl_out):
+    """tau_k = r (2/3 t_k . F + M / (3 R)), t_k the direction that wheel k drives in; M turns the heading back to zero."""
+    state.heading = heading(qpos[3:7])
+    moment = -gains.inertia * (gains.stiffness * state.heading + gains.damping * qvel[5])
     saturated = 0.0
     for k in range(3):
-        angle = state[0] + np.pi * (2 * k + 1) / 3.0
+        angle = state.heading + np.pi * (2 * k + 1) / 3.0
         along = -np.sin(angle) * force[0] + np.cos(angle) * force[1]
-        wish = params[0] * (2.0 / 3.0 * along + moment / (3.0 * params[1]))
-        ctrl_out[k] = laws.clip(wish, params[3])
+        wish = gains.wheel * (2.0 / 3.0 * along + moment / (3.0 * gains.arm))
+        ctrl_out[k] = laws.clip(wish, gains.torque_limit)
         saturated = 1.0 if ctrl_out[k] != wish else saturated
-    state[1] += saturated
+    state.saturated += saturated
 
 
-@laws.reading
-def omni_reading(params, state, qpos, qvel, actuator_force, p_out, v_out, force_out):  # type: ignore[no-untyped-def]
+@laws.reading(gains=GAINS, state=STATE)
+def omni_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
     """p, v of the middle; F = sum of t_k tau_k / r with the heading that the drive saw."""
-    force_out[0] = 0.0
-    force_out[1] = 0.0
     for axis in range(2):
         p_out[axis] = qpos[axis]
         v_out[axis] = qvel[axis]
+        force_out[axis] = 0.0
     for k in range(3):
-        angle = state[0] + np.pi * (2 * k + 1) / 3.0
-        force_out[0] -= np.sin(angle) * actuator_force[k] / params[0]
-        force_out[1] += np.cos(angle) * actuator_force[k] / params[0]
+        angle = state.heading + np.pi * (2 * k + 1) / 3.0
+        force_out[0] -= np.sin(angle) * actuator_force[k] / gains.wheel
+        force_out[1] += np.cos(angle) * actuator_force[k] / gains.wheel
 
 
 def omni() -> Robot:
     """Inertias are read from the MJCF; a planar force also spins the wheels, which adds 3/2 I / r^2 to the mass."""
     own = inertia(mujoco.MjSpec.from_file(str(_MJCF)))
     turn = own.turn + 3.0 * own.wheel * (ARM / WHEEL) ** 2
+    gains = {"wheel": WHEEL, "arm": ARM, "inertia": turn, "torque_limit": 1.2, "stiffness": STIFFNESS, "damping": DAMPING}
     return Robot(
         name="omni",
         mjcf=_MJCF,
@@ -58,9 +59,8 @@ def omni() -> Robot:
         description=OMNI,
         drive=omni_drive,
         reading=omni_reading,
-        params=(WHEEL, ARM, turn, 1.2, STIFFNESS, DAMPING),
-        state=(0.0, 0.0),
-        diagnostics={"heading": 0, "saturated": 1},
+        params=gains,
+        report=("heading", "saturated"),
         mass=own.mass + 1.5 * own.wheel / WHEEL**2,
         force_limit=12.0,
         speed_limit=1.5,

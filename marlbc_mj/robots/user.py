@@ -16,7 +16,8 @@ import numpy as np
 
 from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.base import Robot
-from marlbc_mj.robots.multirotor import DIAGNOSTICS, Attitude, rotor_drive, rotor_numbers, rotor_reading
+from marlbc_mj.robots.multirotor import REPORT, rotor_drive, rotor_reading
+from marlbc_mj.robots.rotors import Attitude, rotor_numbers
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
@@ -232,11 +233,11 @@ def _flying(fields: dict[str, Any], joint: str, path: Path) -> Robot:
         reading=rotor_reading,
         params=params,
         state=state,
-        diagnostics=DIAGNOSTICS,
+        report=REPORT,
         description="rotors that lift and turn",
         force_limit=0.3 * mass * 9.81,
         speed_limit=1.0,
         acceleration_limit=1.0,
         gains=(9.0, 6.0),
-        height=params[2],
+        height=params["height"],
     )

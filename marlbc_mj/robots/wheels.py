@@ -9,14 +9,14 @@ from marlbc_mj.core.laws import allocation_free
 
 
 @allocation_free
-def heading(quaternion):  # type: ignore[no-untyped-def]
+def heading(quaternion):
     """Yaw [rad] of a unit quaternion w, x, y, z."""
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
 class Inertia(NamedTuple):
-    """Of a whole robot about its frame, wheels at rest relative to it."""
+    """Inertia of a whole robot about its frame, wheels at rest relative to it."""
 
     mass: float  # [kg]
     turn: float  # about z [kg m^2]

@@ -23,18 +23,22 @@ TRACKING = ("velocity_error", "position_error", "ratio")
 MISSION = ("total", "switches", "violation_time", "clearance", "effort", "velocity_error", "ratio")
 
 
-@laws.controller
-def exact_model(params, state, p, v, p_r, v_r, drag, h, force_out):  # type: ignore[no-untyped-def]
+@laws.controller(gains=("position_gain", "velocity_gain", "limit"))
+def exact_model(gains, state, p, v, p_r, v_r, drag, h, force_out):
     """PD plus perfect knowledge of f: u = clip(-k_p e_p - k_v e_v - f); the limit of what any identifier can reach."""
     for axis in range(2):
-        wish = -params[0] * (p[axis] - p_r[axis]) - params[1] * (v[axis] - v_r[axis]) - drag[axis]
-        force_out[axis] = laws.clip(wish, params[2])
+        e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
+        wish = -gains.position_gain * e_p - gains.velocity_gain * e_v - drag[axis]
+        force_out[axis] = laws.clip(wish, gains.limit)
 
 
 class ExactModel(PD):
     """The gains of :class:`PD` with :func:`exact_model`."""
 
     law = staticmethod(exact_model)
+
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        return laws.gains_of(self, limit=limit)
 
 
 def half_mission(scale: float) -> Scenario:

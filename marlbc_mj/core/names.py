@@ -1,0 +1,217 @@
+"""Names for the numbers of a law: what it reads as ``gains.limit`` or ``state.tau[axis]`` is a row of float64 for the loop."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, cast
+
+import numpy as np
+
+from marlbc_mj.core.compiling import Law, plain
+from marlbc_mj.util.errors import ConfigurationError
+
+Shape = int | tuple[int, ...]
+Numbers = Mapping[str, Any] | Sequence[float] | np.ndarray
+"""Numbers by name: a mapping or a NamedTuple. For a law that declares no names, a plain vector."""
+
+
+class Owner(NamedTuple):
+    """Whose names these are, for messages."""
+
+    law: str
+    word: str  # "gain" or "state"
+
+
+@dataclass(frozen=True)
+class Names:
+    """The fields of one row of float64, in this order. Without fields the row stays a plain vector."""
+
+    shapes: tuple[tuple[str, tuple[int, ...]], ...] = ()  # name and shape of each field; () is a single number
+
+    @classmethod
+    def of(cls, declared: "Names | str | Iterable[str] | Mapping[str, Shape]") -> "Names":
+        """Names from what a decorator is given: names of single numbers, or names with the shapes of arrays.
+
+        Raises:
+            ConfigurationError: a name that stands twice, is no identifier, or already means something to NumPy's records.
+        """
+        if isinstance(declared, Names):
+            return declared
+        if isinstance(declared, str):
+            declared = (declared,)
+        pairs = declared.items() if isinstance(declared, Mapping) else [(name, ()) for name in declared]
+        names = cls(tuple((name, (shape,) if isinstance(shape, int) else tuple(shape)) for name, shape in pairs))
+        names._check()
+        return names
+
+    def _check(self) -> None:
+        for name in self.names:
+            if not name.isidentifier():
+                raise ConfigurationError(f"{name!r} cannot name a number of a law: it is no identifier")
+            if hasattr(np.record, name) or hasattr(np.recarray, name):
+                raise ConfigurationError(
+                    f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name"
+                )
+            if self.names.count(name) > 1:
+                raise ConfigurationError(f"{name!r} names two numbers of a law")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names alone."""
+        return tuple(name for name, _ in self.shapes)
+
+    @cached_property
+    def dtype(self) -> np.dtype[Any]:
+        """The row as one NumPy record, which Python and compiled code read alike."""
+        return np.dtype((np.record, [(name, np.float64, shape) for name, shape in self.shapes]))
+
+    @property
+    def size(self) -> int:
+        """Length of the row."""
+        return self.dtype.itemsize // 8 if self.shapes else 0
+
+    def at(self, name: str) -> int:
+        """Where in the row a field begins."""
+        return int(dict(self.dtype.fields or {})[name][1]) // 8
+
+    def view(self, rows: np.ndarray) -> Any:
+        """One row (S or more,) as a record with these fields; a stack (..., S) as an array of records.
+
+        Nothing is copied: what is written to a field is written to the row.
+        """
+        if not self.shapes:
+            return rows
+        records = rows[..., : self.size].view(self.dtype)[..., 0] if rows.ndim > 1 else rows[: self.size].view(self.dtype)
+        return records.view(np.recarray) if rows.ndim > 1 else records[0]
+
+    def row(self, numbers: Numbers, owner: Owner, default: float | None = None) -> np.ndarray:
+        """``numbers`` packed into one row (S,). A single number fills an array; a name left out has the default, if there is one.
+
+        Raises:
+            ConfigurationError: a name that is missing or unknown, a shape that does not fit, or numbers without names.
+        """
+        given = numbers._asdict() if hasattr(numbers, "_asdict") else numbers
+        if not isinstance(given, Mapping):
+            return self._vector(given, owner)
+        self._require(given, owner, default is None)
+        out = np.full(self.size, 0.0 if default is None else default)
+        record = self.view(out)
+        for name, value in given.items():
+            field, value = record[name], np.asarray(value, dtype=np.float64)
+            if value.shape not in ((), np.shape(field)):
+                raise ConfigurationError(
+                    f"{owner.word} {name!r} of law {owner.law!r} has shape {np.shape(field)}, got {value.shape}"
+                )
+            record[name] = value
+        return out
+
+    def _vector(self, numbers: Sequence[float] | np.ndarray, owner: Owner) -> np.ndarray:
+        """Numbers without names, for a law that declares none."""
+        if self.shapes:
+            raise ConfigurationError(
+                f"law {owner.law!r} takes its {owner.word}s by name, got {tuple(numbers)}; its names: {', '.join(self.names)}"
+            )
+        return np.array(numbers, dtype=np.float64)
+
+    def _require(self, given: Mapping[str, Any], owner: Owner, complete: bool) -> None:
+        """Raise ConfigurationError unless the names given are these."""
+        there = ", ".join(self.names) or "none; declare them in the law's decorator"
+        for name in given:
+            if name not in self.names:
+                raise ConfigurationError(f"law {owner.law!r} has no {owner.word} named {name!r}; its names: {there}")
+        missing = [name for name in self.names if name not in given]
+        if complete and missing:
+            raise ConfigurationError(f"law {owner.law!r} is not given its {owner.word} {missing[0]!r}; its names: {there}")
+
+
+Declared = Names | str | Iterable[str] | Mapping[str, Shape]
+"""Names of numbers, ``("position_gain", "limit")``, or names with shapes, ``{"w_f": (2, 12), "scale": ()}``."""
+
+
+class Interface(NamedTuple):
+    """What a law was declared as: its kind, and the names of its gains and of its state."""
+
+    signature: Any = None
+    gains: Names = Names()
+    state: Names = Names()
+
+
+def interface(law: Law) -> Interface:
+    """What a law was declared as, compiled or plain; an undeclared function has no kind and no names."""
+    return cast(Interface, getattr(plain(law), "interface", Interface()))
+
+
+def require_kind(law: Law, signature: Any) -> None:
+    """Raise ConfigurationError if a law was declared as another kind of law."""
+    declared = interface(law).signature
+    if declared != signature:
+        raise ConfigurationError(f"law {name_of(law)!r} was declared as {declared}, but is used as {signature}")
+
+
+def pack_gains(law: Law, numbers: Numbers, kind: Any = None) -> np.ndarray:
+    """The row (P,) of gains that the loop hands to a law, from numbers by name.
+
+    Raises:
+        ConfigurationError: a name that is missing or unknown, or an array of the wrong shape; says which, and shows the names.
+            With a ``kind``: the law was declared as another one.
+    """
+    if kind is not None and interface(law).signature is not None:
+        require_kind(law, kind)
+    return interface(law).gains.row(numbers, Owner(name_of(law), "gain"))
+
+
+def pack_state(law: Law, numbers: Numbers) -> np.ndarray:
+    """The row (S,) of a law's state, from numbers by name; what is left out starts at 0.
+
+    Raises:
+        ConfigurationError: an unknown name, or an array of the wrong shape; says which, and shows the names.
+    """
+    return interface(law).state.row(numbers, Owner(name_of(law), "state"), default=0.0)
+
+
+def as_gains(law: Law, numbers: Numbers) -> Any:
+    """Gains as a law reads them, for calling it from Python; see :func:`pack_gains`."""
+    return interface(law).gains.view(pack_gains(law, numbers))
+
+
+def as_state(law: Law, numbers: Numbers) -> Any:
+    """State as a law reads and writes it, for calling it from Python; see :func:`pack_state`."""
+    return interface(law).state.view(pack_state(law, numbers))
+
+
+def gains_of(owner: Any, **given: Any) -> dict[str, Any]:
+    """Gains of ``owner.law`` by name: those given, and all others from the fields of ``owner`` that have their names.
+
+    Raises:
+        ConfigurationError: the law has a gain that is neither given nor a field.
+    """
+    names = interface(owner.law).gains.names
+    for name in names:
+        if name not in given and not hasattr(owner, name):
+            raise ConfigurationError(
+                f"law {name_of(owner.law)!r} has a gain {name!r}, which {type(owner).__name__} has no field for; its names: "
+                f"{', '.join(names)}"
+            )
+    return {name: getattr(owner, name) for name in names if name not in given} | given
+
+
+def name_of(law: Law) -> str:
+    """A law's name, for messages."""
+    return str(getattr(law, "__name__", repr(law)))
+
+
+def refuse_undeclared(law: Law, error: Exception) -> None:
+    """Raise ConfigurationError if an error means that a law uses a name that it does not declare; else do nothing.
+
+    NumPy's records say so by AttributeError, numba's compiler by KeyError.
+    """
+    said = re.search(r"record'? object has no attribute '(\w+)'", str(error)) if isinstance(error, AttributeError) else None
+    wrong = said.group(1) if said else error.args[0] if isinstance(error, KeyError) else None
+    declared = interface(law)
+    if wrong is None or wrong in (*declared.gains.names, *declared.state.names):
+        return
+    names = (
+        f"{word}: {', '.join(names.names) or 'none'}" for word, names in (("gains", declared.gains), ("state", declared.state))
+    )
+    raise ConfigurationError(f"law {name_of(law)!r} uses {wrong!r}, which it does not declare; {'; '.join(names)}") from error

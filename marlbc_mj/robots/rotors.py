@@ -1,0 +1,67 @@
+"""The numbers of a rotorcraft's laws, read from its MJCF: shares of the rotors are the pseudo-inverse of what they do."""
+
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from marlbc_mj.robots.multirotor import MOST_ROTORS
+from marlbc_mj.util.errors import ConfigurationError
+
+HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # of the height [1/s^2, 1/s]
+
+
+class Attitude(NamedTuple):
+    """Closed-loop response of roll, pitch and yaw, and the lag of the thrust."""
+
+    stiffness: tuple[float, float, float]  # a [1/s^2]
+    damping: tuple[float, float, float]  # b [1/s]
+    thrust_lag: float  # [s]
+
+
+class Numbers(NamedTuple):
+    """What the two laws need to know of a robot, and its mass."""
+
+    params: dict[str, Any]
+    state: dict[str, Any]
+    mass: float  # [kg]
+
+
+def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> Numbers:
+    """Gains and state of the two laws for a robot at rest, and its mass.
+
+    Raises:
+        ConfigurationError: the rotors cannot give thrust and three moments, or are too many.
+    """
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    mass, gravity = float(model.body(body).subtreemass[0]), -float(model.opt.gravity[2])
+    params = {
+        "mass": mass,
+        "gravity": gravity,
+        "height": float(data.body(body).xpos[2]),
+        "height_stiffness": HEIGHT_STIFFNESS,
+        "height_damping": HEIGHT_DAMPING,
+        "inertia": tuple(model.body(body).inertia.tolist()),
+        **attitude._asdict(),
+        **_rotors(model, data, spec.modelname),
+    }
+    return Numbers(params, {"axis": (0.0, 0.0, 1.0), "thrust": mass * gravity}, mass)
+
+
+def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:
+    """The gains that are one number or row per rotor, padded with zeros to MOST_ROTORS."""
+    if model.nu > MOST_ROTORS:
+        raise ConfigurationError(f"{name}: at most {MOST_ROTORS} rotors, got {model.nu}")
+    effect = np.zeros((model.nu, model.nv))
+    mujoco.mju_sparse2dense(effect, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
+    if np.linalg.matrix_rank(rotors, tol=1e-9) < 4:
+        raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and three moments")
+    shares = np.linalg.pinv(rotors)
+    least, most = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    lift = rotors[0] / model.actuator_gainprm[:, 0]
+    own = {"thrust_share": shares[:, 0], "moment_share": shares[:, 1:], "least": least, "most": most, "lift": lift}
+    padding = MOST_ROTORS - model.nu
+    return {key: [*rows.tolist(), *np.zeros((padding, *rows.shape[1:])).tolist()] for key, rows in own.items()}
