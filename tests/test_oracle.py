@@ -67,7 +67,7 @@ def test_the_scripted_returns_of_the_entries_are_the_reference_values():
 def test_another_scenario_has_no_schedule_and_says_how_to_get_one(scenario):
     """The message names scenario, controller and command."""
     with pytest.raises(ConfigurationError, match="no schedule for scenario 'paper' under 'sorlc' .* marlbc oracle"):
-        Oracle().start(scenario)
+        Oracle().start(scenario, 1)
 
 
 def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
@@ -77,7 +77,7 @@ def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
         supervisor = make_supervisor("oracle-schedule", controller)
         assert supervisor.schedule(draws) == Oracle(controller).schedule(PAPER)
     with pytest.raises(ConfigurationError, match="no schedule"):
-        supervisor.start(replace(draws, force_limit=150.0))
+        supervisor.start(replace(draws, force_limit=150.0), 1)
 
 
 def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
@@ -86,7 +86,7 @@ def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
     with pytest.raises(ConfigurationError, match="under 'lqr'"):
         Oracle("lqr", cache=tmp_path / "none.json").entry(PAPER)
     with pytest.raises(ConfigurationError, match="'nonsense'; choose from: sorlc"):
-        Oracle("nonsense").start(PAPER)
+        Oracle("nonsense").start(PAPER, 1)
 
 
 def test_a_broken_cache_is_refused(tmp_path):
@@ -95,7 +95,7 @@ def test_a_broken_cache_is_refused(tmp_path):
     for text in ("{", "[]"):
         broken.write_text(text)
         with pytest.raises(ConfigurationError, match=r"broken\.json"):
-            Oracle(cache=broken).start(PAPER)
+            Oracle(cache=broken).start(PAPER, 1)
 
 
 def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):

@@ -9,7 +9,8 @@ import torch
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
+from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
+from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.training.config import Shaping, TrainConfig
 from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.util.errors import ConfigurationError
@@ -66,10 +67,10 @@ class BaseTrainer(ABC):
         """The networks whose largest output is the greedy action."""
 
     @abstractmethod
-    def advance(self) -> Outcome:
+    def advance(self) -> DecisionOutcome:
         """One decision in every world, and what is learned then."""
 
-    def judge(self, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def judge(self, outcome: DecisionOutcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """(B, N) float32 rewards to learn from, and bool: the agent's return ends here, by the mission's end or its own loss;
         the agent came too close.
         """
@@ -126,7 +127,7 @@ class BaseTrainer(ABC):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, by owner and name."""
-        return [(self, "state"), *((self.batch, name) for name in ("cut", "last", "age"))]
+        return [(self, "state"), *((self.batch, name) for name in ("cut", "last"))]
 
 
 def make_starts(config: TrainConfig) -> Starts:
@@ -144,13 +145,13 @@ def unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarr
     return {name.removeprefix(f"{prefix}."): array for name, array in arrays.items() if name.startswith(f"{prefix}.")}
 
 
-def shaped_reward(outcome: Outcome, shaping: Shaping) -> np.ndarray:
+def shaped_reward(outcome: DecisionOutcome, shaping: Shaping) -> np.ndarray:
     """(B, N) float32: the reward of every agent, made from the printed terms as ``shaping`` says; see :func:`lost`."""
     team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps
     own = outcome.switches * (shaping.own_switch_cost + shaping.haste_cost * (outcome.age < shaping.dwell))
     return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
 
 
-def lost(outcome: Outcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
+def lost(outcome: DecisionOutcome, shaping: Shaping, safe_distance: float) -> np.ndarray:
     """(B, N) bool: agents that came too close."""
     return np.asarray(outcome.clearance < safe_distance + shaping.margin)

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from marlbc_mj.controllers import CONTROLLERS, Controller, make_controller
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, run_episode
 from marlbc_mj.recording.reader import read_log
@@ -19,7 +20,7 @@ from marlbc_mj.report.seed_page import write_seed_report
 from marlbc_mj.results.seeds import SeedResults, check_free, perturbed, run_methods, seed_range
 from marlbc_mj.results.summary import Result, method_key
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS, Decision, Situation, Supervisor, make_supervisor
+from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS, Decision, Supervisor, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
 from marlbc_mj.util.files import check_folder, staged_folder, write_json
 from marlbc_mj.util.provenance import provenance
@@ -143,13 +144,13 @@ class Stopwatch:
         self.supervisor = supervisor
         self.solver_ms: list[float] = []
 
-    def start(self, scenario: Scenario) -> Any:
+    def start(self, scenario: Scenario, teams: int) -> Any:
         """The supervisor's memory."""
-        return self.supervisor.start(scenario)
+        return self.supervisor.start(scenario, teams)
 
-    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
+    def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
         """The supervisor's orders."""
-        orders, memory = self.supervisor.decide(situation, memory)
+        orders, memory = self.supervisor.decide(observation, memory)
         spent = getattr(memory, "solver_ms", None)
         if spent is not None:
             self.solver_ms.append(float(spent))
@@ -178,13 +179,13 @@ def run_method(
     law, chief = make_controller(controller), Stopwatch(make_supervisor(supervisor, controller))
     try:
         world = World(scenario, law, record=True)
-        chief.start(scenario)
+        chief.start(scenario, 1)
     except MarlbcError as error:
         return Result.failed(*names, f"cannot start: {error}")
 
     def step_done(frame: Frame) -> None:
-        if round(frame.time / scenario.mission_step) % 50 == 0:
-            say(key, frame.time, scenario.duration)
+        if frame.observation.step % 50 == 0:
+            say(key, float(frame.observation.time), scenario.duration)
 
     try:
         if folder is None:
@@ -266,7 +267,7 @@ def run_single(
     config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
     check_folder(out, overwrite=overwrite)
     World(scenario, make_controller(controller))
-    make_supervisor(supervisor, controller).start(scenario)  # a method that cannot start is a wrong setting here
+    make_supervisor(supervisor, controller).start(scenario, 1)  # a method that cannot start is a wrong setting here
     say = progress or (lambda what, done, total: None)
     result = run_method(scenario, supervisor, controller, seed, out, say, overwrite)
     if result.metrics is None:

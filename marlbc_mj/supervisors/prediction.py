@@ -1,55 +1,105 @@
 """What candidate order sequences lead to: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
 
-Both predictions fill the same *trails* (C, H, N, 2): the position of every agent at the end of every predicted mission step, for
-each of C candidates. One cost judges them. Candidates are shared out over threads; results do not depend on how many. Obstacles
-that move are predicted to keep the velocity they have.
+A *pair* is a team and one of its candidates; C counts the pairs of all B teams. Both predictions fill the same *trails*
+(C, H, N, 2): the position of every agent at the end of every predicted mission step, for each pair. One cost judges them. Pairs
+are shared out over threads; results do not depend on how many. Obstacles that move are predicted to keep the velocity they have.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
-from marlbc_mj.core.laws import allocation_free, compiled
+from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
 from marlbc_mj.engine.limits import keep, limit
-from marlbc_mj.engine.loop import path_at, set_references
-from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.loop import path_at
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
-from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.references import ROOM, Composition, set_velocities
 
-SCRATCH = 11
-"""Rows of two that one candidate needs: desired path, what ``set_references`` asks for, and a normal."""
+SCRATCH = ROOM + 1
+"""Rows of two that one pair needs: those of a composition, and a normal."""
+
+
+class Weights(NamedTuple):
+    """The numbers of the cost."""
+
+    formation: float  # w_F, per agent and step
+    reconstruction: float  # w_R, per agent and step
+    slack: float  # of missing clearance [1/m]
+    clearance: float  # wanted [m]
+    scale: float  # of distances to slots [m]
+
+
+class Problem(NamedTuple):
+    """What a prediction asks of the mission; flat, for compiled code."""
+
+    mission_step: float  # [s]
+    limits: np.ndarray  # (2,) speed [m/s] and acceleration [m/s^2] of references
+    formations: np.ndarray  # (2, N, 2) slots of FM, then of FR [m]
+    w_formation: float  # the rest as in :class:`Weights`
+    w_reconstruction: float
+    w_slack: float
+    least: float
+    scale: float
+
+
+class Teams(NamedTuple):
+    """Where predictions for B teams begin."""
+
+    first: np.ndarray  # (B,) int64, mission steps made
+    start: np.ndarray  # (B, N, 2) [m]
+    moving: np.ndarray  # (B, N, 2) velocity that references of limited acceleration go on from [m/s]
+    obstacles: np.ndarray  # (B, K, 3), or (B, K, 5) where they move
+
+
+class Pairs(NamedTuple):
+    """The candidates of every team, one team after the other; many pairs may share a sequence of orders."""
+
+    team: np.ndarray  # (C,) int64, below B
+    sequence: np.ndarray  # (C,) int64, below S
+    orders: np.ndarray  # (S, H, N) int64, indices into scenario.orders
+
+
+class Scratch(NamedTuple):
+    """What a pair needs room for."""
+
+    rows: np.ndarray  # (C, SCRATCH, 2)
+    velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
+    obstacles: np.ndarray  # (C, K, 3 or 5)
+    grid: np.ndarray  # (C, room)
+
+
+def problem(scenario: Scenario, weights: Weights) -> Problem:
+    """Of a scenario under the weights of a cost."""
+    limits = np.array([scenario.speed_limit, scenario.acceleration_limit])
+    return Problem(scenario.mission_step, limits, scenario.formations, *weights)
 
 
 @allocation_free
-def roll_out(  # type: ignore[no-untyped-def]
-    start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits, obstacles, drifted,
-    grid, scratch, v_r, before_v, trail,
-):  # fmt: skip
-    """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
-
-    Args:
-        start: (N, 2) [m] at mission step ``first``; moving: (N, 2) its velocity [m/s], from which limited references go on.
-        limits: speed [m/s] and acceleration [m/s^2] of references; before_v: (N, 2), scratch.
-        orders: (H, N) int64, indices into ``table``.
-        path: (2, 2), p_cd(0) [m] and its velocity [m/s]; obstacles: (K, 3), or (K, 5) now; drifted: the same, scratch.
-        sees, grid: as ``set_references`` takes them; scratch: (SCRATCH, 2); v_r: (N, 2), scratch.
-        trail: (H, N, 2) [m], written in place.
+def predict_reference(c, composition, problem, teams, pairs, scratch, trail):  # type: ignore[no-untyped-def]
+    """Reference trail (H, N, 2) [m] of pair ``c``: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual``
+    reference.
     """
-    now = scratch[:2]
-    before = start
-    for i in range(start.shape[0]):
+    b, orders, duration = pairs.team[c], pairs.orders[pairs.sequence[c]], problem.mission_step
+    v_r, before_v = scratch.velocity[c, 0], scratch.velocity[c, 1]
+    before = teams.start[b]
+    for i in range(before.shape[0]):
         for axis in range(2):
-            v_r[i, axis] = moving[i, axis]
+            v_r[i, axis] = teams.moving[b, i, axis]
     for k in range(orders.shape[0]):
-        path_at((first + k) * mission_step, path, now)
-        keep(limits, v_r, before_v)
-        seen = _after(k * mission_step, obstacles, drifted)
-        set_references(behavior_laws, behavior_params, sees, table, orders[k], before, now, seen, grid, scratch[2:9], v_r)
-        limit(limits, mission_step, before_v, v_r)
-        for i in range(start.shape[0]):
+        keep(problem.limits, v_r, before_v)
+        seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
+        t = (teams.first[b] + k) * duration
+        set_velocities(composition, orders[k], t, before, seen, scratch.grid[c], scratch.rows[c, :ROOM], v_r)
+        limit(problem.limits, duration, before_v, v_r)
+        for i in range(before.shape[0]):
             for axis in range(2):
-                trail[k, i, axis] = before[i, axis] + mission_step * v_r[i, axis]
+                trail[k, i, axis] = before[i, axis] + duration * v_r[i, axis]
         before = trail[k]
 
 
@@ -63,104 +113,99 @@ def _after(t, obstacles, drifted):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted, weights, scratch):  # type: ignore[no-untyped-def]
-    """Sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
+def trail_cost(c, composition, problem, teams, pairs, scratch, trail):  # type: ignore[no-untyped-def]
+    """Cost of the trail (H, N, 2) [m] of pair ``c``.
 
-    Slots are those of the desired centroid. ``weights`` (5,): w_F, w_R, w_slack [1/m], d_min [m], scale [m];
-    ``formations`` (2, N, 2) [m]; ``scratch`` (SCRATCH, 2).
+    The sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
+    Slots are those of the desired centroid.
     """
-    now, normal = scratch[:2], scratch[9]
+    b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
+    now, normal = scratch.rows[c, :2], scratch.rows[c, ROOM]
     cost = 0.0
     for k in range(trail.shape[0]):
-        path_at((first + k + 1) * mission_step, path, now)
-        seen = _after((k + 1) * mission_step, obstacles, drifted)
+        path_at((teams.first[b] + k + 1) * duration, composition.path, now)
+        seen = _after((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
         for i in range(trail.shape[1]):
             for which in range(2):
                 x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
                 y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
-                cost += weights[which] * min(1.0, np.sqrt(x * x + y * y) / weights[4])
-            cost += weights[2] * max(0.0, weights[3] - nearest_obstacle(trail[k, i], seen, normal))
+                weight = problem.w_formation if which == 0 else problem.w_reconstruction
+                cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
+            cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(trail[k, i], seen, normal))
     return cost
 
 
 @allocation_free
-def judge_candidate(  # type: ignore[no-untyped-def]
-    c, kinematic, start, moving, first, mission_step, orders, behavior_laws, behavior_params, sees, table, path, limits,
-    formations, obstacles, drifted, grid, weights, scratch, v_r, before_v, trails, costs,
-):  # fmt: skip
-    """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
+def judge_pair(c, kinematic, composition, problem, teams, pairs, scratch, trails, costs):  # type: ignore[no-untyped-def]
+    """Cost of pair ``c``, after its reference is predicted unless its trail was filled by other means."""
     if kinematic:
-        roll_out(
-            start, moving, first, mission_step, orders[c], behavior_laws, behavior_params, sees, table, path, limits, obstacles,
-            drifted[c], grid[c], scratch[c], v_r[c], before_v[c], trails[c],
-        )  # fmt: skip
-    costs[c] = trail_cost(trails[c], first, mission_step, path, formations, obstacles, drifted[c], weights, scratch[c])
+        predict_reference(c, composition, problem, teams, pairs, scratch, trails[c])
+    costs[c] = trail_cost(c, composition, problem, teams, pairs, scratch, trails[c])
 
 
 @compiled
-def judge_serial(candidates, *args):  # type: ignore[no-untyped-def]
-    """:func:`judge_candidate` of every candidate, one after the other."""
-    for c in range(candidates):
-        judge_candidate(c, *args)
+def _judge_serial(kinematic, composition, problem, teams, pairs, scratch, trails, costs):  # type: ignore[no-untyped-def]
+    """:func:`judge_pair` of every pair, one after the other."""
+    for c in range(costs.shape[0]):
+        judge_pair(c, kinematic, composition, problem, teams, pairs, scratch, trails, costs)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def judge_parallel(candidates, *args):  # type: ignore[no-untyped-def]
-    """:func:`judge_candidate` of every candidate, shared out over numba's threads; the same numbers as in series."""
-    for c in numba.prange(candidates):
-        judge_candidate(c, *args)
+@threaded
+def _judge_parallel(kinematic, composition, problem, teams, pairs, scratch, trails, costs):  # type: ignore[no-untyped-def]
+    """:func:`judge_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
+    for c in numba.prange(costs.shape[0]):
+        judge_pair(c, kinematic, composition, problem, teams, pairs, scratch, trails, costs)
 
 
-def judge(
-    plan: Plan, start: np.ndarray, first: int, orders: np.ndarray, obstacles: np.ndarray, weights: np.ndarray, *,
-    moving: np.ndarray | None = None, threads: int = 1, trails: np.ndarray | None = None,
+def judge_pairs(
+    scenario: Scenario, composition: Composition, weights: Weights, teams: Teams, pairs: Pairs, *,
+    threads: int = 1, trails: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) from positions ``start`` (N, 2) at step ``first``.
+    """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
-    ``moving`` (N, 2) [m/s], zero by default, is the velocity that references of limited acceleration go on from.
-    ``weights`` as in :func:`trail_cost`; ``trails`` given are judged as they are, else the kinematic reference is rolled out.
+    ``trails`` given are judged as they are, else the kinematic reference is predicted.
     """
-    candidates, scenario = len(orders), plan.scenario
-    kinematic = trails is None
+    kinematic, count = trails is None, len(pairs.team)
     if trails is None:
-        trails = np.empty((*orders.shape, 2))
-    costs = np.empty(candidates)
-    arguments = (
-        kinematic, np.ascontiguousarray(start), np.ascontiguousarray(np.zeros_like(start) if moving is None else moving), first,
-        scenario.mission_step, orders, plan.behavior_laws, plan.behavior_params, plan.sees, scenario.orders.table, plan.path,
-        plan.limits, scenario.formations, np.ascontiguousarray(obstacles), np.zeros((candidates, *obstacles.shape)),
-        np.zeros((candidates, plan.grid_room)), weights, np.zeros((candidates, SCRATCH, 2)),
-        *np.zeros((2, candidates, scenario.agents, 2)), trails, costs,
-    )  # fmt: skip
-    if threads == 1 or candidates == 1:
-        judge_serial(candidates, *arguments)
+        trails = np.empty((count, *pairs.orders.shape[1:], 2))
+    costs = np.empty(count)
+    scratch = Scratch(
+        np.zeros((count, SCRATCH, 2)),
+        np.zeros((count, 2, scenario.agents, 2)),
+        np.zeros((count, *teams.obstacles.shape[1:])),
+        np.zeros((count, grid_room(scenario))),
+    )
+    arguments = kinematic, composition, problem(scenario, weights), teams, pairs, scratch, trails, costs
+    if threads == 1 or count == 1:
+        _judge_serial(*arguments)
     else:
         numba.set_num_threads(threads)
-        judge_parallel(candidates, *arguments)
+        _judge_parallel(*arguments)
     return costs, trails
 
 
-def follow(twin: World, situation: Situation) -> None:
-    """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
-    state = twin.state
-    state.position[0], state.velocity[0], state.obstacles[0] = situation.position, situation.velocity, situation.obstacles
+def follow(twins: World, observation: Observation) -> None:
+    """Put twins (worlds of their own, one per team) where the measured teams are; references and controllers stay theirs."""
+    state = twins.state
+    state.position[:], state.velocity[:], state.obstacles[:] = observation.position, observation.velocity, observation.obstacles
     if state.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
-        place, velocity = situation.obstacles[:, :3], situation.obstacles[:, 3:]
-        state.motions[0, :, :2], state.motions[0, :, 2:] = velocity, 0.0
-        state.anchors[0] = place
-        state.anchors[0, :, :2] -= velocity * situation.time
-    state.put(0, twin.data[0], situation.position, situation.velocity)
+        place, velocity = observation.obstacles[..., :3], observation.obstacles[..., 3:]
+        state.motions[..., :2], state.motions[..., 2:] = velocity, 0.0
+        state.anchors[:] = place
+        state.anchors[..., :2] -= velocity * observation.time[:, None, None]
+    for b in range(twins.worlds):
+        state.put(b, twins.data[b], observation.position[b], observation.velocity[b])
 
 
-def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:
-    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) through MuJoCo: measured positions, from the twin's state on.
+def simulate(twins: World, team: int, worlds: World, orders: np.ndarray) -> np.ndarray:
+    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) of one team through MuJoCo: positions, from its twin's state on.
 
     ``worlds`` holds at least C worlds; those left over repeat the first candidate. A world that diverges stays where it did.
     """
     candidates, horizon = orders.shape[:2]
     every = np.concatenate([orders, np.repeat(orders[:1], worlds.worlds - candidates, axis=0)])
     for c in range(worlds.worlds):
-        worlds.copy_world(twin, 0, c)
+        worlds.copy_world(twins, team, c)
     trails = np.empty((*orders.shape, 2))
     for k in range(horizon):
         worlds.advance(np.ascontiguousarray(every[:, k]))
