@@ -15,6 +15,7 @@ from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA = 0, 1, 2
+_STATES = np.array([_FM, _FR, _OA])[:, None, None]
 
 
 class Membership(NamedTuple):
@@ -76,14 +77,12 @@ class FMS:
 
     def decide(self, observation: Observation, memory: FuzzyMemory) -> tuple[np.ndarray, FuzzyMemory]:
         """One rule base per agent, on its own clearance."""
-        clearance, in_force = observation.clearance, memory.state[None]
+        clearance, state = observation.clearance, memory.state
         sets = memberships(clearance, _rate(clearance, memory), memory.safe_distance)
         strength = np.stack([sets.far, sets.mid * sets.closing, sets.near])  # (3, B, N) by state
-        kept = np.take_along_axis(strength, in_force, axis=0) + sets.mid * sets.opening
-        np.put_along_axis(strength, in_force, kept, axis=0)
-        winner = strength.argmax(axis=0)
-        ahead = (strength.max(axis=0) - kept[0]) >= self.lead
-        state = np.where(ahead & (winner != memory.state), winner, memory.state)
+        strength += np.where(state == _STATES, sets.mid * sets.opening, 0.0)
+        winner, ahead = strength.argmax(axis=0), strength.max(axis=0) - np.choose(state, strength)
+        state = np.where((ahead >= self.lead) & (winner != state), winner, state)
         orders = lift(memory.orders[state], observation, memory.way)
         return orders, memory._replace(state=state, clearance=clearance.copy())
 
