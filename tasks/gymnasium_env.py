@@ -1,4 +1,7 @@
-"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`."""
+"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`.
+
+``gymnasium.make`` and ``gymnasium.make_vec`` know them once :mod:`marlbc_mj.tasks` is imported.
+"""
 
 from typing import Any
 
@@ -12,9 +15,6 @@ from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
-
-ID = "marlbc_mj/PaperFormation-v0"
-"""Known to ``gymnasium.make`` and ``gymnasium.make_vec`` once :mod:`marlbc_mj.tasks` is imported."""
 
 
 def state_space(state: State) -> gymnasium.spaces.Box:

@@ -13,7 +13,7 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
 
-TRIES = 20
+PLACES_TRIED = 20
 """Places along the route that are tried for an exploring start."""
 
 
@@ -79,7 +79,7 @@ class Route:
 
         ``anchors`` (K, 3) [m] and ``motions`` (K, 6) are this episode's obstacles; (0, 6): all at rest.
         """
-        for _ in range(TRIES):
+        for _ in range(PLACES_TRIED):
             step = self._decision(rng) * self.interval
             for which in ((0, 1), (1,))[int(rng.integers(2))]:
                 position = self._centre(step) + self.scenario.formations[which]

@@ -14,11 +14,12 @@ from marlbc_mj.policies.states import CLOSE, OLD, RANGE, SPEED, make_state, near
 from marlbc_mj.scenarios import Perturbation, make_scenario
 from marlbc_mj.scenarios.family import Family
 from marlbc_mj.tasks.batch import FormationBatch
-from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
+from marlbc_mj.tasks.gymnasium_env import PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
 
+ID = "marlbc_mj/PaperFormation-v0"
 AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
 
 

@@ -11,14 +11,14 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
-from marlbc_mj.supervisors.prediction import Pairs, Teams, Weights, judge_pairs
+from marlbc_mj.supervisors.prediction import Pairs, Teams, CostWeights, judge_pairs
 from marlbc_mj.supervisors.references import composition
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 SEEN = World(PAPER).observe()
 FM, FR, OA_FM, OA_FR = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM", "OA>FR"))
-FREE = Weights(1.0, 0.3, 0.0, 0.0, 0.5)  # weights without a clearance term
+FREE = CostWeights(1.0, 0.3, 0.0, 0.0, 0.5)  # weights without a clearance term
 
 
 def at(positions, step: int = 0, obstacles=None) -> Observation:
@@ -80,7 +80,7 @@ def test_the_cost_of_two_steps_by_hand():
     trail[0, 0, 0] -= 0.25
     x, y = trail[1, 0]
     obstacle = np.array([[x + 3.9, y, 2.0]])  # 1.9 m ahead in the second step, 2.2 m in the first
-    weights = Weights(1.0, 0.3, 1e4, 2.05, 0.5)
+    weights = CostWeights(1.0, 0.3, 1e4, 2.05, 0.5)
     costs, _ = judge(trail[0], 0, np.zeros((1, 2, 4), dtype=np.int64), obstacle, weights, trails=trail[None])
     assert costs[0] == pytest.approx(2.4 + 0.5 + 1500.0, rel=1e-12)
 

@@ -15,14 +15,23 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, Window, paper
 from marlbc_mj.supervisors import Oracle, Scripted, make_supervisor
-from marlbc_mj.supervisors.oracle import command_table, evaluate, read_cache, save, search, segments, shipped, windows_of
+from marlbc_mj.supervisors.oracle import (
+    command_table,
+    evaluate,
+    read_cache,
+    save_schedule,
+    search,
+    segments,
+    shipped_schedules,
+    windows_of,
+)
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 SHORT = paper(
     name="short", duration=4.0, obstacles=(), schedule=(Window(1.025, 2.025, -1, "FR"),)
 )  # where FM throughout is better
-SHIPPED = sorted(entry["controller"] for entry in read_cache(shipped()).values())
+SHIPPED = sorted(entry["controller"] for entry in read_cache(shipped_schedules()).values())
 
 
 def test_the_case_studys_controller_is_among_the_shipped():
@@ -108,8 +117,8 @@ def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):
     assert [total for _, total in calls] == sorted(total for _, total in calls) and calls[-1][1] == found.total
     assert found.scripted is not None and found.total > found.scripted
     cache = tmp_path / "schedules.json"
-    save(found, SHORT, "pd", cache)
-    save(found._replace(total=0.0), SHORT, "lqr", cache)
+    save_schedule(found, SHORT, "pd", cache)
+    save_schedule(found._replace(total=0.0), SHORT, "lqr", cache)
     assert len(json.loads(cache.read_text())) == 2
     oracle = Oracle("pd", cache=cache)
     trajectory = run_episode(World(SHORT, make_controller("pd"), record=True), oracle)

@@ -112,7 +112,7 @@ class LogWriter:
         Raises:
             SimulationError: the disk does not take it.
         """
-        stamp = round(frame.observation.time * 1e9)
+        stamp = round(float(frame.observation.time) * 1e9)
         try:
             for topic, data in self._messages(frame, stamp):
                 self._mcap.add_message(self._channels[topic], stamp, data, stamp, self._steps)

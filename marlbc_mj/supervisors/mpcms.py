@@ -9,11 +9,12 @@ tolerance, up to one of it, since beyond it a formation is lost whatever the dis
 pull at agents in the column too, and then avoidance serves as a brake that keeps them from it (measured: switches 6/4/2/6).
 A step costs w_R per agent in formation, w_F in the column and w_F + w_R in neither, which is how G orders them.
 
-The cost's terms, H and weights are the project's specification. Reconstructed are E, the slots (those of the desired centroid),
-the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the candidates: hold the joint
-order, or change it once, at one of the ``instants``: either the whole team to FM or to FR, or avoidance on top of (or off) the
-common motion behavior for up to ``together`` agents. One agent at a time is what makes a column of the gate, where two discs
-close in on two agents: with two at a time the team dodges into it instead, and two agents violate (measured: 1.5 and 1.1 s).
+The cost's terms, H and weights are the project's specification. The rest is reconstructed: E, the slots (those of the desired
+centroid), the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the candidates.
+These hold the joint order, or change it once, at one of the ``instants``: either the whole team to FM or to FR, or avoidance on
+top of (or off) the common motion behavior for up to ``together`` agents. With one agent at a time the team forms a column at the
+gate, where two discs close in on two agents. With two at a time it dodges into the gate, and two agents violate (measured: 1.5
+and 1.1 s).
 The margin published there, 0.05 m, is one for a reference; the agents lag behind it when it jumps. With it the case study sees
 0.035 s of violation at the entry of the gate, so 0.15 m is the default.
 
@@ -35,13 +36,13 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
-from marlbc_mj.supervisors.prediction import Pairs, Teams, Weights, follow, judge_pairs, simulate
+from marlbc_mj.supervisors.prediction import Pairs, Teams, CostWeights, follow, judge_pairs, simulate
 from marlbc_mj.supervisors.references import Composition, composition
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
-MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision
+MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
-STARTS = ("measured", "reference")
+PREDICTED_FROM = ("measured", "reference")
 AVOIDANCE = "OA"
 
 
@@ -119,8 +120,8 @@ class MPCMS:
             )
         if self.prediction not in PREDICTIONS:
             raise unknown("MPCMS prediction", self.prediction, PREDICTIONS)
-        if self.start_from not in STARTS:
-            raise unknown("MPCMS start_from", self.start_from, STARTS)
+        if self.start_from not in PREDICTED_FROM:
+            raise unknown("MPCMS start_from", self.start_from, PREDICTED_FROM)
         if self.threads > numba.config.NUMBA_NUM_THREADS:
             most = numba.config.NUMBA_NUM_THREADS
             raise ConfigurationError(f"MPCMS threads must be between 1 and {most} on this machine, got {self.threads}")
@@ -183,7 +184,7 @@ class MPCMS:
             start = memory.reference
         scenario, seen = memory.scenario, observation
         least, scale = scenario.safe_distance + self.margin, scenario.formation_tolerance
-        weights = Weights(self.w_formation, self.w_reconstruction, self.slack, least, scale)
+        weights = CostWeights(self.w_formation, self.w_reconstruction, self.slack, least, scale)
         teams = Teams(*map(np.ascontiguousarray, (seen.step, start, seen.velocity, seen.obstacles)))
         costs, trails = judge_pairs(scenario, memory.composition, weights, teams, pairs, threads=self.threads, trails=trails)
         return costs, trails[:, 0]

@@ -56,7 +56,7 @@ class Evaluation(NamedTuple):
     violated: np.ndarray  # (B, M) bool: d <= d_OA for any agent after any substep of the mission step
 
 
-def shipped() -> Path:
+def shipped_schedules() -> Path:
     """The cache that comes with the package."""
     return Path(str(files("marlbc_mj") / "supervisors" / "oracle_schedules.json"))
 
@@ -85,9 +85,9 @@ def read_cache(path: Path) -> dict[str, Any]:
     return entries
 
 
-def save(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
+def save_schedule(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
     """Add a schedule to the cache (the shipped one by default), in the place of a former one with the same key."""
-    path = path or shipped()
+    path = path or shipped_schedules()
     entry = {"scenario": scenario.name, "controller": controller, **found._asdict(), "versions": versions()}
     write_json(path, read_cache(path) | {cache_key(scenario, make_controller(controller)): entry})
 
@@ -119,7 +119,7 @@ class Oracle:
 
     def entry(self, scenario: Scenario) -> dict[str, Any]:
         """The cache's entry: windows, total (return), seed, budget, episodes, versions."""
-        entries = read_cache(self.cache or shipped())
+        entries = read_cache(self.cache or shipped_schedules())
         known = replace(scenario, perturbation=Perturbation()) if self.unperturbed else scenario
         key = cache_key(known, make_controller(self.controller))
         if key not in entries:
@@ -206,7 +206,7 @@ def command_table(scenario: Scenario, windows: tuple[Window, ...]) -> np.ndarray
     """(M, N) index into ``scenario.orders.commands`` at every mission step, as the scripted supervisor gives them."""
     schedule = Scripted(windows, scenario.formation_names[0]).start(scenario, 1)
     times = np.arange(scenario.mission_steps) * scenario.mission_step
-    return scenario.orders.command_of[orders_at(times, schedule)]
+    return np.asarray(scenario.orders.command_of[orders_at(times, schedule)])
 
 
 def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:

@@ -21,11 +21,11 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.references import ROOM, Composition, set_velocities
 
-SCRATCH = ROOM + 1
+PAIR_ROOM = ROOM + 1
 """Rows of two that one pair needs: those of a composition, and a normal."""
 
 
-class Weights(NamedTuple):
+class CostWeights(NamedTuple):
     """The numbers of the cost."""
 
     formation: float  # w_F, per agent and step
@@ -41,7 +41,7 @@ class Problem(NamedTuple):
     mission_step: float  # [s]
     limits: np.ndarray  # (2,) speed [m/s] and acceleration [m/s^2] of references
     formations: np.ndarray  # (2, N, 2) slots of FM, then of FR [m]
-    w_formation: float  # the rest as in :class:`Weights`
+    w_formation: float  # the rest as in :class:`CostWeights`
     w_reconstruction: float
     w_slack: float
     least: float
@@ -68,13 +68,13 @@ class Pairs(NamedTuple):
 class Scratch(NamedTuple):
     """What a pair needs room for."""
 
-    rows: np.ndarray  # (C, SCRATCH, 2)
+    rows: np.ndarray  # (C, PAIR_ROOM, 2)
     velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
     obstacles: np.ndarray  # (C, K, 3 or 5)
     grid: np.ndarray  # (C, room)
 
 
-def problem(scenario: Scenario, weights: Weights) -> Problem:
+def problem(scenario: Scenario, weights: CostWeights) -> Problem:
     """Of a scenario under the weights of a cost."""
     limits = np.array([scenario.speed_limit, scenario.acceleration_limit])
     return Problem(scenario.mission_step, limits, scenario.formations, *weights)
@@ -158,7 +158,7 @@ def _judge_parallel(kinematic, composition, problem, teams, pairs, scratch, trai
 
 
 def judge_pairs(
-    scenario: Scenario, composition: Composition, weights: Weights, teams: Teams, pairs: Pairs, *,
+    scenario: Scenario, composition: Composition, weights: CostWeights, teams: Teams, pairs: Pairs, *,
     threads: int = 1, trails: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
@@ -170,7 +170,7 @@ def judge_pairs(
         trails = np.empty((count, *pairs.orders.shape[1:], 2))
     costs = np.empty(count)
     scratch = Scratch(
-        np.zeros((count, SCRATCH, 2)),
+        np.zeros((count, PAIR_ROOM, 2)),
         np.zeros((count, 2, scenario.agents, 2)),
         np.zeros((count, *teams.obstacles.shape[1:])),
         np.zeros((count, grid_room(scenario))),

@@ -10,7 +10,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario, Window
 from marlbc_mj.util.errors import ConfigurationError
 
-TOLERANCE = 1e-9
+ON_BOUND = 1e-9
 """A time within this of a bound is on it [s]: 3 * 0.05 > 0.15 in floating point, yet it is the bound."""
 
 
@@ -66,7 +66,7 @@ def _play(time, schedule, orders):  # type: ignore[no-untyped-def]
     """Put the orders of the windows that are open at ``time`` (B,) [s] into ``orders`` (B, N), which are the default."""
     for b in range(len(time)):
         for w in range(len(schedule.start)):
-            if schedule.start[w] + TOLERANCE < time[b] < schedule.end[w] - TOLERANCE:
+            if schedule.start[w] + ON_BOUND < time[b] < schedule.end[w] - ON_BOUND:
                 for i in range(orders.shape[1]):
                     if schedule.agent[w] == i or schedule.agent[w] < 0:
                         orders[b, i] = schedule.order[w]
