@@ -364,6 +364,15 @@ def test_the_extended_state_is_what_it_says(seed, agents):
         read(seen)
 
 
+def test_a_command_that_an_episode_began_with_is_as_old_as_can_be():
+    """Its age is infinite, and the state saturates: the same as at ``OLD`` or any later time."""
+    read, seen = make_state("extended", paper()), World(paper(), worlds=2).observe()
+    assert np.isinf(seen.age).all()
+    for age in (OLD, 2.0 * OLD):
+        assert (read(seen) == read(seen._replace(age=np.full((2, 4), age)))).all()
+    assert (read(seen) != read(seen._replace(age=np.full((2, 4), 0.9 * OLD)))).sum() == 8
+
+
 def test_the_extended_state_does_not_know_where_on_the_path_it_is():
     """Team and obstacles moved together along the path: the same state."""
     scenario = paper()

@@ -11,7 +11,7 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
-from marlbc_mj.supervisors.prediction import Pairs, Teams, CostWeights, judge_pairs
+from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
 from marlbc_mj.supervisors.references import composition
 from marlbc_mj.util.errors import ConfigurationError
 

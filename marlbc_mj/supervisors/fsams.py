@@ -1,4 +1,4 @@
-"""FSAMS, the finite-state-automata mission supervisor (Marino et al. 2013; the rule stands in section 4.2.1 of the paper, erratum 8)."""
+"""FSAMS, the finite-state-automata mission supervisor (Marino et al. 2013; its rule: section 4.2.1, erratum 8)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

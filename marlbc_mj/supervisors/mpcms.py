@@ -15,7 +15,7 @@ These hold the joint order, or change it once, at one of the ``instants``: eithe
 top of (or off) the common motion behavior for up to ``together`` agents. With one agent at a time the team forms a column at the
 gate, where two discs close in on two agents. With two at a time it dodges into the gate, and two agents violate (measured: 1.5
 and 1.1 s).
-The margin published there, 0.05 m, is one for a reference; the agents lag behind it when it jumps. With it the case study sees
+The specified margin, 0.05 m, suits a reference; the agents lag behind it when it jumps. With that margin the case study sees
 0.035 s of violation at the entry of the gate, so 0.15 m is the default.
 
 The MuJoCo prediction sees that lag, and needs a longer horizon for it: the way back from the column takes about 3 s, so
@@ -36,7 +36,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
-from marlbc_mj.supervisors.prediction import Pairs, Teams, CostWeights, follow, judge_pairs, simulate
+from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, follow, judge_pairs, simulate
 from marlbc_mj.supervisors.references import Composition, composition
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
