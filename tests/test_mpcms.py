@@ -171,6 +171,16 @@ def test_mujoco_prediction_simulates_what_the_world_does():
         np.testing.assert_allclose(memory.reference, observation.position, rtol=0, atol=1e-12)
 
 
+def test_mujoco_prediction_has_a_world_for_every_candidate():
+    """Whoever avoids: with two agents avoiding there is one change more than with one, since none of them is both kinds."""
+    supervisor = MPCMS(horizon=2, instants=(0,), prediction="mujoco")
+    memory = supervisor.start(PAPER, 1)
+    for avoiding in range(5):
+        joint = Joint(0, (True,) * avoiding + (False,) * (4 - avoiding))
+        assert memory.worlds.worlds >= len(supervisor._candidates(PAPER, joint).orders)
+        assert supervisor.decide(SEEN, memory._replace(joints=(joint,)))[0].shape == (1, 4)
+
+
 def test_mujoco_prediction_needs_a_compiled_controller():
     with pytest.raises(ConfigurationError, match="compiled"):
         MPCMS(prediction="mujoco", controller=PythonPD()).start(PAPER, 1)

@@ -82,9 +82,9 @@ class MPCMS:
     its own copy of the reference. The MuJoCo prediction simulates force law, limit and drag of every candidate; what a supervisor
     cannot measure (reference, controller state) comes from a twin world that was given the same orders, the drag is the nominal
     one. That twin is part of the memory and moves with every decision. All teams' candidates are judged in one call; only the
-    MuJoCo prediction simulates one team after the other. Where the scenario has agent avoidance, it goes on top
-    of the orders given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least
-    violation is chosen.
+    MuJoCo prediction simulates one team after the other. Where the scenario has agent avoidance, it goes on top of the orders
+    given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least violation is
+    chosen.
 
     Raises:
         ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
@@ -133,7 +133,7 @@ class MPCMS:
             ConfigurationError: the scenario lacks an order, or the MuJoCo prediction a compiled controller.
         """
         joint = Joint(0, (False,) * scenario.agents)
-        most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True, *joint.avoiding[1:]))))
+        most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True,) * scenario.agents)))
         if most * self.horizon * scenario.agents > MOST_ORDERS:
             raise ConfigurationError(
                 f"MPCMS would predict {most} candidates over {self.horizon} steps for {scenario.agents} agents: more than "
