@@ -9,30 +9,32 @@ import numpy as np
 
 from marlbc_mj.core.behaviors import clearances, clearances_among
 from marlbc_mj.core.motion import NUMBERS, moved
+from marlbc_mj.engine.loop import Record
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import Blend, Supervisor, situation
+from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
+from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
-"""Of robots that are where their p is and never turn."""
+"""Pose of robots that are where their p is and never turn."""
 
 
 class Frame(NamedTuple):
-    """One mission step as it is recorded: the state in which orders were given, and what they led to."""
+    """One mission step as it is recorded: what orders were given on, and what they led to."""
 
-    time: float  # [s] start of the mission step
-    position: np.ndarray  # (N, 2) [m]
-    velocity: np.ndarray  # (N, 2) [m/s]
-    reference: np.ndarray  # (N, 2) p_r [m]
-    reference_velocity: np.ndarray  # (N, 2) v_r [m/s]
-    force: np.ndarray  # (N, 2) applied in the first substep [N]
-    clearance: np.ndarray  # (N,) at the start of the mission step [m]
-    formation: int  # G at the start of the mission step
+    observation: Observation  # of the one team, at the start of the mission step
+    record: Record  # (substeps, N, 2) each
     command: np.ndarray  # (N,) index into scenario.orders.commands
     reward: float  # r1 + r2 of this mission step
     controller_state: np.ndarray  # (N, S) at the start of the mission step
     decision_ms: float  # what the supervisor took [ms]
     pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
+
+    @property
+    def first(self) -> Record:
+        """The first substep, (N, 2) each: where the team was when orders were given, and what it did first."""
+        return Record(*(rows[0] for rows in self.record))
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Trajectory:
 
 def run_episode(
     world: World,
-    supervisor: Supervisor,
+    supervisor: Supervisor | OneTeamSupervisor,
     *,
     seed: int = 0,
     names: tuple[str, str] = ("supervisor", "controller"),
@@ -78,64 +80,56 @@ def run_episode(
     """Run one whole episode in a world made with ``worlds=1, record=True``.
 
     Args:
+        world: where the episode happens.
+        supervisor: decides for B teams, or for one, see :func:`~marlbc_mj.supervisors.one_team.batched`.
         seed: which draw of the scenario.
         names: supervisor's and controller's, for tables and logs.
         on_frame: called after every mission step, a log writer for example.
 
     Raises:
+        ConfigurationError: more than one world, or a decision of wrong shape or type.
         SimulationError: the world diverged.
     """
-    scenario = world.scenario
-    memory = supervisor.start(scenario)
-    observation = world.reset(seed)
-    state = world.state
-    obstacles = state.anchors[0].copy() if scenario.moving else state.obstacles[0].copy()
+    if world.worlds != 1:
+        raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
+    supervisor = batched(supervisor)
+    memory = supervisor.start(world.scenario, 1)
+    observation, done = world.reset(seed), False
     frames: list[Frame] = []
-    substeps: list[np.ndarray] = []
-    formation = []
-    done = False
     while not done:
         began = perf_counter()
-        decision, memory = supervisor.decide(situation(observation, state.obstacles[0].copy(), scenario.mission_step), memory)
+        decision, memory = supervisor.decide(observation, memory)
         decision_ms = 1e3 * (perf_counter() - began)
         controller_state, pose = world.state.controller[0].copy(), _pose(world)
-        if isinstance(decision, Blend):
-            step = world.step(decision.orders[None], decision.velocity[None])
-        else:
-            step = world.step(decision[None])
+        step = carry_out(world, decision)
         assert step.record is not None, "run_episode needs World(record=True)"
-        record = np.stack([rows[0] for rows in step.record])  # (5, substeps, N, 2)
-        frames.append(
-            Frame(
-                float(observation.time[0]),
-                *(record[k, 0] for k in range(5)),  # type: ignore[call-arg]  # five fields, in the order of Record
-                observation.clearance[0],
-                int(observation.formation[0]),
-                step.observation.command[0],
-                float(step.reward[0]),
-                controller_state,
-                decision_ms,
-                pose,
-            )
-        )
+        record = Record(*(rows[0] for rows in step.record))
+        command, reward = step.observation.command[0], float(step.reward[0])
+        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose))
         if on_frame is not None:
             on_frame(frames[-1])
-        substeps.append(record)
-        formation.append(int(step.observation.formation[0]))
         observation, done = step.observation, bool(step.done[0])
-    record = np.concatenate(substeps, axis=1)
+    return _trajectory(world, frames, observation, seed, names)
+
+
+def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int, names: tuple[str, str]) -> Trajectory:
+    """The frames of a whole episode in one world, and the ``last`` observation of its end, as one record."""
+    scenario, state = world.scenario, world.state
+    position, velocity, *others = (np.concatenate(rows) for rows in zip(*(f.record for f in frames), strict=True))
+    reference, reference_velocity, force = others
+    formation = [*(f.observation.formation for f in frames[1:]), last.formation[0]]
     return Trajectory(
         scenario=scenario,
         supervisor=names[0],
         controller=names[1],
         seed=seed,
-        obstacles=obstacles,
-        time=np.arange(record.shape[1]) * scenario.substep,
-        position=np.concatenate([record[0], observation.position]),
-        velocity=np.concatenate([record[1], observation.velocity]),
-        reference=record[2],
-        reference_velocity=record[3],
-        force=record[4],
+        obstacles=(state.anchors if scenario.moving else state.obstacles)[0].copy(),
+        time=np.arange(len(position)) * scenario.substep,
+        position=np.concatenate([position, last.position]),
+        velocity=np.concatenate([velocity, last.velocity]),
+        reference=reference,
+        reference_velocity=reference_velocity,
+        force=force,
         command=np.array([f.command for f in frames]),
         formation=np.array(formation),
         reward=np.array([f.reward for f in frames]),

@@ -1,4 +1,7 @@
-"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`."""
+"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`.
+
+``gymnasium.make`` and ``gymnasium.make_vec`` know them once :mod:`marlbc_mj.tasks` is imported.
+"""
 
 from typing import Any
 
@@ -9,11 +12,9 @@ from gymnasium.vector.utils import batch_space
 from marlbc_mj.controllers import Controller
 from marlbc_mj.policies.states import State
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
+from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
+from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
-
-ID = "marlbc_mj/PaperFormation-v0"
-"""Known to ``gymnasium.make`` and ``gymnasium.make_vec`` once :mod:`marlbc_mj.tasks` is imported."""
 
 
 def state_space(state: State) -> gymnasium.spaces.Box:
@@ -21,7 +22,7 @@ def state_space(state: State) -> gymnasium.spaces.Box:
     return gymnasium.spaces.Box(state.low.astype(np.float32), state.high.astype(np.float32), dtype=np.float32)
 
 
-def terms(outcome: Outcome, safe_distance: float) -> dict[str, np.ndarray]:
+def terms(outcome: DecisionOutcome, safe_distance: float) -> dict[str, np.ndarray]:
     """Per-world infos of a decision: the reward's terms (14), (15) and what safety is judged by."""
     return {
         "formation_reward": outcome.formation,

@@ -14,7 +14,7 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.supervisors import Blend, make_supervisor, situation
+from marlbc_mj.supervisors import Blend, make_supervisor
 from marlbc_mj.supervisors.neighbors import REACH
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -120,7 +120,7 @@ def test_supervisors_put_it_on_top_when_a_neighbor_is_too_close(name):
     supervisor, world = make_supervisor(name), World(scenario)
     near = (0.9 if name == "layered" else 0.9 * REACH) * scenario.behaviors[3].distance
     position = np.array([[0.0, 0.0], [near, 0.0], [40.0, 0.0], [80.0, 0.0]])
-    seen = situation(world.observe(), world.state.obstacles[0], scenario.mission_step)
-    decision, _ = supervisor.decide(seen._replace(position=position, reference=position), supervisor.start(scenario))
+    seen = world.observe()._replace(position=position[None], reference=position[None])
+    decision, _ = supervisor.decide(seen, supervisor.start(scenario, 1))
     orders = decision.orders if isinstance(decision, Blend) else decision
-    assert [scenario.orders.names[k].startswith("AA>") for k in orders] == [True, True, False, False]
+    assert [scenario.orders.names[k].startswith("AA>") for k in orders[0]] == [True, True, False, False]

@@ -48,7 +48,7 @@ def test_a_policy_is_read_as_it_was_written(tmp_path):
         assert a.dtype == b.dtype and np.array_equal(a, b)
     assert found[3:] == policy[3:]
     assert description["signature"] == signed()["signature"] and description["format"] == FORMAT
-    Learned.load(path).start(paper())
+    Learned.load(path).start(paper(), 1)
 
 
 @given(st.data())
@@ -165,7 +165,7 @@ def test_a_signature_says_all_or_it_is_refused(tmp_path):
 def test_what_a_policy_depends_on_must_be_the_same(changes, name, tmp_path):
     write_policy(tmp_path / "p.safetensors", policy_of(), signed())
     learned = Learned.load(tmp_path / "p.safetensors")
-    assert name in refusal(lambda: learned.start(replace(paper(), **changes)))
+    assert name in refusal(lambda: learned.start(replace(paper(), **changes), 1))
 
 
 def test_what_a_policy_copes_with_is_free(tmp_path):
@@ -173,7 +173,7 @@ def test_what_a_policy_copes_with_is_free(tmp_path):
     write_policy(tmp_path / "p.safetensors", policy_of(), signed())
     learned = Learned.load(tmp_path / "p.safetensors")
     for changes in ({"obstacles": ((5.0, 0.0, 1.0),)}, {"perturbation": Perturbation(1.0, 0.5, (0.0, 5.0))}, {"duration": 20.0}):
-        assert learned.start(paper(**changes)).actions.shape == (1, 4)
+        assert learned.start(paper(**changes), 1).actions.shape == (1, 4)
 
 
 @pytest.mark.parametrize(
@@ -190,9 +190,9 @@ def test_what_a_policy_copes_with_is_free(tmp_path):
 def test_networks_that_do_not_fit_their_signature_are_refused(policy, changes, fragment, tmp_path):
     write_policy(tmp_path / "p.safetensors", policy, signed(**changes))
     learned = Learned.load(tmp_path / "p.safetensors")
-    assert fragment in refusal(lambda: learned.start(paper()))
+    assert fragment in refusal(lambda: learned.start(paper(), 1))
 
 
 def test_one_network_of_joint_actions_fits(tmp_path):
     write_policy(tmp_path / "p.safetensors", policy_of(networks=1, actions=256, risk=0.0), signed())
-    Learned.load(tmp_path / "p.safetensors").start(paper())
+    Learned.load(tmp_path / "p.safetensors").start(paper(), 1)

@@ -157,7 +157,7 @@ def test_some_supervisors_run_only_where_they_are_named() -> None:
     assert matrix(("mpcms", "mpcms-mujoco")) == [("mpcms", "sorlc"), ("mpcms-mujoco", "sorlc")]
     slow = make_supervisor("mpcms-mujoco")
     assert isinstance(slow, MPCMS) and slow.prediction == "mujoco"
-    assert slow.start(paper(duration=1.0)).worlds is not None
+    assert slow.start(paper(duration=1.0), 1).worlds is not None
 
 
 @pytest.mark.parametrize("seeds", [[], ["--seeds", "2"]], ids=["one", "seeds"])
@@ -179,19 +179,19 @@ def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
         solver_ms: float
 
     class Solver:
-        def start(self, scenario: Scenario) -> Memory:
+        def start(self, scenario: Scenario, teams: int) -> Memory:
             starts.append(scenario)
             return Memory(0.0)
 
-        def decide(self, situation: Any, memory: Memory) -> tuple[np.ndarray, Memory]:
-            return np.zeros(4, dtype=int), Memory(3.0)
+        def decide(self, observation: Any, memory: Memory) -> tuple[np.ndarray, Memory]:
+            return np.zeros((1, 4), dtype=int), Memory(3.0)
 
     watch = Stopwatch(Solver(), paper())
-    memory = watch.start(paper())
+    memory = watch.start(paper(), 1)
     for _ in range(2):
         _, memory = watch.decide(None, memory)  # type: ignore[arg-type]
     assert watch.share(np.array([4.0, 8.0])) == 0.5 and len(starts) == 1
-    watch.start(paper())
+    watch.start(paper(), 1)
     assert len(starts) == 2  # another episode has a memory of its own
     assert Stopwatch(make_supervisor("scripted"), paper()).share(np.ones(2)) is None
 

@@ -13,11 +13,13 @@ from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.policies.states import CLOSE, OLD, RANGE, SPEED, make_state, nearest_surface
 from marlbc_mj.scenarios import Perturbation, make_scenario
 from marlbc_mj.scenarios.family import Family
-from marlbc_mj.tasks.batch import FormationBatch, Starts
-from marlbc_mj.tasks.gymnasium_env import ID, PaperFormation, PaperFormationVector
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.tasks.gymnasium_env import PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
+from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
 
+ID = "marlbc_mj/PaperFormation-v0"
 AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
 
 
@@ -264,14 +266,15 @@ def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
     batch.cut[batch.cut < 2000] += rng.integers(10, size=(batch.cut < 2000).sum())  # so that they end apart
     for _ in range(25):
         twin.restore(batch.world.snapshot())
-        actions, before = rng.integers(4, size=(12, 4)), batch.age
+        actions, before = rng.integers(4, size=(12, 4)), twin.observe().age
         outcome = batch.step(actions)
         commands = twin.state.command.copy()
         begun = twin.state.steps > 0
         for _ in range(2):
             twin.step(batch.order_of[actions])
         age = np.where((twin.state.command != commands) & begun[:, None], 0.0, before) + 0.1
-        assert (outcome.final_state == batch.read(twin.observe(), twin.state.obstacles, age)).all()
+        np.testing.assert_allclose(twin.observe().age, age, rtol=0, atol=1e-12)
+        assert (outcome.age == before).all() and (outcome.final_state == batch.read(twin.observe())).all()
         ended = outcome.ended
         assert (outcome.final_state[~ended] == outcome.state[~ended]).all()
         assert (outcome.final_state[ended] != outcome.state[ended]).any(axis=1).all()
@@ -284,7 +287,7 @@ def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives()
     points = [20.0 - np.sqrt(3.0), 20.0 + np.sqrt(3.0), 45.0 - np.sqrt(3.0), 45.0 + np.sqrt(3.0)]
     gate = [60.0 - np.sqrt(40.0), 65.0 - np.sqrt(40.0), 70.0 + np.sqrt(40.0), 75.0 + np.sqrt(40.0)]
     batch = FormationBatch(paper(), worlds=200, interval=1, starts=Starts(exploring=1.0, focus=1.0, lead=3.0))
-    found = batch.critical * batch.scenario.mission_step
+    found = batch.route.critical * batch.scenario.mission_step
     assert np.allclose(found, points + gate, atol=0.051)
     batch.reset(0)
     time = batch.world.state.steps * batch.scenario.mission_step
@@ -341,7 +344,8 @@ def test_the_extended_state_is_what_it_says(seed, agents):
     command, formation, age = rng.integers(commands, size=shape), rng.integers(3, size=3), rng.uniform(0.0, 8.0, size=shape)
     obstacles = np.concatenate([rng.normal(size=(3, 6, 2)) * 10.0, rng.uniform(0.0, 3.0, size=(3, 6, 1))], axis=-1)
     seen = world.observe()._replace(position=position, velocity=velocity, command=command, formation=formation)
-    state = read(seen, obstacles, age)
+    seen = seen._replace(obstacles=obstacles, age=age)
+    state = read(seen)
     surfaces = np.empty((2, *shape, 3))
     slots = position.mean(axis=1)[:, None, None] + scenario.formations  # (B, 2, N, 2)
     for b, i in np.ndindex(shape):
@@ -354,10 +358,19 @@ def test_the_extended_state_is_what_it_says(seed, agents):
     expected = np.concatenate([np.concatenate(parts, axis=-1).reshape(3, -1), np.eye(3)[formation]], axis=-1)
     np.testing.assert_allclose(state, np.clip(expected, -1.0, 1.0), atol=1e-7)
     position[1, 1, 0] = np.nan
-    assert np.isnan(read(seen, obstacles, age)).any(axis=1).tolist() == [False, True, False]
+    assert np.isnan(read(seen)).any(axis=1).tolist() == [False, True, False]
     command[2, 0] = commands
     with pytest.raises(IndexError):
-        read(seen, obstacles, age)
+        read(seen)
+
+
+def test_a_command_that_an_episode_began_with_is_as_old_as_can_be():
+    """Its age is infinite, and the state saturates: the same as at ``OLD`` or any later time."""
+    read, seen = make_state("extended", paper()), World(paper(), worlds=2).observe()
+    assert np.isinf(seen.age).all()
+    for age in (OLD, 2.0 * OLD):
+        assert (read(seen) == read(seen._replace(age=np.full((2, 4), age)))).all()
+    assert (read(seen) != read(seen._replace(age=np.full((2, 4), 0.9 * OLD)))).sum() == 8
 
 
 def test_the_extended_state_does_not_know_where_on_the_path_it_is():
@@ -366,12 +379,11 @@ def test_the_extended_state_does_not_know_where_on_the_path_it_is():
     read = make_state("extended", scenario)
     world = World(scenario)
     observation = world.observe()
-    shift = np.array([13.0, 0.0])
-    moved = observation._replace(position=observation.position + shift)
-    obstacles = world.state.obstacles
-    age = np.ones((1, 4))
-    there = read(moved, obstacles + np.array([13.0, 0.0, 0.0]), age)
-    assert np.allclose(read(observation, obstacles, age), there, atol=1e-6)
+    moved = observation._replace(
+        position=observation.position + np.array([13.0, 0.0]), obstacles=observation.obstacles + np.array([13.0, 0.0, 0.0])
+    )
+    there = read(moved)
+    assert np.allclose(read(observation), there, atol=1e-6)
     assert there.shape == (1, read.size)
 
 
@@ -380,9 +392,9 @@ def test_ages_count_from_the_last_change_of_command():
     batch.reset(0)
     plan = [[2, 2, 2, 2], [2, 2, 2, 2], [3, 2, 2, 2], [3, 2, 2, 0], [2, 2, 2, 0]]
     ages = [batch.step(np.array([row, [2] * 4])).age[0] for row in plan]
-    assert ages[2][0] - ages[1][0] == pytest.approx(0.5)  # the first decision switches nothing
+    assert np.isinf(ages[:3]).all()  # the first decision switches nothing
     assert ages[3][0] == pytest.approx(0.5) and ages[4][0] == pytest.approx(1.0) and ages[4][3] == pytest.approx(0.5)
-    assert batch.age[0].tolist() == pytest.approx([0.5, ages[4][1] + 0.5, ages[4][2] + 0.5, 1.0])
+    assert batch.world.observe().age[0].tolist() == pytest.approx([0.5, np.inf, np.inf, 1.0])
 
 
 @pytest.mark.parametrize(

@@ -185,10 +185,10 @@ def test_changes_that_no_field_has_are_named():
 def test_schedules_belong_to_known_places(name):
     """Scripted and oracle refuse with the reason; gates and corridors, whose walls stand still, have a schedule."""
     with refusal(f"scenario {name!r} has no schedule"):
-        make_supervisor("scripted").start(make_scenario(name))
+        make_supervisor("scripted").start(make_scenario(name), 1)
     with refusal("marlbc oracle"):
-        make_supervisor("oracle").start(make_scenario(name))
-    make_supervisor("scripted").start(make_scenario("gates"))
+        make_supervisor("oracle").start(make_scenario(name), 1)
+    make_supervisor("scripted").start(make_scenario("gates"), 1)
 
 
 # Scenario files
@@ -246,7 +246,7 @@ def test_a_mission_point_by_point(tmp_path):
     assert scenario.obstacles == ((20, 0, 1.5), (30, 2, 0)) and scenario.motions[0] == (0, 0, 0, 3, 8, 0)
     assert scenario.schedule == ((5, 9.5, -1, "FR"),) and scenario.moving
     assert World(scenario).step(np.zeros((1, 2), dtype=np.int64)).reward.shape == (1,)
-    assert make_supervisor("scripted").start(scenario)
+    assert make_supervisor("scripted").start(scenario, 1)
 
 
 @pytest.mark.parametrize("name", ["paper", "cruise"])

@@ -9,11 +9,11 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import paper
-from marlbc_mj.supervisors import Situation
 from marlbc_mj.supervisors.fms import FMS, memberships
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
+SEEN = World(PAPER).observe()
 FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))
 clearances = st.floats(-5.0, 20.0)
 rates = st.floats(-100.0, 100.0)
@@ -22,14 +22,11 @@ rates = st.floats(-100.0, 100.0)
 def run(clearance, supervisor=None) -> np.ndarray:
     """Orders (T, 4) for clearances (T,) that all agents share [m]; the safe distance is 2 m."""
     supervisor = supervisor or FMS()
-    memory, out = supervisor.start(PAPER), []
-    zeros = np.zeros((4, 2))
+    memory, out = supervisor.start(PAPER, 1), []
     for step, d in enumerate(clearance):
-        now = Situation(
-            step, step * 0.05, zeros, zeros, np.full(4, d), 0, np.zeros(4, dtype=np.int64), PAPER.obstacle_array(), zeros
-        )
+        now = SEEN._replace(step=np.array([step]), time=np.array([step * 0.05]), clearance=np.full((1, 4), d))
         orders, memory = supervisor.decide(now, memory)
-        out.append(orders)
+        out.append(orders[0])
     return np.array(out)
 
 

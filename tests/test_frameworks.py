@@ -9,15 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.controllers import PD
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, Scenario, paper, standard_behaviors
-from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Blend, Situation, Supervisor, make_supervisor
+from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Blend, Supervisor, make_supervisor
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
+SEEN = World(PAPER).observe()
 FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))
 NAMES = ("layered", "motor-schema", "fuzzy-blend")
 PERTURBED = Perturbation(start_spread=0.5, obstacle_spread=0.3, drag_scale=(0.5, 1.5))
@@ -25,17 +27,20 @@ PATH_VELOCITY = np.array([1.0, 0.0])
 clearances = st.lists(st.floats(-5.0, 20.0) | st.just(np.inf), min_size=1, max_size=6).map(np.array)
 
 
-def at(position, clearance, *, reference=None, obstacles=(), step: int = 0) -> Situation:
-    """A situation with the team at ``position``, its reference there too unless given; clearances are what the test says."""
+def at(position, clearance, *, reference=None, obstacles=(), step: int = 0) -> Observation:
+    """One team seen at ``position``, its reference there too unless given; clearances are what the test says."""
     position = np.array(position, dtype=float)
     reference = position if reference is None else np.array(reference, dtype=float)
-    still, nobody = np.zeros_like(position), np.zeros(len(position), dtype=np.int64)
-    discs = np.array(obstacles, dtype=float).reshape(-1, 3)
-    return Situation(step, step * 0.05, position, still, np.array(clearance, dtype=float), 0, nobody, discs, reference)
+    discs, clearance = np.array(obstacles, dtype=float).reshape(-1, 3), np.array(clearance, dtype=float)
+    now = {"step": np.array(step), "time": np.array(step * 0.05), "clearance": clearance, "obstacles": discs}
+    fields = {**now, "position": position, "reference": reference, "velocity": np.zeros_like(position)}
+    return SEEN._replace(**{name: value[None] for name, value in fields.items()})
 
 
-def decided(supervisor, now: Situation, scenario: Scenario = PAPER) -> Blend:
-    return supervisor.decide(now, supervisor.start(scenario))[0]
+def decided(supervisor, now: Observation, scenario: Scenario = PAPER) -> Blend:
+    """The decision for the one team."""
+    blend, _ = supervisor.decide(now, supervisor.start(scenario, 1))
+    return Blend(blend.orders[0], blend.velocity[0])
 
 
 def slots(which: int, step: int = 0) -> np.ndarray:
@@ -133,7 +138,7 @@ def test_layered_changes_where_the_automaton_does():
     automaton = FSAMS()
     for row in np.random.default_rng(1).uniform(-1, 6, (50, 4)):
         now = at(slots(0), row)
-        np.testing.assert_array_equal(decided(Layered(), now).orders, automaton.decide(now, automaton.start(PAPER))[0])
+        np.testing.assert_array_equal(decided(Layered(), now).orders, automaton.decide(now, automaton.start(PAPER, 1))[0][0])
     assert decided(Layered(reach=1.0), at(slots(0), (2.0, 2.1, 3.9, 9.0))).orders.tolist() == [OA, FM, FM, FM]
 
 
@@ -159,7 +164,7 @@ def test_the_schemas_sum_by_hand():
     blend = decided(MotorSchema(), now)
     np.testing.assert_allclose(blend.velocity, expected, rtol=0, atol=1e-12)
     assert (blend.orders == FM).all()  # 0.75 of OA does not outweigh 1.0 of FM
-    assert decided(MotorSchema(), now._replace(clearance=np.array([2.5, 9, 9, 9]))).orders[0] == OA
+    assert decided(MotorSchema(), now._replace(clearance=np.array([[2.5, 9, 9, 9]]))).orders[0] == OA
     everywhere = decided(MotorSchema(reconstruct_always=True), now).velocity
     np.testing.assert_allclose(everywhere[1:], expected[1:] + 0.8 * fr[1:], rtol=0, atol=1e-12)
 
@@ -187,18 +192,18 @@ def test_any_number_of_agents(name, agents):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_decisions_are_repeatable_and_leave_memory_and_situation_alone(name):
+def test_decisions_are_repeatable_and_leave_memory_and_observation_alone(name):
     supervisor = make_supervisor(name)
     assert isinstance(supervisor, Supervisor) and name in SUPERVISORS
     now = at(slots(0), (1.0, 3.0, 4.5, 9.0), obstacles=PAPER.obstacles)
     before = [np.copy(field) for field in now]
-    memory = supervisor.start(PAPER)
+    memory = supervisor.start(PAPER, 1)
     first, second = supervisor.decide(now, memory)[0], supervisor.decide(now, memory)[0]
     for one, other in zip(first, second, strict=True):
         np.testing.assert_array_equal(one, other)
     for field, copy in zip(now, before, strict=True):
         np.testing.assert_array_equal(field, copy)
-    assert first.velocity.shape == (4, 2) and np.isfinite(first.velocity).all()
+    assert first.velocity.shape == (1, 4, 2) and np.isfinite(first.velocity).all()
 
 
 @pytest.mark.parametrize(
@@ -225,7 +230,7 @@ def test_settings_that_cannot_be_run_are_refused(make, settings, message):
 @pytest.mark.parametrize("name", NAMES)
 def test_a_scenario_without_one_of_the_behaviors_is_refused(name):
     with pytest.raises(ConfigurationError, match="'OA>FM'"):
-        make_supervisor(name).start(paper(behaviors=PAPER.behaviors[1:], schedule=()))
+        make_supervisor(name).start(paper(behaviors=PAPER.behaviors[1:], schedule=()), 1)
 
 
 # The case study ----------------------------------------------------------------------------------------------------------------
@@ -266,7 +271,7 @@ class Drift:
     def start(self, scenario):
         return Blend(np.full(scenario.agents, scenario.orders.index(self.label)), np.tile(self.velocity, (scenario.agents, 1)))
 
-    def decide(self, situation, memory):
+    def decide(self, observation, memory):
         return memory, memory
 
 

@@ -18,7 +18,8 @@ from marlbc_mj.policies.checkpoint import read_arrays
 from marlbc_mj.policies.greedy import greedy
 from marlbc_mj.policies.states import STATES, make_state
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.tasks.batch import FormationBatch, Starts
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.training.config import TrainConfig, from_json, make_config
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss, log_probability
@@ -251,7 +252,7 @@ def test_the_own_entries_of_a_state_are_the_agents_own(name):
         position = np.arange(8.0).reshape(1, 4, 2)
         obstacles, none = np.zeros((1, 1, 3)), np.zeros(1, dtype=np.int64)
         observation = Observation(none, np.zeros(1), position, velocity, np.ones((1, 4)), none, command, age, position, obstacles)
-        return state(observation, obstacles, age)[0]
+        return state(observation)[0]
 
     velocity, command, age = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64), np.ones((1, 4))
     seen = 3 if name == "printed" else 5  # the printed state has no age
@@ -425,7 +426,7 @@ def test_a_checkpoint_of_a_rival_gives_the_evaluated_episode(method, state, tmp_
     assert equal(*(read_arrays(tmp_path / name / RESUME)[0] for name in ("run", "stopped")))
     learned = Learned.load(tmp_path / "run" / "checkpoint" / "last.safetensors")
     scenario = paper()
-    chosen = set(learned.start(scenario).order_of.tolist())
+    chosen = set(learned.start(scenario, 1).order_of.tolist())
     assert chosen == set(order_of(scenario, "avoidance" if method == "rlms" else "commands").tolist())
     assert learned.policy.weights[0].shape[0] == (1 if method == "central" else 4)
     outputs = learned.policy.weights[-1].shape[2] - learned.policy.dueling

@@ -242,13 +242,14 @@ def test_frames_show_the_state_in_which_orders_were_given():
     trajectory = run_episode(World(scenario, record=True), make_supervisor("scripted"), on_frame=frames.append)
     assert len(frames) == 20
     for k, frame in enumerate(frames):
-        assert frame.time == pytest.approx(0.05 * k)
+        assert frame.observation.time == pytest.approx(0.05 * k)
         for name in ("position", "velocity", "reference", "reference_velocity", "force"):
-            assert (getattr(frame, name) == getattr(trajectory, name)[10 * k]).all()
-        np.testing.assert_allclose(frame.clearance, clearances(frame.position, trajectory.obstacles), atol=1e-12)
+            assert (getattr(frame.first, name) == getattr(trajectory, name)[10 * k]).all()
+        seen = frame.observation
+        np.testing.assert_allclose(seen.clearance, clearances(frame.first.position, trajectory.obstacles), atol=1e-12)
         assert (frame.command == trajectory.command[k]).all() and frame.reward == trajectory.reward[k]
         assert (frame.controller_state == trajectory.controller_state[k]).all() and frame.decision_ms >= 0.0
-        assert k == 0 or frame.formation == trajectory.formation[k - 1]
+        assert k == 0 or seen.formation == trajectory.formation[k - 1]
 
 
 def decaying(rate: float, late: float = 0.0) -> Trajectory:

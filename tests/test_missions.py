@@ -137,4 +137,4 @@ def test_256_agents_run_under_every_supervisor_that_decides_per_agent():
     for name in scale.SCALED_SUPERVISORS:
         assert np.isfinite(run_episode(world, make_supervisor(name)).position).all()
     with pytest.raises(ConfigurationError, match="256 agents"):
-        make_supervisor("mpcms").start(scenario)
+        make_supervisor("mpcms").start(scenario, 1)

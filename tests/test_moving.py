@@ -21,7 +21,7 @@ from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Motion, Obstacle, make_scenario
 from marlbc_mj.scenarios.layout import motion_array, motions_of
-from marlbc_mj.supervisors import MPCMS, make_supervisor, situation
+from marlbc_mj.supervisors import MPCMS, make_supervisor
 from marlbc_mj.tasks.formation import make_environment
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -162,9 +162,8 @@ def test_predictions_see_obstacles_come(prediction):
     )
     for scenario, avoids in ((comes, True), (stays, False)):
         supervisor, world = MPCMS(prediction=prediction), World(scenario)
-        seen = situation(world.observe(), world.state.obstacles[0], scenario.mission_step)
-        memory = supervisor.start(scenario)
-        costs, _ = supervisor._predict(seen, memory, supervisor._candidates(scenario, memory.joint).orders)
+        seen, memory = world.observe(), supervisor.start(scenario, 1)
+        costs, _ = supervisor._predict(seen, memory, supervisor._pairs(memory)[1])
         assert (costs[0] > 1e3) == avoids
         assert seen.clearance.min() > 3.0
 

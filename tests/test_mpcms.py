@@ -3,30 +3,30 @@
 import numpy as np
 import pytest
 
-from marlbc_mj.controllers import PD, SORLC
+from marlbc_mj.controllers import PD
 from marlbc_mj.core.laws import plain
-from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
-from marlbc_mj.supervisors import Situation, situation
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
-from marlbc_mj.supervisors.prediction import judge
+from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
+from marlbc_mj.supervisors.references import composition
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
-PLAN = make_plan(PAPER, SORLC())
+SEEN = World(PAPER).observe()
 FM, FR, OA_FM, OA_FR = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM", "OA>FR"))
-FREE = np.array([1.0, 0.3, 0.0, 0.0, 0.5])  # weights without a clearance term
+FREE = CostWeights(1.0, 0.3, 0.0, 0.0, 0.5)  # weights without a clearance term
 
 
-def at(positions, step: int = 0, obstacles=None) -> Situation:
-    """A situation with the team at rest at ``positions``; clearance, formation and command are not read by MPCMS."""
+def at(positions, step: int = 0, obstacles=None) -> Observation:
+    """One team seen at rest at ``positions``; clearance, formation and command are not read by MPCMS."""
     positions = np.array(positions, dtype=float)
     obstacles = PAPER.obstacle_array() if obstacles is None else np.array(obstacles, dtype=float).reshape(-1, 3)
-    unread = np.zeros(4), 0, np.zeros(4, dtype=np.int64)
-    return Situation(step, step * 0.05, positions, np.zeros((4, 2)), *unread, obstacles, positions)
+    fields = {"step": np.array(step), "time": np.array(step * 0.05), "position": positions, "obstacles": obstacles}
+    return SEEN._replace(**{name: value[None] for name, value in fields.items()})
 
 
 def in_formation(step: int, which: int = 0) -> np.ndarray:
@@ -34,9 +34,20 @@ def in_formation(step: int, which: int = 0) -> np.ndarray:
     return np.array([-2.5 + 0.05 * step, 0.0]) + PAPER.formations[which]
 
 
-def decided(supervisor: MPCMS, now: Situation, joint: Joint | None = None) -> np.ndarray:
-    memory = supervisor.start(PAPER)
-    return supervisor.decide(now, memory._replace(joint=joint or memory.joint))[0]
+def decided(supervisor: MPCMS, now: Observation, joint: Joint | None = None) -> np.ndarray:
+    """Orders (N,) of the one team, whose joint order in force is ``joint``."""
+    memory = supervisor.start(PAPER, 1)
+    return supervisor.decide(now, memory._replace(joints=(joint,) if joint else memory.joints))[0][0]
+
+
+def judge(start, step, orders, obstacles, weights, *, threads=1, trails=None):
+    """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) of one team at rest at ``start`` (N, 2)."""
+    now = at(start, step, obstacles)
+    every = np.arange(len(orders))
+    pairs = Pairs(np.zeros_like(every), every, orders)
+    laws = composition(PAPER, PAPER.behaviors, PAPER.orders.table)
+    teams = Teams(now.step, now.position, now.velocity, now.obstacles)
+    return judge_pairs(PAPER, laws, weights, teams, pairs, threads=threads, trails=trails)
 
 
 def test_the_prediction_is_the_worlds_reference():
@@ -48,14 +59,14 @@ def test_the_prediction_is_the_worlds_reference():
     for k in range(horizon):
         world.step(orders[k][None])
         expected.append(world.state.reference[0].copy())
-    _, trails = judge(PLAN, start, 0, orders[None], PAPER.obstacle_array(), FREE)
+    _, trails = judge(start, 0, orders[None], PAPER.obstacle_array(), FREE)
     np.testing.assert_allclose(trails[0], expected, rtol=0, atol=1e-11)
 
 
 def test_the_prediction_does_not_depend_on_the_number_of_threads():
     rng = np.random.default_rng(1)
     orders = rng.choice([FM, FR, OA_FM, OA_FR], (17, 40, 4))
-    one, two = (judge(PLAN, in_formation(1000), 1000, orders, PAPER.obstacle_array(), FREE, threads=t) for t in (1, 2))
+    one, two = (judge(in_formation(1000), 1000, orders, PAPER.obstacle_array(), FREE, threads=t) for t in (1, 2))
     np.testing.assert_array_equal(one[0], two[0])
     np.testing.assert_array_equal(one[1], two[1])
 
@@ -69,8 +80,8 @@ def test_the_cost_of_two_steps_by_hand():
     trail[0, 0, 0] -= 0.25
     x, y = trail[1, 0]
     obstacle = np.array([[x + 3.9, y, 2.0]])  # 1.9 m ahead in the second step, 2.2 m in the first
-    weights = np.array([1.0, 0.3, 1e4, 2.05, 0.5])
-    costs, _ = judge(PLAN, trail[0], 0, np.zeros((1, 2, 4), dtype=np.int64), obstacle, weights, trails=trail[None])
+    weights = CostWeights(1.0, 0.3, 1e4, 2.05, 0.5)
+    costs, _ = judge(trail[0], 0, np.zeros((1, 2, 4), dtype=np.int64), obstacle, weights, trails=trail[None])
     assert costs[0] == pytest.approx(2.4 + 0.5 + 1500.0, rel=1e-12)
 
 
@@ -122,7 +133,7 @@ def test_episodes_are_deterministic_and_the_memory_is_not_changed_by_a_decision(
     assert (np.diff(first.command[:, 0]) != 0).sum() == 2
     np.testing.assert_array_equal(first.command, second.command)
     supervisor = MPCMS()
-    memory, now = supervisor.start(PAPER), at(in_formation(362), 362)
+    memory, now = supervisor.start(PAPER, 1), at(in_formation(362), 362)
     np.testing.assert_array_equal(supervisor.decide(now, memory)[0], supervisor.decide(now, memory)[0])
 
 
@@ -143,26 +154,36 @@ def test_without_a_feasible_candidate_the_least_violation_is_chosen():
 def test_both_starts_agree_while_the_reference_is_tracked():
     """The first decision of an episode is the same, and its own copy of p_r is the world's."""
     world, supervisor = World(PAPER), MPCMS(start_from="reference")
-    memory, observation = supervisor.start(PAPER), world.observe()
+    memory, observation = supervisor.start(PAPER, 1), world.observe()
     for _ in range(30):
-        orders, memory = supervisor.decide(situation(observation, PAPER.obstacle_array(), 0.05), memory)
-        observation = world.step(orders[None]).observation
-    np.testing.assert_allclose(memory.reference, world.state.reference[0], rtol=0, atol=1e-11)
+        orders, memory = supervisor.decide(observation, memory)
+        observation = world.step(orders).observation
+    np.testing.assert_allclose(memory.reference, world.state.reference, rtol=0, atol=1e-11)
 
 
 def test_mujoco_prediction_simulates_what_the_world_does():
     """With the nominal drag the twin is the world: the chosen candidate's first position is what comes, to rounding."""
     world, supervisor = World(PAPER), MPCMS(horizon=3, instants=(0,), prediction="mujoco")
-    memory, observation = supervisor.start(PAPER), world.observe()
+    memory, observation = supervisor.start(PAPER, 1), world.observe()
     for _ in range(20):
-        orders, memory = supervisor.decide(situation(observation, PAPER.obstacle_array(), 0.05), memory)
-        observation = world.step(orders[None]).observation
-        np.testing.assert_allclose(memory.reference, observation.position[0], rtol=0, atol=1e-12)
+        orders, memory = supervisor.decide(observation, memory)
+        observation = world.step(orders).observation
+        np.testing.assert_allclose(memory.reference, observation.position, rtol=0, atol=1e-12)
+
+
+def test_mujoco_prediction_has_a_world_for_every_candidate():
+    """Whoever avoids: with two agents avoiding there is one change more than with one, since none of them is both kinds."""
+    supervisor = MPCMS(horizon=2, instants=(0,), prediction="mujoco")
+    memory = supervisor.start(PAPER, 1)
+    for avoiding in range(5):
+        joint = Joint(0, (True,) * avoiding + (False,) * (4 - avoiding))
+        assert memory.worlds.worlds >= len(supervisor._candidates(PAPER, joint).orders)
+        assert supervisor.decide(SEEN, memory._replace(joints=(joint,)))[0].shape == (1, 4)
 
 
 def test_mujoco_prediction_needs_a_compiled_controller():
     with pytest.raises(ConfigurationError, match="compiled"):
-        MPCMS(prediction="mujoco", controller=PythonPD()).start(PAPER)
+        MPCMS(prediction="mujoco", controller=PythonPD()).start(PAPER, 1)
 
 
 class PythonPD(PD):

@@ -15,14 +15,23 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, Window, paper
 from marlbc_mj.supervisors import Oracle, Scripted, make_supervisor
-from marlbc_mj.supervisors.oracle import command_table, evaluate, read_cache, save, search, segments, shipped, windows_of
+from marlbc_mj.supervisors.oracle import (
+    command_table,
+    evaluate,
+    read_cache,
+    save_schedule,
+    search,
+    segments,
+    shipped_schedules,
+    windows_of,
+)
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
 SHORT = paper(
     name="short", duration=4.0, obstacles=(), schedule=(Window(1.025, 2.025, -1, "FR"),)
 )  # where FM throughout is better
-SHIPPED = sorted(entry["controller"] for entry in read_cache(shipped()).values())
+SHIPPED = sorted(entry["controller"] for entry in read_cache(shipped_schedules()).values())
 
 
 def test_the_case_studys_controller_is_among_the_shipped():
@@ -67,7 +76,7 @@ def test_the_scripted_returns_of_the_entries_are_the_reference_values():
 def test_another_scenario_has_no_schedule_and_says_how_to_get_one(scenario):
     """The message names scenario, controller and command."""
     with pytest.raises(ConfigurationError, match="no schedule for scenario 'paper' under 'sorlc' .* marlbc oracle"):
-        Oracle().start(scenario)
+        Oracle().start(scenario, 1)
 
 
 def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
@@ -77,7 +86,7 @@ def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
         supervisor = make_supervisor("oracle-schedule", controller)
         assert supervisor.schedule(draws) == Oracle(controller).schedule(PAPER)
     with pytest.raises(ConfigurationError, match="no schedule"):
-        supervisor.start(replace(draws, force_limit=150.0))
+        supervisor.start(replace(draws, force_limit=150.0), 1)
 
 
 def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
@@ -86,7 +95,7 @@ def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
     with pytest.raises(ConfigurationError, match="under 'lqr'"):
         Oracle("lqr", cache=tmp_path / "none.json").entry(PAPER)
     with pytest.raises(ConfigurationError, match="'nonsense'; choose from: sorlc"):
-        Oracle("nonsense").start(PAPER)
+        Oracle("nonsense").start(PAPER, 1)
 
 
 def test_a_broken_cache_is_refused(tmp_path):
@@ -95,7 +104,7 @@ def test_a_broken_cache_is_refused(tmp_path):
     for text in ("{", "[]"):
         broken.write_text(text)
         with pytest.raises(ConfigurationError, match=r"broken\.json"):
-            Oracle(cache=broken).start(PAPER)
+            Oracle(cache=broken).start(PAPER, 1)
 
 
 def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):
@@ -108,8 +117,8 @@ def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):
     assert [total for _, total in calls] == sorted(total for _, total in calls) and calls[-1][1] == found.total
     assert found.scripted is not None and found.total > found.scripted
     cache = tmp_path / "schedules.json"
-    save(found, SHORT, "pd", cache)
-    save(found._replace(total=0.0), SHORT, "lqr", cache)
+    save_schedule(found, SHORT, "pd", cache)
+    save_schedule(found._replace(total=0.0), SHORT, "lqr", cache)
     assert len(json.loads(cache.read_text())) == 2
     oracle = Oracle("pd", cache=cache)
     trajectory = run_episode(World(SHORT, make_controller("pd"), record=True), oracle)

@@ -5,11 +5,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Window, paper
-from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Scripted, Situation, Supervisor, make_supervisor
+from marlbc_mj.supervisors import FSAMS, SUPERVISORS, Scripted, Supervisor, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
+SEEN = World(PAPER).observe()
 FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))
 URGENCY = {FM: 0, FR: 1, OA: 2}
 clearance_sequences = st.lists(
@@ -17,28 +20,24 @@ clearance_sequences = st.lists(
 )  # (T, 4), as fast as can be
 
 
-def at(step: int, clearance=(9.0, 9.0, 9.0, 9.0)) -> Situation:
-    """A situation at a mission step; only time and clearance matter to these supervisors."""
-    zeros = np.zeros((4, 2))
-    obstacles = PAPER.obstacle_array()
-    return Situation(
-        step, step * 0.05, zeros, zeros, np.array(clearance, dtype=float), 0, np.zeros(4, dtype=np.int64), obstacles, zeros
-    )
+def at(step: int, clearance=(9.0, 9.0, 9.0, 9.0)) -> Observation:
+    """One team at a mission step; only time and clearance matter to these supervisors."""
+    return SEEN._replace(step=np.array([step]), time=np.array([step * 0.05]), clearance=np.array([clearance], dtype=float))
 
 
 def run(supervisor, clearances) -> np.ndarray:
     """Orders (T, 4) for a sequence of clearances (T, 4)."""
-    memory = supervisor.start(PAPER)
+    memory = supervisor.start(PAPER, 1)
     out = []
     for step, clearance in enumerate(clearances):
         orders, memory = supervisor.decide(at(step, clearance), memory)
-        out.append(orders)
+        out.append(orders[0])
     return np.array(out)
 
 
 def names_at(supervisor, time: float) -> list[str]:
-    orders, _ = supervisor.decide(at(round(time / 0.05)), supervisor.start(PAPER))
-    return [PAPER.orders.commands[PAPER.orders.command_of[order]] for order in orders]
+    orders, _ = supervisor.decide(at(round(time / 0.05)), supervisor.start(PAPER, 1))
+    return [PAPER.orders.commands[PAPER.orders.command_of[order]] for order in orders[0]]
 
 
 @pytest.mark.parametrize(
@@ -70,8 +69,8 @@ def test_a_time_on_a_windows_bound_is_outside_it(first, length):
     """For every bound that is a multiple of 0.05 s as people write it: 3 * 0.05 > 0.15 in floating point is no reason."""
     start, end = round(first * 0.05, 2), round((first + length) * 0.05, 2)
     scripted = Scripted(windows=(Window(start, end, 1, "FR"),))
-    memory = scripted.start(PAPER)
-    inside = [scripted.decide(at(step), memory)[0][1] == FR for step in range(first + length + 2)]
+    memory = scripted.start(PAPER, 1)
+    inside = [scripted.decide(at(step), memory)[0][0, 1] == FR for step in range(first + length + 2)]
     assert inside == [first < step < first + length for step in range(first + length + 2)]
 
 
@@ -95,7 +94,7 @@ def test_later_windows_win_and_defaults_fill():
 def test_a_script_that_does_not_fit_is_refused(supervisor, scenario, message):
     """Agent, order, or no schedule at all; the message names it."""
     with pytest.raises(ConfigurationError, match=message):
-        supervisor.start(scenario)
+        supervisor.start(scenario, 1)
 
 
 @pytest.mark.parametrize("hysteresis", ["hysteresis", "dwell"])
@@ -163,7 +162,7 @@ def test_an_automaton_is_deterministic_and_leaves_its_memory_alone(clearances):
     """State in, state out: an old memory can be used again, and gives the same."""
     supervisor = FSAMS(hysteresis=0.3, dwell=0.5)
     np.testing.assert_array_equal(run(supervisor, clearances), run(supervisor, clearances))
-    memory = supervisor.start(PAPER)
+    memory = supervisor.start(PAPER, 1)
     first, _ = supervisor.decide(at(0, clearances[0]), memory)
     second, _ = supervisor.decide(at(0, clearances[0]), memory)
     np.testing.assert_array_equal(first, second)
@@ -174,18 +173,18 @@ def test_thresholds_follow_the_scenarios_safe_distance():
     """d_OA is the scenario's."""
     scenario = paper(safe_distance=3.0)
     supervisor = FSAMS()
-    orders, _ = supervisor.decide(at(0, (3.0, 3.1, 6.0, 6.1)), supervisor.start(scenario))
-    assert orders.tolist() == [OA, FR, FR, FM]
+    orders, _ = supervisor.decide(at(0, (3.0, 3.1, 6.0, 6.1)), supervisor.start(scenario, 1))
+    assert orders.tolist() == [[OA, FR, FR, FM]]
 
 
 @pytest.mark.parametrize("name", ["scripted", "fsams", "fsams-hysteresis"])
 def test_every_named_supervisor_keeps_the_protocol(name):
-    """Orders are (N,) valid indices."""
+    """Orders are (B, N) valid indices."""
     assert name in SUPERVISORS
     supervisor = make_supervisor(name)
     assert isinstance(supervisor, Supervisor)
-    orders, _ = supervisor.decide(at(0), supervisor.start(PAPER))
-    assert orders.shape == (4,) and ((orders >= 0) & (orders < 6)).all()
+    orders, _ = supervisor.decide(at(0), supervisor.start(PAPER, 1))
+    assert orders.shape == (1, 4) and ((orders >= 0) & (orders < 6)).all()
 
 
 def test_the_fair_automaton_is_the_printed_one_with_hysteresis_and_dwell():

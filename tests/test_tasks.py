@@ -14,7 +14,7 @@ from marlbc_mj.core.laws import plain
 from marlbc_mj.engine.assembly import assemble
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, paper
-from marlbc_mj.supervisors import make_supervisor, situation
+from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
@@ -23,12 +23,12 @@ def test_whole_episode_equals_the_compiled_loop() -> None:
     environment = tasks.load("formation", "paper", random_state=0)
     scenario = environment.task.scenario
     world, supervisor = World(scenario), make_supervisor("scripted")
-    memory, observation, timestep = supervisor.start(scenario), world.reset(), environment.reset()
+    memory, observation, timestep = supervisor.start(scenario, 1), world.reset(), environment.reset()
     worst, total, steps = 0.0, 0.0, 0
     while not timestep.last():
-        orders, memory = supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
-        step = world.step(orders[None])
-        observation, timestep = step.observation, environment.step(orders)
+        orders, memory = supervisor.decide(observation, memory)
+        step = world.step(orders)
+        observation, timestep = step.observation, environment.step(orders[0])
         qpos = environment.physics.data.qpos[world.plan.plant.qpos_index]
         worst = max(worst, np.abs(qpos - observation.position[0]).max(), abs(timestep.reward - step.reward[0]))
         worst = max(worst, np.abs(timestep.observation["state"] - observation.state()[0]).max())

@@ -317,7 +317,7 @@ def test_damaged_checkpoints_are_refused(kind, finished, tmp_path):
 )
 def test_a_checkpoint_of_another_team_is_refused(scenario, fragment, finished):
     with pytest.raises(ConfigurationError, match=fragment):
-        Learned.load(finished / "checkpoint" / "best.safetensors").start(scenario())
+        Learned.load(finished / "checkpoint" / "best.safetensors").start(scenario(), 1)
 
 
 def test_a_checkpoint_runs_on_perturbed_draws(finished):

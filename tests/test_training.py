@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.policies.greedy import RISK_SLACK, Policy, admissible, greedy
-from marlbc_mj.tasks.batch import Outcome
+from marlbc_mj.tasks.batch import DecisionOutcome
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
 from marlbc_mj.training.exploration import Exploration, shares
@@ -477,7 +477,7 @@ def outcome(**changes):
         "clearance": np.array([[3.0, 2.05, 9.0], [1.0, 5.0, 5.0]]),
         "age": np.array([[9.0, 9.0, 1.0], [1.0] * 3]), "steps": np.full(b, 4), "terminal": None, "truncated": None,
     }  # fmt: skip
-    return Outcome(**{**fields, **changes})
+    return DecisionOutcome(**{**fields, **changes})
 
 
 def test_the_printed_reward_is_unshaped():

@@ -9,7 +9,8 @@ import torch
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.greedy import Policy
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.tasks.batch import FormationBatch, Outcome, Starts
+from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
+from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.shaping import lost, shaped_reward
@@ -70,16 +71,16 @@ class BaseTrainer(ABC):
         """The networks whose largest output is the greedy action."""
 
     @abstractmethod
-    def advance(self) -> Outcome:
+    def advance(self) -> DecisionOutcome:
         """Make one decision in every world and learn from it."""
 
-    def step(self, actions: np.ndarray) -> Outcome:
+    def step(self, actions: np.ndarray) -> DecisionOutcome:
         """Make the decision ``actions`` (B, N) in every world."""
         outcome = self.batch.step(actions)
         single_thread()
         return outcome
 
-    def judge(self, outcome: Outcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def judge(self, outcome: DecisionOutcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What a decision means for each agent.
 
         Returns:
@@ -139,7 +140,7 @@ class BaseTrainer(ABC):
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""
-        return [(self, "state"), *((self.batch, name) for name in ("cut", "last", "age"))]
+        return [(self, "state"), *((self.batch, name) for name in ("cut", "last"))]
 
 
 def single_thread() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.tasks.batch import Outcome
+from marlbc_mj.tasks.batch import DecisionOutcome
 from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.learner import LARGEST_GRADIENT
@@ -76,7 +76,7 @@ class MAPPO(BaseTrainer):
         """The actors; their logits stand for action values."""
         return self.actors
 
-    def advance(self) -> Outcome:
+    def advance(self) -> DecisionOutcome:
         """Make one sampled decision in every world; at the end of a rollout, learn from it."""
         config = self.config
         share = self.steps / config.budget

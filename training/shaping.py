@@ -8,7 +8,7 @@ import numpy as np
 from marlbc_mj.util.settings import POSITIVE, check
 
 if TYPE_CHECKING:
-    from marlbc_mj.tasks.batch import Outcome
+    from marlbc_mj.tasks.batch import DecisionOutcome
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Shaping:
         check(self, "shaping.")
 
 
-def shaped_reward(outcome: "Outcome", shaping: Shaping) -> np.ndarray:
+def shaped_reward(outcome: "DecisionOutcome", shaping: Shaping) -> np.ndarray:
     """(B, N) float32 rewards of a decision: (formation + violation - centre - own costs) / scale; see :func:`lost`.
 
     Args:
@@ -57,6 +57,6 @@ def shaped_reward(outcome: "Outcome", shaping: Shaping) -> np.ndarray:
     return np.asarray((team[:, None] - own) / shaping.scale, dtype=np.float32)
 
 
-def lost(outcome: "Outcome", shaping: Shaping, safe_distance: float) -> np.ndarray:
+def lost(outcome: "DecisionOutcome", shaping: Shaping, safe_distance: float) -> np.ndarray:
     """(B, N) bool: agents that came closer to an obstacle than ``safe_distance`` + ``shaping.margin`` [m]."""
     return np.asarray(outcome.clearance < safe_distance + shaping.margin)

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from marlbc_mj.policies.greedy import greedy
-from marlbc_mj.tasks.batch import Outcome
+from marlbc_mj.tasks.batch import DecisionOutcome
 from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig
@@ -69,7 +69,7 @@ class Trainer(BaseTrainer):
         """The networks whose largest output is the greedy action."""
         return self.learner.smooth
 
-    def advance(self) -> Outcome:
+    def advance(self) -> DecisionOutcome:
         """Make one decision in every world, and ``updates`` gradient steps."""
         config, replay = self.config, self.replay
         share = self.steps / config.budget

@@ -109,7 +109,7 @@ class OracleCommand:
     def run(self) -> None:
         """Search, save, and say what was found."""
         from marlbc_mj.scenarios import make_scenario
-        from marlbc_mj.supervisors.oracle import save, search
+        from marlbc_mj.supervisors.oracle import save_schedule, search
 
         scenario = make_scenario(self.scenario)
         with progress_bars() as progress:
@@ -121,5 +121,5 @@ class OracleCommand:
                 threads=self.threads,
                 progress=lambda done, total: progress("search", done, self.budget),
             )
-        save(found, scenario, self.controller, self.out)
+        save_schedule(found, scenario, self.controller, self.out)
         print(f"return {found.total:.0f} after {found.episodes} episodes (scripted: {found.scripted})")

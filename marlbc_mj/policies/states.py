@@ -1,4 +1,4 @@
-"""The state vectors that learners see: the printed one, and an extended one relative to slots and obstacles."""
+"""The state vectors that learners see: the published one, and an extended one relative to slots and obstacles."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -36,15 +36,13 @@ class State(Protocol):
     high: np.ndarray  # (S,)
     layout: dict[str, float]  # what a policy's weights depend on; ``version`` is raised when numbers change their meaning
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, S) float32 states from a batch observation, obstacles (B, K, 3) [m] and how long every command has been in force,
-        (B, N) [s].
-        """
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """(B, S) float32 states of B teams."""
         ...
 
 
 class PrintedState:
-    """s = (X, Pr, G) as printed: positions [m] and velocities [m/s] agent by agent, commands, G. (2n+1)N+1 numbers."""
+    """s = (X, Pr, G) as published: positions [m] and velocities [m/s] agent by agent, commands, G. (2n+1)N+1 numbers."""
 
     def __init__(self, scenario: Scenario) -> None:
         agents = scenario.agents
@@ -54,8 +52,8 @@ class PrintedState:
         self.low = np.array([-np.inf] * 4 * agents + [0.0] * (agents + 1))
         self.high = np.array([np.inf] * 4 * agents + [len(scenario.orders.commands) - 1.0] * agents + [2.0])
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, 5N+1) float32; obstacles (B, K, 3) are not in it (erratum 9), nor is the age of the commands."""
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """(B, 5N+1) float32; obstacles are not in it (erratum 9), nor is the age of the commands."""
         return observation.state().astype(np.float32)
 
 
@@ -78,13 +76,14 @@ class ExtendedState:
         self.scale = np.ones(self.size)
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
 
-    def __call__(self, observation: Observation, obstacles: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, N (23 + C) + 3) float32 from a batch observation, obstacles (B, K, 3) [m] and ages (B, N) [s]; C commands."""
+    def __call__(self, observation: Observation) -> np.ndarray:
+        """(B, N (23 + C) + 3) float32 with C commands; a command that an episode began with is old.
+
+        Raises:
+            IndexError: a command that is none of the scenario's.
+        """
         out = np.zeros((len(observation.position), self.size), dtype=np.float32)
-        _fill(
-            observation.position, observation.velocity, observation.command, observation.formation, obstacles, age, self.slots,
-            self.velocity, self.safe, out,
-        )  # fmt: skip
+        _fill(observation, self.slots, self.velocity, self.safe, out)
         return out
 
 
@@ -98,8 +97,13 @@ def nearest_surface(point, obstacles, out):
 
 
 @laws.compiled
-def _fill(position, velocity, command, formation, obstacles, age, slots, path, safe, out):
-    """The extended state of every world into ``out`` (B, S), which is 0."""
+def _fill(observation, slots, path, safe, out):
+    """The extended state of every team into ``out`` (B, S), which is 0.
+
+    ``slots`` (2, N, 2) [m], ``path`` (2,) the desired centroid's velocity [m/s], ``safe`` d_OA [m].
+    """
+    position, velocity, obstacles = observation.position, observation.velocity, observation.obstacles
+    command, age = observation.command, observation.age
     agents = position.shape[1]
     width = (out.shape[1] - TEAM_ENTRIES) // agents
     centroid, slot, lengths = np.empty(2), np.empty(2), np.empty(LENGTHS)
@@ -125,7 +129,7 @@ def _fill(position, velocity, command, formation, obstacles, age, slots, path, s
                 raise IndexError("a command is none of the scenario's")
             own[2 * LENGTHS + 2 + command[b, i]] = 1.0
             own[width - 1] = laws.clip(age[b, i] / OLD, 1.0)
-        out[b, agents * width + formation[b]] = 1.0
+        out[b, agents * width + observation.formation[b]] = 1.0
 
 
 STATES: dict[str, Callable[[Scenario], State]] = {"printed": PrintedState, "extended": ExtendedState}

@@ -116,7 +116,7 @@ class LogWriter:
         Raises:
             SimulationError: the disk does not take it.
         """
-        stamp = round(frame.time * 1e9)
+        stamp = round(float(frame.observation.time) * 1e9)
         try:
             for topic, data in self._messages(frame, stamp):
                 self._mcap.add_message(self._channels[topic], stamp, data, stamp, self._steps)
@@ -183,21 +183,22 @@ class LogWriter:
 
     def _messages(self, frame: Frame, stamp: int) -> Iterator[tuple[str, bytes]]:
         """All messages of one mission step."""
-        scene, transforms = self._scene.encode(stamp, frame.position, frame.reference)
+        seen, first = frame.observation, frame.first
+        scene, transforms = self._scene.encode(stamp, first.position, first.reference)
         yield SCENE_TOPIC, scene
         yield TRANSFORMS_TOPIC, transforms
-        motion = np.concatenate([frame.position, frame.velocity], axis=1)
-        yield "/state", schemas.encode(schemas.STATE, motion, time=float(frame.time))
-        reference = np.concatenate([frame.reference, frame.reference_velocity], axis=1)
+        motion = np.concatenate([first.position, first.velocity], axis=1)
+        yield "/state", schemas.encode(schemas.STATE, motion, time=float(seen.time))
+        reference = np.concatenate([first.reference, first.reference_velocity], axis=1)
         yield "/reference", schemas.encode(schemas.REFERENCE, reference)
-        yield "/force", schemas.encode(schemas.FORCE, frame.force)
+        yield "/force", schemas.encode(schemas.FORCE, first.force)
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
         if self._posed:
             yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)
         if self._weighted:
             yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
-        verdicts = {"formation": int(frame.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}
-        yield "/metrics", schemas.encode(schemas.METRICS, frame.clearance[:, None], **verdicts)
+        verdicts = {"formation": int(seen.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}
+        yield "/metrics", schemas.encode(schemas.METRICS, seen.clearance[:, None], **verdicts)
 
     def _end(self) -> None:
         try:

@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, Trajectory, run_episode
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.results.summary import Result, method_key
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import Decision, Situation, Supervisor, make_supervisor
+from marlbc_mj.supervisors import Decision, Supervisor, make_supervisor
 from marlbc_mj.util.errors import MarlbcError, SimulationError
 from marlbc_mj.util.progress import Progress, silent
 
@@ -48,15 +49,15 @@ class Stopwatch:
     def __init__(self, supervisor: Supervisor, scenario: Scenario) -> None:
         self.supervisor = supervisor
         self.solver_ms: list[float] = []
-        self.memory: list[Any] = [supervisor.start(scenario)]
+        self.memory: list[Any] = [supervisor.start(scenario, 1)]
 
-    def start(self, scenario: Scenario) -> Any:
+    def start(self, scenario: Scenario, teams: int) -> Any:
         """The supervisor's memory."""
-        return self.memory.pop() if self.memory else self.supervisor.start(scenario)
+        return self.memory.pop() if self.memory else self.supervisor.start(scenario, teams)
 
-    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
+    def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
         """The supervisor's orders."""
-        orders, memory = self.supervisor.decide(situation, memory)
+        orders, memory = self.supervisor.decide(observation, memory)
         spent = getattr(memory, "solver_ms", None)
         if spent is not None:
             self.solver_ms.append(float(spent))
@@ -131,8 +132,8 @@ def _frame_observer(job: EpisodeJob, log: LogWriter | None, progress: Progress) 
     def observe(frame: Frame) -> None:
         if log is not None:
             log.write(frame)
-        if round(frame.time / job.scenario.mission_step) % TELL_EVERY == 0:
-            progress(job.key, frame.time, job.scenario.duration)
+        if frame.observation.step % TELL_EVERY == 0:
+            progress(job.key, float(frame.observation.time), job.scenario.duration)
 
     return observe
 

@@ -14,7 +14,8 @@ from marlbc_mj.episode import Frame, run_episode
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, paper
 from marlbc_mj.studies.timing import interleaved
-from marlbc_mj.supervisors import Scripted, situation
+from marlbc_mj.supervisors import Scripted
+from marlbc_mj.supervisors.scripted import orders_at
 from marlbc_mj.util.progress import Progress, silent
 
 
@@ -45,12 +46,12 @@ def _rollout(world: World, schedule: np.ndarray) -> None:
 
 def _episode(world: World) -> None:
     scenario, supervisor = world.scenario, Scripted()
-    memory = supervisor.start(scenario)
+    memory = supervisor.start(scenario, 1)
     observation = world.reset()
     done = False
     while not done:
-        orders, memory = supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
-        step = world.step(orders[None])
+        orders, memory = supervisor.decide(observation, memory)
+        step = world.step(orders)
         observation, done = step.observation, bool(step.done[0])
 
 
@@ -71,9 +72,4 @@ def _write(scenario: Scenario, frames: list[Frame], path: Path) -> None:
 
 def scripted_orders(scenario: Scenario) -> np.ndarray:
     """(M, N) orders of the scripted supervisor at every mission step."""
-    supervisor = Scripted()
-    memory = supervisor.start(scenario)
-    world = World(scenario)
-    start = situation(world.observe(), world.state.obstacles[0], scenario.mission_step)
-    times = np.arange(scenario.mission_steps) * scenario.mission_step
-    return np.array([supervisor.decide(start._replace(time=float(t)), memory)[0] for t in times])
+    return orders_at(np.arange(scenario.mission_steps) * scenario.mission_step, Scripted().start(scenario, 1))

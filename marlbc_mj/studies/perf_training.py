@@ -16,7 +16,6 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.policies.checkpoint import signature
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.studies.timing import interleaved, ratio
-from marlbc_mj.supervisors import situation
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.training.base import BaseTrainer, make_starts
@@ -205,16 +204,15 @@ def _measure_decisions(trainer: BaseTrainer, episodes: int) -> dict[str, dict[st
     every: list[float] = []
     deciding: list[float] = []
     for _ in range(episodes):
-        memory, observation = supervisor.start(scenario), world.reset()
-        supervisor.decide(situation(observation, world.state.obstacles[0], scenario.mission_step), memory)
+        memory, observation = supervisor.start(scenario, 1), world.reset()
+        supervisor.decide(observation, memory)
         for step in range(scenario.mission_steps):
-            seen = situation(observation, world.state.obstacles[0], scenario.mission_step)
             began = perf_counter()
-            orders, memory = supervisor.decide(seen, memory)
+            orders, memory = supervisor.decide(observation, memory)
             every.append(1e6 * (perf_counter() - began))
             if step % config.interval == 0:
                 deciding.append(every[-1])
-            observation = world.step(orders[None]).observation
+            observation = world.step(orders).observation
     samples = {"decision_step": deciding, "all_mission_steps": every}
     return {name: {"median": float(np.median(us)), "p99": float(np.percentile(us, 99))} for name, us in samples.items()}
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.table import Column, Table, to_markdown
@@ -26,7 +27,7 @@ from marlbc_mj.scenarios.families import Field
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, run_study
 from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
-from marlbc_mj.supervisors import make_supervisor, situation
+from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
@@ -56,7 +57,7 @@ class SizedTeams:
         self.steps = max(1, AGENT_STEPS // (self.world.worlds * agents))
         self.agent_steps = self.world.worlds * agents * self.steps
         self.supervisors = {name: make_supervisor(name) for name in SCALED_SUPERVISORS}
-        self.memories = {name: supervisor.start(self.scenario) for name, supervisor in self.supervisors.items()}
+        self.memories = {name: supervisor.start(self.scenario, 1) for name, supervisor in self.supervisors.items()}
 
     def advance(self) -> None:
         """One burst; a finished mission starts again."""
@@ -66,8 +67,8 @@ class SizedTeams:
             self.world.advance(self.orders)
 
     def decide(self, name: str) -> None:
-        """One decision of a supervisor, in the state where the team is."""
-        seen = situation(self.world.observe(), self.world.state.obstacles[0], self.scenario.mission_step)
+        """One decision of a supervisor for one team, in the state where it is."""
+        seen = Observation(*(field[:1] for field in self.world.observe()))
         _, self.memories[name] = self.supervisors[name].decide(seen, self.memories[name])
 
 

@@ -4,19 +4,20 @@ from collections.abc import Callable
 from functools import partial
 
 from marlbc_mj.policies.shipped import checkpoint_path
-from marlbc_mj.supervisors.base import Blend, Decision, Situation, Supervisor, situation
+from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.supervisors.fsams import FSAMS
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.supervisors.mpcms import MPCMS
+from marlbc_mj.supervisors.one_team import OneTeam, batched
 from marlbc_mj.supervisors.oracle import Oracle
 from marlbc_mj.supervisors.scripted import Scripted
 from marlbc_mj.util.errors import unknown
 
-SUPERVISORS: dict[str, tuple[Callable[..., Supervisor], str]] = {
+SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]] = {
     "scripted": (Scripted, "the scenario's schedule: the fewest switches its geometry allows"),
-    "fsams": (FSAMS, "finite state automaton on the clearance, thresholds as printed (chatters)"),
+    "fsams": (FSAMS, "finite state automaton on the clearance, thresholds as published (chatters)"),
     "fsams-hysteresis": (
         lambda: FSAMS(hysteresis=0.3, dwell=0.5),
         "the same with 0.3 m hysteresis and 0.5 s dwell: the fair baseline",
@@ -34,7 +35,7 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor], str]] = {
     ),
     "marlms": (
         lambda: Learned.load(checkpoint_path("marlms")),
-        "MARLMS: the shipped checkpoint of lenient, dueling, averaged Q-networks, one an agent",
+        "MARLMS: the shipped checkpoint of lenient, dueling, averaged Q-networks, one per agent",
     ),
     "rlms": (
         lambda: Learned.load(checkpoint_path("rlms")),
@@ -59,13 +60,15 @@ UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQ
 def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
     """A supervisor with its default settings, by name; the oracle's schedule belongs to a ``controller``.
 
+    One that decides for one team is wrapped in :class:`OneTeam`.
+
     Raises:
         ConfigurationError: unknown name.
     """
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, SUPERVISORS)
     factory = SUPERVISORS[name][0]
-    return factory(controller) if name in ORACLES else factory()
+    return batched(factory(controller) if name in ORACLES else factory())
 
 
 __all__ = [
@@ -82,10 +85,12 @@ __all__ = [
     "Layered",
     "Learned",
     "MotorSchema",
+    "OneTeam",
+    "OneTeamSupervisor",
     "Oracle",
     "Scripted",
-    "Situation",
     "Supervisor",
+    "batched",
+    "carry_out",
     "make_supervisor",
-    "situation",
 ]

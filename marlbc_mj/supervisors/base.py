@@ -1,62 +1,80 @@
-"""What the runner asks of a mission supervisor: state in, orders out (with velocities or without), at every mission step."""
+"""What a mission supervisor is: observations of B teams in, orders out, with velocities or without, at every mission step."""
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
-
-
-class Situation(NamedTuple):
-    """What one team's supervisor sees at the start of a mission step."""
-
-    step: int  # mission steps made so far
-    time: float  # [s]
-    position: np.ndarray  # (N, 2) measured [m]
-    velocity: np.ndarray  # (N, 2) measured [m/s]
-    clearance: np.ndarray  # (N,) [m]
-    formation: int  # G: 2 in formation, 1 in column, 0 neither
-    command: np.ndarray  # (N,) index into scenario.orders.commands; meaningless at step 0
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
-    reference: np.ndarray  # (N, 2) p_r [m]
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class Blend(NamedTuple):
-    """A decision that does not leave the reference velocities to the composition of orders (12)."""
+    """A decision that does not leave the reference velocities to the composition of orders (12).
 
-    orders: np.ndarray  # (N,) indices into ``scenario.orders``: the labels that switches are counted by
-    velocity: np.ndarray  # (N, 2) v_r for the mission step [m/s]
+    A one-team supervisor gives both without the leading axis.
+    """
+
+    orders: np.ndarray  # (B, N) indices into ``scenario.orders``: the labels that switches are counted by
+    velocity: np.ndarray  # (B, N, 2) v_r for the mission step [m/s]
 
 
 Decision = np.ndarray | Blend
-"""(N,) indices into ``scenario.orders``, whose composition (12) is v_r, or orders with a v_r of their own."""
+"""(B, N) indices into ``scenario.orders``, whose composition (12) is v_r, or orders with a v_r of their own."""
 
 
 @runtime_checkable
 class Supervisor(Protocol):
-    """Maps situations to one priority order per agent. Implementations are frozen dataclasses; memory travels outside."""
+    """Maps observations to one priority order per agent, for B teams at once.
+
+    Implementations are frozen dataclasses; what is remembered travels outside. Teams do not interact: the orders of one are the
+    same whatever B is.
+    """
+
+    def start(self, scenario: Scenario, teams: int) -> Any:
+        """Memory of B ``teams`` at the start of an episode; checks that the scenario suits this supervisor."""
+        ...
+
+    def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
+        """Orders (B, N), alone or with reference velocities; and the memory for the next call."""
+        ...
+
+
+class OneTeamSupervisor(Protocol):
+    """The simpler form, for one team; :func:`~marlbc_mj.supervisors.one_team.batched` makes a :class:`Supervisor` of it."""
 
     def start(self, scenario: Scenario) -> Any:
-        """Memory at the start of an episode; checks that the scenario suits this supervisor."""
+        """Memory of one team at the start of an episode; checks that the scenario suits this supervisor."""
         ...
 
-    def decide(self, situation: Situation, memory: Any) -> tuple[Decision, Any]:
-        """Orders, alone or with reference velocities; and the memory for the next call."""
+    def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
+        """Orders (N,) for an :meth:`Observation.team`, alone or with velocities (N, 2); and the memory for the next call."""
         ...
 
 
-def situation(observation: Observation, obstacles: np.ndarray, mission_step: float, world: int = 0) -> Situation:
-    """One world's situation from a batch observation."""
-    time = float(observation.time[world])
-    return Situation(
-        round(time / mission_step),
-        time,
-        observation.position[world],
-        observation.velocity[world],
-        observation.clearance[world],
-        int(observation.formation[world]),
-        observation.command[world],
-        obstacles,
-        observation.reference[world],
-    )
+def split_decision(decision: Decision, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:
+    """Orders of ``shape``, and the reference velocities [m/s] that come with them, if any do: one more axis, of length 2.
+
+    Raises:
+        ConfigurationError: anything else, orders of another shape or that are not integers for example.
+    """
+    orders, velocity = decision if isinstance(decision, Blend) else (decision, None)
+    if not isinstance(orders, np.ndarray) or orders.dtype.kind not in "iu":
+        found = orders.dtype if isinstance(orders, np.ndarray) else type(orders).__name__
+        raise ConfigurationError(f"a supervisor's orders must be an array of integers with shape {shape}, got {found}")
+    if orders.shape != shape:
+        raise ConfigurationError(f"a supervisor's orders must have shape {shape}, got {orders.shape}")
+    if velocity is not None and np.shape(velocity) != (*shape, 2):
+        raise ConfigurationError(f"a supervisor's velocities must have shape {(*shape, 2)}, got {np.shape(velocity)}")
+    return orders, velocity
+
+
+def carry_out(world: World, decision: Decision) -> Step:
+    """One mission step of every world, under the decision of a supervisor for all of them.
+
+    Raises:
+        ConfigurationError: a decision that is none, see :func:`split_decision` and :meth:`World.step`.
+        SimulationError: a world diverged.
+    """
+    return world.step(*split_decision(decision, (world.worlds, world.scenario.agents)))

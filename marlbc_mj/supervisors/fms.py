@@ -1,6 +1,6 @@
 """FMS, the fuzzy mission supervisor (after Marino et al. 2009): a zero-order Sugeno rule base on each agent's own clearance.
 
-Reconstructed: the source prints neither its sets nor its rules. Chosen here are the product as "and", a keep rule that speaks
+Reconstructed: the source publishes neither its sets nor its rules. Chosen here are the product as "and", a keep rule that speaks
 for the order in force, and the clearance rate from two successive mission steps.
 """
 
@@ -9,30 +9,31 @@ from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA = 0, 1, 2
+_STATES = np.array([_FM, _FR, _OA])[:, None, None]
 
 
 class Membership(NamedTuple):
     """Degrees in [0, 1] to which each agent's clearance x = d / d_OA and its rate d' belong to the fuzzy sets."""
 
-    near: np.ndarray  # (N,) trapezoid (0, 0, 1, 1.3) of x, 1 inside an obstacle
-    mid: np.ndarray  # (N,) trapezoid (1, 1.3, 2, 2.6)
-    far: np.ndarray  # (N,) trapezoid (2, 2.6, inf, inf)
-    closing: np.ndarray  # (N,) 1 / (1 + exp(2 d')), d' in m/s
-    opening: np.ndarray  # (N,) 1 / (1 + exp(-2 d')) = 1 - closing
+    near: np.ndarray  # (B, N) trapezoid (0, 0, 1, 1.3) of x, 1 inside an obstacle
+    mid: np.ndarray  # (B, N) trapezoid (1, 1.3, 2, 2.6)
+    far: np.ndarray  # (B, N) trapezoid (2, 2.6, inf, inf)
+    closing: np.ndarray  # (B, N) 1 / (1 + exp(2 d')), d' in m/s
+    opening: np.ndarray  # (B, N) 1 / (1 + exp(-2 d')) = 1 - closing
 
 
 def memberships(clearance: np.ndarray, rate: np.ndarray, safe_distance: float) -> Membership:
-    """Fuzzy sets of FMS; near + mid + far = 1 and closing + opening = 1.
+    """Fuzzy sets of FMS, element by element; near + mid + far = 1 and closing + opening = 1.
 
     Args:
-        clearance: (N,) d [m], infinite without obstacles.
-        rate: (N,) d' [m/s].
+        clearance: (B, N) d [m], infinite without obstacles.
+        rate: (B, N) d' [m/s].
         safe_distance: d_OA [m].
     """
     x = np.asarray(clearance) / safe_distance
@@ -43,10 +44,10 @@ def memberships(clearance: np.ndarray, rate: np.ndarray, safe_distance: float) -
 
 
 class FuzzyMemory(NamedTuple):
-    """One team between two mission steps."""
+    """B teams between two mission steps."""
 
-    state: np.ndarray  # (N,) 0: FM, 1: FR, 2: OA on top
-    clearance: np.ndarray | None  # (N,) at the mission step before [m]
+    state: np.ndarray  # (B, N) 0: FM, 1: FR, 2: OA on top
+    clearance: np.ndarray  # (B, N) at the mission step before [m]; infinite before the first
     orders: np.ndarray  # (3,) the order of each state
     safe_distance: float  # [m]
     mission_step: float  # [s]
@@ -67,30 +68,27 @@ class FMS:
         if not 0 <= self.lead <= 1:
             raise ConfigurationError(f"FMS lead must be between 0 and 1, got {self.lead}")
 
-    def start(self, scenario: Scenario) -> FuzzyMemory:
+    def start(self, scenario: Scenario, teams: int) -> FuzzyMemory:
         """Every agent in formation."""
         orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
-        state = np.zeros(scenario.agents, dtype=np.int64)
-        return FuzzyMemory(state, None, orders, scenario.safe_distance, scenario.mission_step, give_way(scenario))
+        shape = teams, scenario.agents
+        state, before = np.full(shape, _FM), np.full(shape, np.inf)
+        return FuzzyMemory(state, before, orders, scenario.safe_distance, scenario.mission_step, give_way(scenario))
 
-    def decide(self, situation: Situation, memory: FuzzyMemory) -> tuple[np.ndarray, FuzzyMemory]:
+    def decide(self, observation: Observation, memory: FuzzyMemory) -> tuple[np.ndarray, FuzzyMemory]:
         """One rule base per agent, on its own clearance."""
-        clearance = situation.clearance
+        clearance, state = observation.clearance, memory.state
         sets = memberships(clearance, _rate(clearance, memory), memory.safe_distance)
-        strength = np.stack([sets.far, sets.mid * sets.closing, sets.near])  # (3, N) by state
-        agents = np.arange(len(clearance))
-        strength[memory.state, agents] += sets.mid * sets.opening
-        winner = strength.argmax(axis=0)
-        ahead = strength[winner, agents] - strength[memory.state, agents]
-        state = np.where((ahead >= self.lead) & (winner != memory.state), winner, memory.state)
-        orders = lift(memory.orders[state], situation, memory.way)
+        strength = np.stack([sets.far, sets.mid * sets.closing, sets.near])  # (3, B, N) by state
+        strength += np.where(state == _STATES, sets.mid * sets.opening, 0.0)
+        winner, ahead = strength.argmax(axis=0), strength.max(axis=0) - np.choose(state, strength)
+        state = np.where((ahead >= self.lead) & (winner != state), winner, state)
+        orders = lift(memory.orders[state], observation, memory.way)
         return orders, memory._replace(state=state, clearance=clearance.copy())
 
 
 def _rate(clearance: np.ndarray, memory: FuzzyMemory) -> np.ndarray:
-    """(N,) clearance rate [m/s], 0 where there is no earlier clearance or no obstacle."""
-    if memory.clearance is None:
-        return np.zeros(len(clearance))
+    """(B, N) clearance rate [m/s], 0 where there is no earlier clearance or no obstacle."""
     known = np.isfinite(clearance) & np.isfinite(memory.clearance)
-    change = np.subtract(clearance, memory.clearance, out=np.zeros(len(clearance)), where=known)
+    change = np.subtract(clearance, memory.clearance, out=np.zeros(clearance.shape), where=known)
     return np.asarray(change / memory.mission_step)

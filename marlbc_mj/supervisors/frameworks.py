@@ -14,22 +14,25 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
-from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team, path_at
+from marlbc_mj.core.laws import compiled
+from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import grid_room, make_behaviors
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Blend, Situation
+from marlbc_mj.supervisors.base import Blend
 from marlbc_mj.supervisors.fms import memberships
 from marlbc_mj.supervisors.neighbors import GiveWay, crowded, give_way
 from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA, _AA = 0, 1, 2, 3
+_LABELS = {"FM": "FM", "FR": "FR", "OA": "OA>FM", "AA": "AA>FM"}
 
 
 class Repertoire(NamedTuple):
-    """What a framework blends, fixed for an episode."""
+    """What a framework blends, fixed for an episode; M behaviors: FM, FR, OA and perhaps AA."""
 
-    behaviors: Behaviors  # of the scenario, in a table of orders that hold one behavior each: FM, FR, OA, and AA if named
-    orders: np.ndarray  # (3,) or (4,) the order that labels each
+    alone: Behaviors  # of the scenario; order j is behavior j alone
+    orders: np.ndarray  # (M,) the order that labels each behavior
     safe_distance: float  # d_OA [m]
     way: GiveWay  # to other agents
     grid: np.ndarray  # scratch
@@ -41,29 +44,41 @@ def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) 
     Raises:
         ConfigurationError: the scenario lacks one of them.
     """
-    labels = {"FM": "FM", "FR": "FR", "OA": "OA>FM", "AA": "AA>FM"}
-    orders = np.array([scenario.orders.index(labels[name]) for name in names])
+    orders = np.array([scenario.orders.index(_LABELS[name]) for name in names])
     place = [b.name for b in scenario.behaviors]
-    alone = np.array([[place.index(name)] for name in names])
-    behaviors = make_behaviors(scenario)._replace(table=alone)
-    return Repertoire(behaviors, orders, scenario.safe_distance, give_way(scenario), np.zeros(grid_room(scenario)))
+    alone = make_behaviors(scenario)._replace(table=np.array([[place.index(name)] for name in names]))
+    return Repertoire(alone, orders, scenario.safe_distance, give_way(scenario), np.zeros(grid_room(scenario)))
 
 
-def evaluated_at(situation: Situation, memory: Repertoire) -> np.ndarray:
-    """(N, 2) where the mission evaluates behaviors [m]."""
-    return np.ascontiguousarray(situation.reference if memory.behaviors.virtual else situation.position)
+def evaluated_at(observation: Observation, memory: Repertoire) -> np.ndarray:
+    """(B, N, 2) where the mission evaluates behaviors [m]."""
+    return np.ascontiguousarray(observation.reference if memory.alone.virtual else observation.position)
 
 
-def behavior_velocities(situation: Situation, memory: Repertoire) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity (8) of FM, FR, OA (and AA), each alone, for every agent, (3 or 4, N, 2) [m/s]; and p_cd, p_cd' (2, 2)."""
-    at = evaluated_at(situation, memory)
-    now, workspace = np.empty((2, 2)), np.empty((WORKSPACE, 2))
-    path_at(situation.time, memory.behaviors.path, now)
+def behavior_velocities(observation: Observation, memory: Repertoire) -> np.ndarray:
+    """Velocity (8) of every behavior alone, for every agent: (M, B, N, 2) [m/s]."""
+    at = evaluated_at(observation, memory)
     velocities = np.empty((len(memory.orders), *at.shape))
-    for behavior, velocity in enumerate(velocities):
-        alone = np.full(len(at), behavior)
-        compose_team(situation.time, alone, memory.behaviors, at, situation.obstacles, memory.grid, workspace, velocity)
-    return velocities, now
+    _fill_velocities(memory.alone, observation.time, at, np.ascontiguousarray(observation.obstacles), memory.grid, velocities)
+    return velocities
+
+
+@compiled
+def _fill_velocities(alone, time, at, obstacles, grid, velocities):
+    """Velocities (M, B, N, 2) [m/s] of every behavior of ``alone`` at ``time`` (B,) [s] and positions (B, N, 2) [m]."""
+    orders, workspace = np.empty(at.shape[1], dtype=np.int64), np.empty((WORKSPACE, 2))
+    for behavior in range(velocities.shape[0]):
+        orders[:] = behavior
+        for b in range(at.shape[0]):
+            compose_team(time[b], orders, alone, at[b], obstacles[b], grid, workspace, velocities[behavior, b])
+
+
+@compiled
+def _fill_normals(at, obstacles, normals):
+    """Outward unit normals (B, N, 2) of the obstacles (B, K, 3) nearest to positions (B, N, 2) [m]."""
+    for b in range(at.shape[0]):
+        for i in range(at.shape[1]):
+            nearest_obstacle(at[b, i], obstacles[b], normals[b, i])
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,7 @@ class Layered:
 
     Subsumption of whole layers: those below are suppressed, not projected, so an agent that avoids an obstacle neither follows
     the path nor keeps its slot meanwhile. OA brings it to d = d_OA, where OA is still active: it can rest there for good
-    while the path goes on. The regions are those of FSAMS as printed. Where the scenario has agent avoidance, AA is the layer
+    while the path goes on. The regions are those of FSAMS as published. Where the scenario has agent avoidance, AA is the layer
     above OA, active while a neighbor is within d_AA.
     """
 
@@ -82,23 +97,23 @@ class Layered:
         if not (np.isfinite(self.reach) and self.reach >= 1):
             raise ConfigurationError(f"Layered reach must be at least 1 and finite, got {self.reach}")
 
-    def start(self, scenario: Scenario) -> Repertoire:
+    def start(self, scenario: Scenario, teams: int) -> Repertoire:
         """The scenario's behaviors."""
         avoiding = any(b.name == "AA" for b in scenario.behaviors)
         return repertoire(scenario, ("FM", "FR", "OA", "AA") if avoiding else ("FM", "FR", "OA"))
 
     def weights(self, clearance: np.ndarray, safe_distance: float) -> np.ndarray:
-        """(3, N), 1 for the highest active of FM, FR and OA and 0 for the others, at clearances (N,) [m]."""
+        """(3, B, N), 1 for the highest active of FM, FR and OA and 0 for the others, at clearances (B, N) [m]."""
         near, within = clearance <= safe_distance, clearance <= self.reach * safe_distance
         return np.stack([~within, within & ~near, near]).astype(np.float64)
 
-    def decide(self, situation: Situation, memory: Repertoire) -> tuple[Blend, Repertoire]:
+    def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
         """One behavior per agent."""
-        weights = self.weights(situation.clearance, memory.safe_distance)
+        weights = self.weights(observation.clearance, memory.safe_distance)
         if len(memory.orders) > _AA:
-            close = crowded(situation, memory.way, reach=1.0)  # alone, AA has an agent stand still from d_AA on
+            close = crowded(observation, memory.way, reach=1.0)  # alone, AA has an agent stand still from d_AA on
             weights = np.concatenate([weights * ~close, close[None].astype(np.float64)])
-        velocities, _ = behavior_velocities(situation, memory)
+        velocities = behavior_velocities(observation, memory)
         return _blend(weights, velocities, memory), memory
 
 
@@ -110,20 +125,20 @@ class FuzzyBlend:
     path's velocity.
     """
 
-    def start(self, scenario: Scenario) -> Repertoire:
+    def start(self, scenario: Scenario, teams: int) -> Repertoire:
         """The scenario's behaviors."""
         return repertoire(scenario)
 
     def weights(self, clearance: np.ndarray, safe_distance: float) -> np.ndarray:
-        """(3, N), mu_j / sum mu_j of FM, FR and OA at clearances (N,) [m]."""
-        sets = memberships(clearance, np.zeros(len(clearance)), safe_distance)
+        """(3, B, N), mu_j / sum mu_j of FM, FR and OA at clearances (B, N) [m]."""
+        sets = memberships(clearance, np.zeros(clearance.shape), safe_distance)
         degrees = np.stack([sets.far, sets.mid, sets.near])
         return np.asarray(degrees / degrees.sum(axis=0))
 
-    def decide(self, situation: Situation, memory: Repertoire) -> tuple[Blend, Repertoire]:
+    def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
         """One mixture per agent."""
-        weights = self.weights(situation.clearance, memory.safe_distance)
-        velocities, _ = behavior_velocities(situation, memory)
+        weights = self.weights(observation.clearance, memory.safe_distance)
+        velocities = behavior_velocities(observation, memory)
         return _blend(weights, velocities, memory), memory
 
 
@@ -163,30 +178,29 @@ class MotorSchema:
         if self.sphere <= self.saturation:
             raise ConfigurationError(f"MotorSchema sphere must be greater than saturation = {self.saturation}, got {self.sphere}")
 
-    def start(self, scenario: Scenario) -> Repertoire:
+    def start(self, scenario: Scenario, teams: int) -> Repertoire:
         """The scenario's behaviors."""
         return repertoire(scenario)
 
     def magnitude(self, clearance: np.ndarray) -> np.ndarray:
-        """(N,) m in [0, 1] at clearances (N,) [m]."""
+        """(B, N) m in [0, 1] at clearances (B, N) [m]."""
         return np.asarray(np.clip((self.sphere - clearance) / (self.sphere - self.saturation), 0.0, 1.0))
 
     def weights(self, clearance: np.ndarray) -> np.ndarray:
-        """(3, N), gain x magnitude of FM, FR and OA at clearances (N,) [m]."""
-        near, always = self.magnitude(clearance), np.ones(len(clearance))
+        """(3, B, N), gain x magnitude of FM, FR and OA at clearances (B, N) [m]."""
+        near, always = self.magnitude(clearance), np.ones(clearance.shape)
         reconstruction = always if self.reconstruct_always else near
         return np.stack([self.formation * always, self.reconstruction * reconstruction, self.avoidance * near])
 
-    def decide(self, situation: Situation, memory: Repertoire) -> tuple[Blend, Repertoire]:
+    def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
         """One sum per agent."""
-        weights = self.weights(situation.clearance)
-        velocities, now = behavior_velocities(situation, memory)
-        velocities[:_OA] = _cut(velocities[:_OA] - now[1], self.speed)
-        for i, p in enumerate(evaluated_at(situation, memory)):
-            nearest_obstacle(p, situation.obstacles, velocities[_OA, i])
+        weights = self.weights(observation.clearance)
+        velocities, path_velocity = behavior_velocities(observation, memory), memory.alone.path[1]
+        velocities[:_OA] = _cut(velocities[:_OA] - path_velocity, self.speed)
+        _fill_normals(evaluated_at(observation, memory), np.ascontiguousarray(observation.obstacles), velocities[_OA])
         velocities[_OA] *= self.speed
         blend = _blend(weights, velocities, memory)
-        return blend._replace(velocity=blend.velocity + now[1]), memory
+        return blend._replace(velocity=blend.velocity + path_velocity), memory
 
 
 def _cut(velocities: np.ndarray, speed: float) -> np.ndarray:
@@ -196,5 +210,5 @@ def _cut(velocities: np.ndarray, speed: float) -> np.ndarray:
 
 
 def _blend(weights: np.ndarray, velocities: np.ndarray, memory: Repertoire) -> Blend:
-    """Sum over behaviors of ``weights`` (3, N) times ``velocities`` (3, N, 2), labelled by the greatest weight."""
+    """Sum over behaviors of ``weights`` (M, B, N) times ``velocities`` (M, B, N, 2), labelled by the greatest weight."""
     return Blend(memory.orders[weights.argmax(axis=0)], (weights[..., None] * velocities).sum(axis=0))

@@ -1,23 +1,23 @@
-"""FSAMS, the finite-state-automata mission supervisor (Marino et al. 2013; the rule is printed in section 4.2.1, erratum 8)."""
+"""FSAMS, the finite-state-automata mission supervisor (Marino et al. 2013; its rule: section 4.2.1, erratum 8)."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.util.errors import ConfigurationError
 
 _FAR, _MIDDLE, _NEAR = 0, 1, 2
 
 
-class Automaton(NamedTuple):
-    """One team's automata."""
+class Automata(NamedTuple):
+    """One automaton per agent of B teams."""
 
-    state: np.ndarray  # (N,) 0: FM, 1: FR, 2: OA on top
-    entered: np.ndarray  # (N,) [s] when it got there
+    state: np.ndarray  # (B, N) 0: FM, 1: FR, 2: OA on top
+    entered: np.ndarray  # (B, N) [s] when it got there
     orders: np.ndarray  # (3,) the order of each state
     safe_distance: float  # [m]
     way: GiveWay  # to other agents
@@ -27,12 +27,10 @@ class Automaton(NamedTuple):
 class FSAMS:
     """d <= d_OA: OA on top; d_OA < d <= 2 d_OA: FR; else FM.
 
-    As printed it chatters: each order moves the agent across the threshold that chose it. With ``hysteresis`` a threshold
-    is crossed
-    inwards at -hysteresis and outwards at +hysteresis, and a state lasts at least ``dwell`` before a less urgent one may
-    follow: the
-    fair baseline. A dwell that also delays the more urgent states drives agents deep into the discs, so that reading is an
-    option only. Where the scenario has agent avoidance, it goes on top of the state's order while a neighbor is too close.
+    As published it chatters: each order moves the agent across the threshold that chose it. With ``hysteresis`` a threshold is
+    crossed inwards at -hysteresis and outwards at +hysteresis, and a state lasts at least ``dwell`` before a less urgent one may
+    follow: the fair baseline. A dwell that also delays the more urgent states drives agents deep into the discs, so that reading
+    is an option only. Where the scenario has agent avoidance, it goes on top of the state's order while a neighbor is too close.
     """
 
     hysteresis: float = 0.0  # [m]
@@ -45,27 +43,27 @@ class FSAMS:
             if not (np.isfinite(value) and value >= 0):
                 raise ConfigurationError(f"FSAMS {name} must be non-negative and finite, got {value}")
 
-    def start(self, scenario: Scenario) -> Automaton:
+    def start(self, scenario: Scenario, teams: int) -> Automata:
         """Every agent in formation, free to switch at once."""
         orders = np.array([scenario.orders.index(name) for name in ("FM", "FR", "OA>FM")])
-        state = np.zeros(scenario.agents, dtype=np.int64)
-        return Automaton(state, np.full(scenario.agents, -np.inf), orders, scenario.safe_distance, give_way(scenario))
+        shape = teams, scenario.agents
+        state, entered = np.full(shape, _FAR), np.full(shape, -np.inf)
+        return Automata(state, entered, orders, scenario.safe_distance, give_way(scenario))
 
-    def decide(self, situation: Situation, memory: Automaton) -> tuple[np.ndarray, Automaton]:
+    def decide(self, observation: Observation, memory: Automata) -> tuple[np.ndarray, Automata]:
         """One automaton per agent, on its own clearance."""
-        state, entered = memory.state.copy(), memory.entered.copy()
-        for i, clearance in enumerate(situation.clearance):
-            wanted = self._level(float(clearance), int(state[i]), memory.safe_distance)
-            at_once = wanted > state[i] and not self.dwell_delays_urgent
-            if wanted != state[i] and (at_once or situation.time - entered[i] >= self.dwell - 1e-9):
-                state[i], entered[i] = wanted, situation.time
-        orders = lift(memory.orders[state], situation, memory.way)
+        now, before = observation.time[:, None], memory.state
+        wanted = self._level(observation.clearance, before, memory.safe_distance)
+        rested = now - memory.entered >= self.dwell - 1e-9
+        at_once = False if self.dwell_delays_urgent else wanted > before
+        changes = (wanted != before) & (rested | at_once)
+        state, entered = np.where(changes, wanted, before), np.where(changes, now, memory.entered)
+        orders = lift(memory.orders[state], observation, memory.way)
         return orders, memory._replace(state=state, entered=entered)
 
-    def _level(self, clearance: float, state: int, safe_distance: float) -> int:
-        """How many thresholds lie at or above the clearance, each shifted away from the side the agent is on."""
-        level = _FAR
+    def _level(self, clearance: np.ndarray, state: np.ndarray, safe_distance: float) -> np.ndarray:
+        """(B, N) how many thresholds lie at or above the clearance, each shifted away from the side the agent is on."""
+        level = np.full(state.shape, _FAR)
         for threshold, inside in ((2.0 * safe_distance, _MIDDLE), (safe_distance, _NEAR)):
-            shift = self.hysteresis if state >= inside else -self.hysteresis
-            level += clearance <= threshold + shift
+            level += clearance <= threshold + np.where(state >= inside, self.hysteresis, -self.hysteresis)
         return level

@@ -9,12 +9,13 @@ tolerance, up to one of it, since beyond it a formation is lost whatever the dis
 pull at agents in the column too, and then avoidance serves as a brake that keeps them from it (measured: switches 6/4/2/6).
 A step costs w_R per agent in formation, w_F in the column and w_F + w_R in neither, which is how G orders them.
 
-The cost's terms, H and weights are the project's specification. Reconstructed are E, the slots (those of the desired centroid),
-the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the candidates: hold the joint
-order, or change it once, at one of the ``instants``: either the whole team to FM or to FR, or avoidance on top of (or off) the
-common motion behavior for up to ``together`` agents. One agent at a time is what makes a column of the gate, where two discs
-close in on two agents: with two at a time the team dodges into it instead, and two agents violate (measured: 1.5 and 1.1 s).
-The margin printed there, 0.05 m, is one for a reference; the agents lag behind it when it jumps. With it the case study sees
+The cost's terms, H and weights are the project's specification. The rest is reconstructed: E, the slots (those of the desired
+centroid), the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the candidates.
+These hold the joint order, or change it once, at one of the ``instants``: either the whole team to FM or to FR, or avoidance on
+top of (or off) the common motion behavior for up to ``together`` agents. With one agent at a time the team forms a column at the
+gate, where two discs close in on two agents. With two at a time it dodges into the gate, and two agents violate (measured: 1.5
+and 1.1 s).
+The specified margin, 0.05 m, suits a reference; the agents lag behind it when it jumps. With that margin the case study sees
 0.035 s of violation at the entry of the gate, so 0.15 m is the default.
 
 The MuJoCo prediction sees that lag, and needs a longer horizon for it: the way back from the column takes about 3 s, so
@@ -23,7 +24,7 @@ that within the 2 s of H = 40 leaving it never pays, and the case study ends in 
 
 from dataclasses import dataclass, field
 from functools import lru_cache
-from itertools import combinations
+from itertools import accumulate, chain, combinations
 from time import perf_counter
 from typing import Literal, NamedTuple
 
@@ -31,17 +32,18 @@ import numba
 import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
-from marlbc_mj.engine.plan import Plan, make_plan
+from marlbc_mj.engine.composition import Behaviors
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
-from marlbc_mj.supervisors.prediction import follow, judge, simulate
+from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, follow, judge_pairs, simulate
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
-MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision
+MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
-STARTS = ("measured", "reference")
+PREDICTED_FROM = ("measured", "reference")
 AVOIDANCE = "OA"
 
 
@@ -61,13 +63,14 @@ class Candidates(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """What MPCMS keeps between mission steps."""
+    """What MPCMS keeps of B teams between mission steps."""
 
-    plan: Plan
-    joint: Joint  # in force
-    reference: np.ndarray | None  # (N, 2) its own copy of p_r [m]; None before the first decision
-    twin: World | None  # MuJoCo prediction: one world that was given the same orders
-    worlds: World | None  # MuJoCo prediction: one world a candidate
+    scenario: Scenario
+    behaviors: Behaviors  # of the scenario
+    joints: tuple[Joint, ...]  # (B,) in force
+    reference: np.ndarray | None  # (B, N, 2) its own copy of p_r [m]; None before the first decision
+    twins: World | None  # MuJoCo prediction: a world per team that was given the same orders
+    worlds: World | None  # MuJoCo prediction: a world per candidate of one team
     way: GiveWay  # to other agents
     solver_ms: float = 0.0  # what the prediction took in the last decision [ms]
 
@@ -79,9 +82,10 @@ class MPCMS:
     The kinematic prediction integrates the reference with the laws of the mission itself, from the ``measured`` positions or from
     its own copy of the reference. The MuJoCo prediction simulates force law, limit and drag of every candidate; what a supervisor
     cannot measure (reference, controller state) comes from a twin world that was given the same orders, the drag is the nominal
-    one. That twin is part of the memory and moves with every decision. Where the scenario has agent avoidance, it goes on top
-    of the orders given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least
-    violation is chosen.
+    one. That twin is part of the memory and moves with every decision. All teams' candidates are judged in one call; only the
+    MuJoCo prediction simulates one team after the other. Where the scenario has agent avoidance, it goes on top of the orders
+    given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least violation is
+    chosen.
 
     Raises:
         ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
@@ -117,65 +121,84 @@ class MPCMS:
             )
         if self.prediction not in PREDICTIONS:
             raise unknown("MPCMS prediction", self.prediction, PREDICTIONS)
-        if self.start_from not in STARTS:
-            raise unknown("MPCMS start_from", self.start_from, STARTS)
+        if self.start_from not in PREDICTED_FROM:
+            raise unknown("MPCMS start_from", self.start_from, PREDICTED_FROM)
         if self.threads > numba.config.NUMBA_NUM_THREADS:
             most = numba.config.NUMBA_NUM_THREADS
             raise ConfigurationError(f"MPCMS threads must be between 1 and {most} on this machine, got {self.threads}")
 
-    def start(self, scenario: Scenario) -> Forecast:
-        """The whole team in formation.
+    def start(self, scenario: Scenario, teams: int) -> Forecast:
+        """All teams in formation.
 
         Raises:
             ConfigurationError: the scenario lacks an order, or the MuJoCo prediction a compiled controller.
         """
-        plan = make_plan(scenario, self.controller)
         joint = Joint(0, (False,) * scenario.agents)
-        most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True, *joint.avoiding[1:]))))
+        most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True,) * scenario.agents)))
         if most * self.horizon * scenario.agents > MOST_ORDERS:
             raise ConfigurationError(
                 f"MPCMS would predict {most} candidates over {self.horizon} steps for {scenario.agents} agents: more than "
                 f"{MOST_ORDERS} orders a decision; choose fewer instants or a supervisor that decides per agent"
             )
         self._candidates(scenario, joint)
-        if self.prediction == "kinematic":
-            return Forecast(plan, joint, None, None, None, give_way(scenario))
-        if not plan.native:
+        twins, worlds = self._simulators(scenario, teams, most) if self.prediction == "mujoco" else (None, None)
+        return Forecast(scenario, make_behaviors(scenario), (joint,) * teams, None, twins, worlds, give_way(scenario))
+
+    def _simulators(self, scenario: Scenario, teams: int, candidates: int) -> tuple[World, World]:
+        """A twin per team, all in the state of the first, and worlds for the ``candidates`` of one team."""
+        twins = World(scenario, self.controller, worlds=teams)
+        if not twins.native:
             raise ConfigurationError("MPCMS prediction 'mujoco' needs a compiled controller and disturbance")
-        twin, worlds = World(scenario, self.controller), World(scenario, self.controller, worlds=most, threads=self.threads)
-        return Forecast(plan, joint, None, twin, worlds, give_way(scenario))
+        for b in range(1, teams):
+            twins.copy_world(twins, 0, b)
+        return twins, World(scenario, self.controller, worlds=candidates, threads=self.threads)
 
-    def decide(self, situation: Situation, memory: Forecast) -> tuple[np.ndarray, Forecast]:
-        """The first orders of the cheapest sequence; ties go to the earlier candidate, holding first."""
-        candidates = self._candidates(memory.plan.scenario, memory.joint)
+    def decide(self, observation: Observation, memory: Forecast) -> tuple[np.ndarray, Forecast]:
+        """The first orders of each team's cheapest sequence; ties go to the earlier candidate, holding first.
+
+        Raises:
+            SimulationError: a team without any candidate of finite cost.
+        """
+        candidates, pairs = self._pairs(memory)
         began = perf_counter()
-        costs, reached = self._predict(situation, memory, candidates.orders)
+        costs, reached = self._predict(observation, memory, pairs)
         solver_ms = 1e3 * (perf_counter() - began)
-        costs = np.where(np.isfinite(costs), costs, np.inf) + self.w_switch * candidates.switches
-        best = int(costs.argmin())
-        if not np.isfinite(costs[best]):
-            raise SimulationError(f"MPCMS: no candidate has a finite cost at t = {situation.time:.3f} s")
-        orders = lift(candidates.orders[best, 0], situation, memory.way)
-        if memory.twin is not None:
-            memory.twin.step(orders[None])
-        return orders, memory._replace(joint=candidates.first[best], reference=reached[best], solver_ms=solver_ms)
+        costs = np.where(np.isfinite(costs), costs, np.inf) + self.w_switch * candidates.switches[pairs.sequence]
+        best = _cheapest(costs, pairs.team, observation.time)
+        sequence = pairs.sequence[best]
+        orders = lift(pairs.orders[sequence, 0], observation, memory.way)
+        if memory.twins is not None:
+            memory.twins.step(orders)
+        joints = tuple(candidates.first[s] for s in sequence.tolist())
+        return orders, memory._replace(joints=joints, reference=reached[best], solver_ms=solver_ms)
 
-    def _predict(self, situation: Situation, memory: Forecast, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (C,) without switches, and positions (C, N, 2) after the first predicted step."""
-        trails, start = None, situation.position
-        if memory.twin is not None and memory.worlds is not None:
-            follow(memory.twin, situation)
-            trails = simulate(memory.twin, memory.worlds, orders)
+    def _predict(self, observation: Observation, memory: Forecast, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
+        """Costs (C,) of all pairs, without switches, and positions (C, N, 2) after the first predicted step."""
+        trails, start = None, observation.position
+        if memory.twins is not None and memory.worlds is not None:
+            follow(memory.twins, observation)
+            sequences = [pairs.orders[pairs.sequence[pairs.team == b]] for b in range(memory.twins.worlds)]
+            simulated = [simulate(memory.twins, b, memory.worlds, orders) for b, orders in enumerate(sequences)]
+            trails = np.concatenate(simulated)
         elif self.start_from == "reference" and memory.reference is not None:
             start = memory.reference
-        scenario = memory.plan.scenario
+        scenario, seen = memory.scenario, observation
         least, scale = scenario.safe_distance + self.margin, scenario.formation_tolerance
-        weights = np.array([self.w_formation, self.w_reconstruction, self.slack, least, scale])
-        costs, trails = judge(
-            memory.plan, start, situation.step, orders, situation.obstacles, weights, moving=situation.velocity,
-            threads=self.threads, trails=trails,
-        )  # fmt: skip
-        return costs, trails[:, 0].copy()
+        weights = CostWeights(self.w_formation, self.w_reconstruction, self.slack, least, scale)
+        teams = Teams(*map(np.ascontiguousarray, (seen.step, start, seen.velocity, seen.obstacles)))
+        costs, trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs, threads=self.threads, trails=trails)
+        return costs, trails[:, 0]
+
+    def _pairs(self, memory: Forecast) -> tuple[Candidates, Pairs]:
+        """The candidates of every joint order in force, one after the other, and which of them are each team's."""
+        known = {joint: self._candidates(memory.scenario, joint) for joint in dict.fromkeys(memory.joints)}
+        firsts, orders, switches = zip(*known.values(), strict=True)
+        counts = {joint: len(candidates.orders) for joint, candidates in known.items()}
+        ends = dict(zip(counts, accumulate(counts.values()), strict=True))
+        sequence = np.concatenate([np.arange(ends[joint] - counts[joint], ends[joint]) for joint in memory.joints])
+        team = np.repeat(np.arange(len(memory.joints)), [counts[joint] for joint in memory.joints])
+        every = Candidates(tuple(chain(*firsts)), np.concatenate(orders), np.concatenate(switches))
+        return every, Pairs(team, sequence, every.orders)
 
     def _changes(self, joint: Joint) -> list[Joint]:
         """Joint orders that one change leads to."""
@@ -191,6 +214,20 @@ class MPCMS:
         motions = scenario.formation_names
         orders = tuple((scenario.orders.index(m), scenario.orders.index(f"{AVOIDANCE}>{m}")) for m in motions)
         return _sequences(joint, tuple(self._changes(joint)), orders, self.horizon, self.instants)
+
+
+def _cheapest(costs: np.ndarray, team: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """(B,) the pair with the least of ``costs`` (C,) of every team, the first of equals; ``team`` (C,) is in order."""
+    first = np.searchsorted(team, np.arange(len(time)))
+    rank = np.arange(len(team)) - first[team]
+    table = np.full((len(time), rank.max() + 1), np.inf)
+    table[team, rank] = costs
+    best = table.argmin(axis=1)
+    lost = np.flatnonzero(~np.isfinite(table.min(axis=1)))
+    if len(lost):
+        which = f" for team {lost[0]}" if len(time) > 1 else ""
+        raise SimulationError(f"MPCMS: no candidate has a finite cost at t = {time[lost[0]]:.3f} s{which}")
+    return np.asarray(first + best)
 
 
 @lru_cache(maxsize=256)

@@ -10,8 +10,8 @@ import numpy as np
 
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR
 from marlbc_mj.core.cells import spacing
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Situation
 
 REACH = 1.5
 """In d_AA. Beyond 1, so that AA is on top before the distance is too small; there it does nothing yet."""
@@ -35,14 +35,16 @@ def give_way(scenario: Scenario) -> GiveWay:
     return GiveWay(0.0, np.arange(len(orders)))
 
 
-def crowded(situation: Situation, way: GiveWay, reach: float = REACH) -> np.ndarray:
-    """(N,) bool: whose nearest neighbor is within ``reach`` d_AA."""
+def crowded(observation: Observation, way: GiveWay, reach: float = REACH) -> np.ndarray:
+    """(B, N) bool: whose nearest neighbor is within ``reach`` d_AA."""
     if way.distance == 0.0:
-        return np.zeros(len(situation.position), dtype=bool)
-    gap = np.minimum(spacing(situation.position), spacing(situation.reference))
+        return np.zeros(observation.position.shape[:2], dtype=bool)
+    gap = np.minimum(spacing(observation.position), spacing(observation.reference))
     return np.asarray(gap <= reach * way.distance)
 
 
-def lift(orders: np.ndarray, situation: Situation, way: GiveWay) -> np.ndarray:
-    """Orders (N,), with AA on top where a neighbor is too close."""
-    return np.asarray(np.where(crowded(situation, way), way.lifted[orders], orders))
+def lift(orders: np.ndarray, observation: Observation, way: GiveWay) -> np.ndarray:
+    """Orders (B, N), with AA on top where a neighbor is too close."""
+    if way.distance == 0.0:
+        return orders
+    return np.asarray(np.where(crowded(observation, way), way.lifted[orders], orders))

@@ -21,11 +21,11 @@ import numpy as np
 from marlbc_mj.controllers import Controller, make_controller
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.core.safety import violates
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
 from marlbc_mj.scenarios.base import YOUNG
-from marlbc_mj.supervisors.base import Situation
-from marlbc_mj.supervisors.scripted import Scripted
+from marlbc_mj.supervisors.scripted import Schedule, Scripted, orders_at
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.provenance import config_hash, plain_data, versions
@@ -58,7 +58,7 @@ class Evaluation(NamedTuple):
     violated: np.ndarray  # (B, M) bool: d <= d_OA for any agent after any substep of the mission step
 
 
-def shipped() -> Path:
+def shipped_schedules() -> Path:
     """The cache that comes with the package."""
     return Path(str(files("marlbc_mj") / "supervisors" / "oracle_schedules.json"))
 
@@ -87,9 +87,9 @@ def read_cache(path: Path) -> dict[str, Any]:
     return entries
 
 
-def save(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
+def save_schedule(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
     """Add a schedule to the cache (the shipped one by default), in the place of a former one with the same key."""
-    path = path or shipped()
+    path = path or shipped_schedules()
     entry = {"scenario": scenario.name, "controller": controller, **found._asdict(), "versions": versions()}
     write_json(path, read_cache(path) | {cache_key(scenario, make_controller(controller)): entry})
 
@@ -102,16 +102,17 @@ class Oracle:
     cache: Path | None = None  # None: the one that comes with the package
     unperturbed: bool = False  # play the schedule of the unperturbed scenario on its draws, for which it is no oracle
 
-    def start(self, scenario: Scenario) -> Any:
-        """Memory: the schedule's.
+    def start(self, scenario: Scenario, teams: int) -> Schedule:
+        """Memory: the cached schedule, which all teams share.
 
         Raises:
             ConfigurationError: no schedule was found yet for this scenario and controller.
         """
-        return self.schedule(scenario).start(scenario)
+        return self.schedule(scenario).start(scenario, teams)
 
-    def decide(self, situation: Situation, memory: Any) -> tuple[np.ndarray, Any]:
-        return Scripted().decide(situation, memory)
+    def decide(self, observation: Observation, memory: Schedule) -> tuple[np.ndarray, Schedule]:
+        """The orders of the schedule at each team's time."""
+        return Scripted().decide(observation, memory)
 
     def schedule(self, scenario: Scenario) -> Scripted:
         """The cached schedule as a scripted supervisor."""
@@ -120,7 +121,7 @@ class Oracle:
 
     def entry(self, scenario: Scenario) -> dict[str, Any]:
         """The cache's entry: windows, total (return), seed, budget, episodes, versions."""
-        entries = read_cache(self.cache or shipped())
+        entries = read_cache(self.cache or shipped_schedules())
         known = replace(scenario, perturbation=Perturbation()) if self.unperturbed else scenario
         key = cache_key(known, make_controller(self.controller))
         if key not in entries:
@@ -205,14 +206,9 @@ def evaluate(world: World, tables: np.ndarray) -> Evaluation:
 
 def command_table(scenario: Scenario, windows: tuple[Window, ...]) -> np.ndarray:
     """(M, N) index into ``scenario.orders.commands`` at every mission step, as the scripted supervisor gives them."""
-    script = Scripted(windows, scenario.formation_names[0])
-    memory = script.start(scenario)
-    nothing = np.zeros(0)
-    rows = []
-    for k in range(scenario.mission_steps):
-        now = Situation(k, k * scenario.mission_step, nothing, nothing, nothing, 0, nothing, nothing, nothing)
-        rows.append(scenario.orders.command_of[script.decide(now, memory)[0]])
-    return np.array(rows)
+    schedule = Scripted(windows, scenario.formation_names[0]).start(scenario, 1)
+    times = np.arange(scenario.mission_steps) * scenario.mission_step
+    return np.asarray(scenario.orders.command_of[orders_at(times, schedule)])
 
 
 def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:

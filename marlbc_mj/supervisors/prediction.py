@@ -1,49 +1,101 @@
 """What candidate order sequences lead to: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
 
-Both predictions fill the same *trails* (C, H, N, 2): the position of every agent at the end of every predicted mission step, for
-each of C candidates. One cost judges them. Candidates are shared out over threads; results do not depend on how many. Obstacles
-that move are predicted to keep the velocity they have.
+A *pair* is a team and one of its candidates; C counts the pairs of all B teams. Both predictions fill the same *trails*
+(C, H, N, 2): the position of every agent at the end of every predicted mission step, for each pair. One cost judges them. Pairs
+are shared out over threads; results do not depend on how many. Obstacles that move are predicted to keep the velocity they have.
 """
+
+from typing import NamedTuple
 
 import numba
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
-from marlbc_mj.core.laws import allocation_free, compiled
+from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
-from marlbc_mj.engine.composition import WORKSPACE, compose_team, keep, limit, path_at
-from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
-from marlbc_mj.supervisors.base import Situation
+from marlbc_mj.scenarios import Scenario
 
-SCRATCH = WORKSPACE + 3
-"""Rows of two that one candidate needs: what composing asks for, the desired path and a normal."""
+PAIR_ROOM = WORKSPACE + 1
+"""Rows of two that one pair needs: those of a composition, and a normal."""
+
+
+class CostWeights(NamedTuple):
+    """The numbers of the cost."""
+
+    formation: float  # w_F, per agent and step
+    reconstruction: float  # w_R, per agent and step
+    slack: float  # of missing clearance [1/m]
+    clearance: float  # wanted [m]
+    scale: float  # of distances to slots [m]
+
+
+class Problem(NamedTuple):
+    """What a prediction asks of the mission; flat, for compiled code."""
+
+    mission_step: float  # [s]
+    formations: np.ndarray  # (2, N, 2) slots of FM, then of FR [m]
+    w_formation: float  # the rest as in :class:`CostWeights`
+    w_reconstruction: float
+    w_slack: float
+    least: float
+    scale: float
+
+
+class Teams(NamedTuple):
+    """Where predictions for B teams begin."""
+
+    first: np.ndarray  # (B,) int64, mission steps made
+    start: np.ndarray  # (B, N, 2) [m]
+    moving: np.ndarray  # (B, N, 2) velocity that references of limited acceleration go on from [m/s]
+    obstacles: np.ndarray  # (B, K, 3), or (B, K, 5) where they move
+
+
+class Pairs(NamedTuple):
+    """The candidates of every team, one team after the other; many pairs may share a sequence of orders."""
+
+    team: np.ndarray  # (C,) int64, below B
+    sequence: np.ndarray  # (C,) int64, below S
+    orders: np.ndarray  # (S, H, N) int64, indices into scenario.orders
+
+
+class Scratch(NamedTuple):
+    """What a pair needs room for."""
+
+    rows: np.ndarray  # (C, PAIR_ROOM, 2)
+    velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
+    obstacles: np.ndarray  # (C, K, 3 or 5)
+    grid: np.ndarray  # (C, room)
+
+
+def problem(scenario: Scenario, weights: CostWeights) -> Problem:
+    """The numbers of a scenario that a prediction needs, under the weights of a cost."""
+    return Problem(scenario.mission_step, scenario.formations, *weights)
 
 
 @allocation_free
-def predict(start, moving, first, mission_step, orders, behaviors, obstacles, drifted, grid, scratch, v_r, before_v, trail):
-    """Reference trail of one candidate: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
-
-    Args:
-        start: (N, 2) [m] at mission step ``first``; moving: (N, 2) its velocity [m/s], from which limited references go on.
-        before_v: (N, 2), scratch.
-        orders: (H, N) int64, indices into the behaviors' table.
-        obstacles: (K, 3), or (K, 5) now; drifted: the same, scratch.
-        grid, scratch, v_r: of the candidate, scratch.
-        trail: (H, N, 2) [m], written in place.
+def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
+    """Reference trail (H, N, 2) [m] of pair ``c``: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual``
+    reference.
     """
-    before = start
-    for i in range(start.shape[0]):
+    b, orders, duration = pairs.team[c], pairs.orders[pairs.sequence[c]], problem.mission_step
+    v_r, before_v = scratch.velocity[c, 0], scratch.velocity[c, 1]
+    before = teams.start[b]
+    for i in range(before.shape[0]):
         for axis in range(2):
-            v_r[i, axis] = moving[i, axis]
+            v_r[i, axis] = teams.moving[b, i, axis]
     for k in range(orders.shape[0]):
         keep(behaviors, v_r, before_v)
-        seen = _after(k * mission_step, obstacles, drifted)
-        compose_team((first + k) * mission_step, orders[k], behaviors, before, seen, grid, scratch[3:], v_r)
-        limit(behaviors, mission_step, before_v, v_r)
-        for i in range(start.shape[0]):
+        seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
+        t = (teams.first[b] + k) * duration
+        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c, :WORKSPACE], v_r)
+        limit(behaviors, duration, before_v, v_r)
+        for i in range(before.shape[0]):
             for axis in range(2):
-                trail[k, i, axis] = before[i, axis] + mission_step * v_r[i, axis]
+                trail[k, i, axis] = before[i, axis] + duration * v_r[i, axis]
         before = trail[k]
 
 
@@ -57,110 +109,99 @@ def _after(t, obstacles, drifted):
 
 
 @allocation_free
-def trail_cost(trail, first, mission_step, path, formations, obstacles, drifted, weights, scratch):
-    """Sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
+def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
+    """Cost of the trail (H, N, 2) [m] of pair ``c``.
 
-    Slots are those of the desired centroid. ``weights`` (5,): w_F, w_R, w_slack [1/m], d_min [m], scale [m];
-    ``formations`` (2, N, 2) [m]; ``scratch`` (SCRATCH, 2).
+    The sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
+    Slots are those of the desired centroid.
     """
-    now, normal = scratch[:2], scratch[2]
+    b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
+    now, normal = scratch.rows[c, :2], scratch.rows[c, WORKSPACE]
     cost = 0.0
     for k in range(trail.shape[0]):
-        path_at((first + k + 1) * mission_step, path, now)
-        seen = _after((k + 1) * mission_step, obstacles, drifted)
+        path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
+        seen = _after((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
         for i in range(trail.shape[1]):
             for which in range(2):
                 x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
                 y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
-                cost += weights[which] * min(1.0, np.sqrt(x * x + y * y) / weights[4])
-            cost += weights[2] * max(0.0, weights[3] - nearest_obstacle(trail[k, i], seen, normal))
+                weight = problem.w_formation if which == 0 else problem.w_reconstruction
+                cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
+            cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(trail[k, i], seen, normal))
     return cost
 
 
 @allocation_free
-def judge_candidate(
-    c, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
-    scratch, v_r, before_v, trails, costs,
-):  # fmt: skip
-    """Cost of candidate ``c``, after rolling out its reference unless its trail was filled by other means."""
+def judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
+    """Cost of pair ``c``, after its reference is predicted unless its trail was filled by other means."""
     if kinematic:
-        predict(
-            start, moving, first, mission_step, orders[c], behaviors, obstacles, drifted[c], grid[c], scratch[c], v_r[c],
-            before_v[c], trails[c],
-        )  # fmt: skip
-    costs[c] = trail_cost(trails[c], first, mission_step, behaviors.path, formations, obstacles, drifted[c], weights, scratch[c])
+        predict_reference(c, behaviors, problem, teams, pairs, scratch, trails[c])
+    costs[c] = trail_cost(c, behaviors, problem, teams, pairs, scratch, trails[c])
 
 
 @compiled
-def judge_serial(candidates, *args):
-    """:func:`judge_candidate` of every candidate, one after the other."""
-    for c in range(candidates):
-        judge_candidate(c, *args)
+def _judge_serial(kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
+    """:func:`judge_pair` of every pair, one after the other."""
+    for c in range(costs.shape[0]):
+        judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
 
 
-@numba.njit(cache=True, error_model="numpy", nogil=True, parallel=True)
-def judge_parallel(
-    candidates, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
-    scratch, v_r, before_v, trails, costs,
-):  # fmt: skip
-    """:func:`judge_candidate` of every candidate, shared out over numba's threads; the same numbers as in series."""
-    for c in numba.prange(candidates):
-        judge_candidate(
-            c, kinematic, start, moving, first, mission_step, orders, behaviors, formations, obstacles, drifted, grid, weights,
-    scratch, v_r, before_v, trails, costs,
-        )  # fmt: skip
+@threaded
+def _judge_parallel(kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
+    """:func:`judge_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
+    for c in numba.prange(costs.shape[0]):
+        judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
 
 
-def judge(
-    plan: Plan, start: np.ndarray, first: int, orders: np.ndarray, obstacles: np.ndarray, weights: np.ndarray, *,
-    moving: np.ndarray | None = None, threads: int = 1, trails: np.ndarray | None = None,
+def judge_pairs(
+    scenario: Scenario, behaviors: Behaviors, weights: CostWeights, teams: Teams, pairs: Pairs, *,
+    threads: int = 1, trails: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-    """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) from positions ``start`` (N, 2) at step ``first``.
+    """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
-    ``moving`` (N, 2) [m/s], zero by default, is the velocity that references of limited acceleration go on from.
-    ``weights`` as in :func:`trail_cost`; ``trails`` given are judged as they are, else the kinematic reference is rolled out.
+    ``trails`` given are judged as they are, else the kinematic reference is predicted.
     """
-    candidates, scenario = len(orders), plan.scenario
-    kinematic = trails is None
+    kinematic, count = trails is None, len(pairs.team)
     if trails is None:
-        trails = np.empty((*orders.shape, 2))
-    costs = np.empty(candidates)
-    arguments = (
-        kinematic, np.ascontiguousarray(start), np.ascontiguousarray(np.zeros_like(start) if moving is None else moving), first,
-        scenario.mission_step, orders, plan.behaviors, scenario.formations, np.ascontiguousarray(obstacles),
-        np.zeros((candidates, *obstacles.shape)),
-        np.zeros((candidates, plan.grid_room)), weights, np.zeros((candidates, SCRATCH, 2)),
-        *np.zeros((2, candidates, scenario.agents, 2)), trails, costs,
-    )  # fmt: skip
-    if threads == 1 or candidates == 1:
-        judge_serial(candidates, *arguments)
+        trails = np.empty((count, *pairs.orders.shape[1:], 2))
+    costs = np.empty(count)
+    scratch = Scratch(
+        np.zeros((count, PAIR_ROOM, 2)),
+        np.zeros((count, 2, scenario.agents, 2)),
+        np.zeros((count, *teams.obstacles.shape[1:])),
+        np.zeros((count, grid_room(scenario))),
+    )
+    arguments = kinematic, behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
+    if threads == 1 or count == 1:
+        _judge_serial(*arguments)
     else:
         numba.set_num_threads(threads)
-        judge_parallel(candidates, *arguments)
+        _judge_parallel(*arguments)
     return costs, trails
 
 
-def follow(twin: World, situation: Situation) -> None:
-    """Put a twin (a world of its own) where the measured team is; references and controllers stay what the twin made them."""
-    team = twin.state
-    team.position[0], team.velocity[0], team.obstacles[0] = situation.position, situation.velocity, situation.obstacles
-    if team.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
-        place, velocity = situation.obstacles[:, :3], situation.obstacles[:, 3:]
-        team.motions[0, :, :2], team.motions[0, :, 2:] = velocity, 0.0
-        team.anchors[0] = place
-        team.anchors[0, :, :2] -= velocity * situation.time
-    twin.put(0, situation.position, situation.velocity)
+def follow(twins: World, observation: Observation) -> None:
+    """Put twins (worlds of their own, one per team) where the measured teams are; references and controllers stay theirs."""
+    state = twins.state
+    state.position[:], state.velocity[:], state.obstacles[:] = observation.position, observation.velocity, observation.obstacles
+    if state.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
+        place, velocity = observation.obstacles[..., :3], observation.obstacles[..., 3:]
+        state.motions[..., :2], state.motions[..., 2:] = velocity, 0.0
+        state.anchors[:] = place
+        state.anchors[..., :2] -= velocity * observation.time[:, None, None]
+    for b in range(twins.worlds):
+        twins.put(b, observation.position[b], observation.velocity[b])
 
 
-def simulate(twin: World, worlds: World, orders: np.ndarray) -> np.ndarray:
-    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) through MuJoCo: measured positions, from the twin's state on.
+def simulate(twins: World, team: int, worlds: World, orders: np.ndarray) -> np.ndarray:
+    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) of one team through MuJoCo: positions, from its twin's state on.
 
     ``worlds`` holds at least C worlds; those left over repeat the first candidate. A world that diverges stays where it did.
     """
     candidates, horizon = orders.shape[:2]
     every = np.concatenate([orders, np.repeat(orders[:1], worlds.worlds - candidates, axis=0)])
     for c in range(worlds.worlds):
-        worlds.copy_world(twin, 0, c)
+        worlds.copy_world(twins, team, c)
     trails = np.empty((*orders.shape, 2))
     for k in range(horizon):
         worlds.advance(np.ascontiguousarray(every[:, k]))

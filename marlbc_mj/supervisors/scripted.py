@@ -1,12 +1,27 @@
 """The scripted supervisor: the scenario's own schedule of orders, the fewest switches its geometry allows."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.laws import compiled
+from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario, Window
-from marlbc_mj.supervisors.base import Situation
 from marlbc_mj.util.errors import ConfigurationError
+
+ON_BOUND = 1e-9
+"""A time within this of a bound is on it [s]: 3 * 0.05 > 0.15 in floating point, yet it is the bound."""
+
+
+class Schedule(NamedTuple):
+    """Windows of W orders, and what holds outside all of them."""
+
+    default: np.ndarray  # (N,) orders
+    start: np.ndarray  # (W,) [s]
+    end: np.ndarray  # (W,) [s]
+    agent: np.ndarray  # (W,) whose order it is; -1 for everybody
+    order: np.ndarray  # (W,)
 
 
 @dataclass(frozen=True)
@@ -16,22 +31,42 @@ class Scripted:
     windows: tuple[Window, ...] | None = None  # None: the scenario's schedule
     default: str = "FM"  # order outside all windows
 
-    def start(self, scenario: Scenario) -> tuple[np.ndarray, list[tuple[Window, int]]]:
-        """Memory: the default orders (N,), and every window with its order's index."""
+    def start(self, scenario: Scenario, teams: int) -> Schedule:
+        """Memory: the schedule, which all teams share.
+
+        Raises:
+            ConfigurationError: no schedule, or one that does not fit the scenario.
+        """
         windows = scenario.schedule if self.windows is None else self.windows
         if not windows:
             raise ConfigurationError(f"scenario {scenario.name!r} has no schedule for the scripted supervisor")
         scenario.check_windows(windows)
-        default = np.full(scenario.agents, scenario.orders.index(self.default))
-        return default, [(window, scenario.orders.index(window.order)) for window in windows]
+        return Schedule(
+            np.full(scenario.agents, scenario.orders.index(self.default)),
+            np.array([window.start for window in windows], dtype=np.float64),
+            np.array([window.end for window in windows], dtype=np.float64),
+            np.array([window.agent for window in windows]),
+            np.array([scenario.orders.index(window.order) for window in windows]),
+        )
 
-    def decide(
-        self, situation: Situation, memory: tuple[np.ndarray, list[tuple[Window, int]]]
-    ) -> tuple[np.ndarray, tuple[np.ndarray, list[tuple[Window, int]]]]:
+    def decide(self, observation: Observation, memory: Schedule) -> tuple[np.ndarray, Schedule]:
         """Later windows win over earlier ones."""
-        default, windows = memory
-        orders = default.copy()
-        for window, order in windows:
-            if window.start + 1e-9 < situation.time < window.end - 1e-9:  # 3 * 0.05 > 0.15, yet it is the bound
-                orders[window.agent if window.agent >= 0 else slice(None)] = order
-        return orders, memory
+        return orders_at(observation.time, memory), memory
+
+
+def orders_at(times: np.ndarray, schedule: Schedule) -> np.ndarray:
+    """(B, N) orders of a schedule at ``times`` (B,) [s]."""
+    orders = np.tile(schedule.default, (len(times), 1))
+    _play(times, schedule, orders)
+    return orders
+
+
+@compiled
+def _play(time, schedule, orders):  # type: ignore[no-untyped-def]
+    """Put the orders of the windows that are open at ``time`` (B,) [s] into ``orders`` (B, N), which are the default."""
+    for b in range(len(time)):
+        for w in range(len(schedule.start)):
+            if schedule.start[w] + ON_BOUND < time[b] < schedule.end[w] - ON_BOUND:
+                for i in range(orders.shape[1]):
+                    if schedule.agent[w] == i or schedule.agent[w] < 0:
+                        orders[b, i] = schedule.order[w]

@@ -1,0 +1,68 @@
+"""Supervisors that decide for one team, made to decide for B: one memory per team, one call per team."""
+
+import inspect
+from dataclasses import dataclass
+from typing import NamedTuple, cast
+
+import numpy as np
+
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, split_decision
+from marlbc_mj.util.errors import ConfigurationError
+
+
+class Memories(NamedTuple):
+    """B teams between two mission steps."""
+
+    teams: tuple[object, ...]  # (B,) memory of each
+    solver_ms: float | None = None  # what their solvers took in the last decision, all together [ms]; None: they do not tell
+
+
+@dataclass(frozen=True)
+class OneTeam:
+    """B teams under a supervisor that decides for one; they are asked one after the other."""
+
+    supervisor: OneTeamSupervisor
+
+    def start(self, scenario: Scenario, teams: int) -> Memories:
+        """One memory per team."""
+        return Memories(tuple(self.supervisor.start(scenario) for _ in range(teams)))
+
+    def decide(self, observation: Observation, memory: Memories) -> tuple[Decision, Memories]:
+        """The decisions of all teams, stacked.
+
+        Raises:
+            ConfigurationError: a decision of wrong shape or type, or velocities for some teams only.
+        """
+        answers = [self.supervisor.decide(observation.team(b), own) for b, own in enumerate(memory.teams)]
+        decisions, memories = zip(*answers, strict=True)
+        return stack_decisions(decisions, observation.position.shape[1]), Memories(memories, _total(memories))
+
+
+def stack_decisions(decisions: tuple[Decision, ...], agents: int) -> Decision:
+    """One decision for B teams of B decisions for one team of N ``agents`` each.
+
+    Raises:
+        ConfigurationError: a decision of wrong shape or type, or velocities for some teams only.
+    """
+    orders, velocities = zip(*(split_decision(decision, (agents,)) for decision in decisions), strict=True)
+    given = [velocity for velocity in velocities if velocity is not None]
+    if not given:
+        return np.stack(orders)
+    if len(given) < len(decisions):
+        raise ConfigurationError("a supervisor gave velocities for some teams and orders alone for others")
+    return Blend(np.stack(orders), np.stack(given))
+
+
+def _total(memories: tuple[object, ...]) -> float | None:
+    """Sum of what the memories tell as ``solver_ms`` [ms]; None where they do not."""
+    told = [ms for memory in memories if (ms := getattr(memory, "solver_ms", None)) is not None]
+    return float(sum(told)) if told else None
+
+
+def batched(supervisor: Supervisor | OneTeamSupervisor) -> Supervisor:
+    """The supervisor itself, or :class:`OneTeam` around it where its ``start`` takes the scenario alone."""
+    if len(inspect.signature(supervisor.start).parameters) > 1:
+        return cast(Supervisor, supervisor)
+    return OneTeam(cast(OneTeamSupervisor, supervisor))

@@ -1,0 +1,121 @@
+"""Where the episodes of learners begin: at the start of the mission, or exploring, anywhere along the route."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.core.motion import obstacles_at
+from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.layout import motion_array
+from marlbc_mj.util.errors import ConfigurationError
+
+PLACES_TRIED = 20
+"""Places along the route that are tried for an exploring start."""
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where episodes begin: this share of them anywhere along the route, in formation or in column, at rest in the slots.
+
+    An exploring start lasts ``length`` and then ends without being terminal. Where slots of the first formation come within the
+    safe distance of an obstacle, it starts as a column; where those of the column do, too, somewhere else. Where a slot becomes
+    blocked or free is where orders have to change: decisions are rare elsewhere, so that a uniform start spends most of its
+    time where there is nothing to learn.
+    """
+
+    exploring: float = 0.0  # share of episodes in [0, 1]
+    length: float = 20.0  # [s]
+    focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
+    lead: float = 8.0  # how long before, at the most [s]
+    turning: float = 0.0  # share of the exploring starts that are to begin with the whole team taking one formation, either
+
+    def __post_init__(self) -> None:
+        for name in ("exploring", "focus", "turning"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ConfigurationError(f"{name} is a share of starts between 0 and 1, got {getattr(self, name)}")
+        if not self.lead >= 0:
+            raise ConfigurationError(f"the lead of a focused start must not be negative, got {self.lead} s")
+        if not self.length > 0:
+            raise ConfigurationError(f"the length of an exploring start must be positive, got {self.length} s")
+
+
+class Start(NamedTuple):
+    """An exploring start of one team."""
+
+    step: int  # mission steps that count as made
+    position: np.ndarray  # (N, 2) [m]
+    command: np.ndarray  # (N,) commands that count as given last
+    turn: int  # command with which the whole team is to begin; -1: none
+
+
+class Route:
+    """Draws the exploring starts of one scenario, as ``starts`` says.
+
+    Args:
+        scenario: the problem instance.
+        starts: shares of the kinds of starts.
+        interval: mission steps that a decision holds for; starts are at decisions.
+        commands: those that the action set has.
+    """
+
+    def __init__(self, scenario: Scenario, starts: Starts, interval: int, commands: Iterable[int]) -> None:
+        self.scenario = scenario
+        self.starts = starts
+        self.interval = interval
+        self.decisions = scenario.mission_steps // interval  # of a whole mission
+        parts = [name.split(SEPARATOR) for name in scenario.orders.commands]
+        known = sorted(commands, key=lambda c: len(parts[c]))
+        self.keeping = [
+            [c for c in known if parts[c][-1] == kept] or known for kept in scenario.formation_names
+        ]  # commands that an exploring start in each formation has, the shortest first, as far as the action set has them
+        self.critical = self._critical()
+
+    def draw(self, rng: np.random.Generator, anchors: np.ndarray, motions: np.ndarray) -> Start | None:
+        """A start where one of the formations is clear of obstacles; None if none was found.
+
+        ``anchors`` (K, 3) [m] and ``motions`` (K, 6) are this episode's obstacles; (0, 6): all at rest.
+        """
+        for _ in range(PLACES_TRIED):
+            step = self._decision(rng) * self.interval
+            for which in ((0, 1), (1,))[int(rng.integers(2))]:
+                position = self._centre(step) + self.scenario.formations[which]
+                if not self._blocked(position, obstacles_at(step * self.scenario.mission_step, anchors, motions)).any():
+                    command = rng.choice(self.keeping[which], size=self.scenario.agents)
+                    turns = happens(self.starts.turning, rng)
+                    return Start(step, position, command, self.keeping[int(rng.integers(2))][0] if turns else -1)
+        return None
+
+    def _decision(self, rng: np.random.Generator) -> int:
+        """The decision with which an exploring start begins."""
+        last = self.decisions - 1
+        if len(self.critical) and happens(self.starts.focus, rng):
+            lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
+            return min(max(round(float(rng.choice(self.critical)) - lead), 0), last - 1)
+        return int(rng.integers(last))
+
+    def _critical(self) -> np.ndarray:
+        """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
+        decisions = np.arange(self.decisions) * self.interval
+        slots = [self._centre(int(step)) + self.scenario.formations[0] for step in decisions]
+        anchors, motions = self.scenario.obstacle_array(), motion_array(self.scenario.motions)
+        places = [obstacles_at(step * self.scenario.mission_step, anchors, motions) for step in decisions]
+        blocked = np.array([self._blocked(*pair) for pair in zip(slots, places, strict=True)])
+        return np.flatnonzero((blocked[1:] != blocked[:-1]).any(axis=1)) + 1
+
+    def _centre(self, step: int) -> np.ndarray:
+        """(2,) desired centroid at a mission step [m]."""
+        scenario = self.scenario
+        return np.array(scenario.path_origin) + step * scenario.mission_step * np.array(scenario.path_velocity)
+
+    def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
+        """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
+        return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
+
+
+def happens(share: float, rng: np.random.Generator) -> bool:
+    """True in this share of all calls; what never happens draws no number, so that it leaves the stream to the rest."""
+    return share > 0 and rng.random() < share
