@@ -112,7 +112,7 @@ def test_names_cost_no_reference_counting_and_leave_the_loops_signature_as_it_is
     """The team form takes rows of float64, whatever the names."""
     assert laws.address(named, laws.CONTROLLER) != 0
     assert named.entry.signatures == [laws.TEAM_CONTROLLER.args]
-    assert "NRT_incref" not in named.entry.inspect_llvm(laws.TEAM_CONTROLLER.args)
+    assert named.targetoptions["_nrt"] is named.entry.targetoptions["_nrt"] is False
 
 
 def test_gains_are_packed_in_the_order_of_their_names():

@@ -26,17 +26,26 @@ calls by address is the law's team form, which sees each row by its names. A law
 Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or for coverage.
 """
 
-import zlib
-from types import FunctionType
 from typing import Any, cast
 
 import numba
-from numba import types
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
-from numba.extending import intrinsic, overload
 
 from marlbc_mj.core.compiling import Law, allocation_free, clip, compiled, inlined, is_compiled, plain, threaded
+from marlbc_mj.core.kinds import (
+    BEHAVIOR,
+    CONTROLLER,
+    DISTURBANCE,
+    DRIVE,
+    ON_ROWS,
+    READING,
+    TEAM_CONTROLLER,
+    TEAM_DISTURBANCE,
+    TEAM_DRIVE,
+    TEAM_READING,
+    on_rows,
+)
 from marlbc_mj.core.names import (
     Declared,
     Interface,
@@ -54,152 +63,13 @@ from marlbc_mj.core.names import (
 )
 from marlbc_mj.util.errors import ConfigurationError
 
-_VECTOR = types.float64[::1]
-_MATRIX = types.float64[:, ::1]
-
-BEHAVIOR = types.int64(_VECTOR, _VECTOR, _MATRIX, _MATRIX, _MATRIX, types.int64, _VECTOR, _MATRIX)
-"""gains (P,), p (2,) [m], path (2, 2): desired centroid [m] and its velocity [m/s], obstacles (K, 3): x, y, radius [m], or
-(K, 5) where they move: their velocity [m/s] too, team (N, 2): everyone's position [m], agent, velocity_out (2,) [m/s],
-jacobian_out (2, 2) -> rows used of the Jacobian."""
-
-CONTROLLER = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
-"""gains (P,), state (S,) changed in place, p (2,) [m], v (2,) [m/s], p_r (2,) [m], v_r (2,) [m/s], drag (2,) [N]: the
-true f(chi), for laws that assume a known model, h [s], force_out (2,) [N]."""
-
-DISTURBANCE = types.void(_VECTOR, types.float64, _VECTOR, _VECTOR, _VECTOR)
-"""gains (P,), t [s], p (2,) [m], v (2,) [m/s], force_out (2,) [N]."""
-
-DRIVE = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
-"""gains (P,), state (S,) changed in place, the robot's own part of qpos and of qvel, planar force (2,) [N] that is wanted,
-h [s], ctrl_out (actuators,): MuJoCo's controls, in the order of the robot's MJCF. Called before every substep."""
-
-READING = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR)
-"""gains (P,), state (S,) as the drive left it, the robot's own part of qpos, of qvel and of actuator_force, p_out (2,) [m],
-v_out (2,) [m/s], force_out (2,) [N]: the planar force that the actuators really gave. Called after every substep."""
-
-TEAM_CONTROLLER = types.void(_MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, types.float64, _MATRIX)
-"""A controller for every agent in turn: the arguments of :data:`CONTROLLER`, one row per agent."""
-
-TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
-"""A disturbance for every agent in turn: the arguments of :data:`DISTURBANCE`, one row per agent."""
-
-_SPANS = types.int64[:, :, ::1]
-TEAM_DRIVE = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _MATRIX, types.float64, _SPANS, _VECTOR)
-"""A drive for every robot in turn: gains (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (3, N, 2): first
-and last + 1 of each robot in qpos, in qvel and in ctrl; the whole ctrl."""
-
-TEAM_READING = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _SPANS, _MATRIX, _MATRIX, _MATRIX)
-"""A reading of every robot in turn: gains, state, the whole qpos, qvel and actuator_force, spans; p, v, force (N, 2)."""
-
-
-def _law(*arguments: Any) -> Any:
-    """Stands for the law in the templates below."""
-
-
-def _gains(row: Any) -> Any:
-    """Stands for the view of a row of gains by their names."""
-
-
-def _state(row: Any) -> Any:
-    """Stands for the view of a row of state by its names."""
-
-
-def _behavior_on_rows(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
-    return _law(_gains(gains), p, path, obstacles, team, agent, velocity_out, jacobian_out)
-
-
-def _controller_team(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    for i in range(p.shape[0]):
-        _law(_gains(gains[i]), _state(state[i]), p[i], v[i], p_r[i], v_r[i], drag[i], h, force_out[i])
-
-
-def _disturbance_team(gains, t, p, v, force_out):
-    for i in range(p.shape[0]):
-        _law(_gains(gains), t, p[i], v[i], force_out[i])
-
-
-def _drive_team(gains, state, qpos, qvel, force, h, spans, ctrl_out):
-    for i in range(force.shape[0]):
-        q, v, u = spans[0, i], spans[1, i], spans[2, i]
-        own = qpos[q[0] : q[1]], qvel[v[0] : v[1]]
-        _law(_gains(gains[i]), _state(state[i]), own[0], own[1], force[i], h, ctrl_out[u[0] : u[1]])
-
-
-def _reading_team(gains, state, qpos, qvel, actuator_force, spans, p_out, v_out, force_out):
-    for i in range(p_out.shape[0]):
-        q, v, u = spans[0, i], spans[1, i], spans[2, i]
-        own = qpos[q[0] : q[1]], qvel[v[0] : v[1]], actuator_force[u[0] : u[1]]
-        _law(_gains(gains[i]), _state(state[i]), own[0], own[1], own[2], p_out[i], v_out[i], force_out[i])
-
-
-_ON_ROWS = {
-    BEHAVIOR: (BEHAVIOR, _behavior_on_rows),
-    CONTROLLER: (TEAM_CONTROLLER, _controller_team),
-    DISTURBANCE: (TEAM_DISTURBANCE, _disturbance_team),
-    DRIVE: (TEAM_DRIVE, _drive_team),
-    READING: (TEAM_READING, _reading_team),
-}
-"""What the loop calls for each kind of law: its signature, and the template of the function."""
-
-
-@intrinsic
-def _as_record(typing_context, row, dtype):
-    """The beginning of a row as a record; compiled code only.
-
-    NumPy's ``view`` does the same with checks that cost more than a small law. They are needless: every row that the loop hands
-    on was packed by the same names.
-    """
-    record = dtype.dtype
-
-    def codegen(context, builder, signature, args):
-        array = context.make_array(signature.args[0])(context, builder, args[0])
-        return builder.bitcast(array.data, context.get_value_type(record))
-
-    return record(row, dtype), codegen
-
-
-def _reader(names: Names) -> Law:
-    """The function that turns a row into what the law is handed: a record, or the row itself where there are no names."""
-    dtype = names.dtype
-
-    def read(row):
-        return names.view(row)
-
-    @overload(read, inline="always")
-    def compiled_face(row):
-        return (lambda row: _as_record(row, dtype)) if names.shapes else (lambda row: row)
-
-    return read
-
-
-def _on_rows(law: Law, signature: Any) -> Law:
-    """The template of a kind of law with this very law in it: a Python function, to be called or to be compiled.
-
-    Why it is put together from a code object: numba keeps compiled code on disk under the file, first line and name of a
-    function, and under a pickle of what the function closes over. An ordinary closure over a compiled law would be compiled
-    anew in every process, because the pickle of a compiled law is a different one in each. So the template refers to its law by a
-    global name, and takes the place (file and line) and the name of the law for its own. The names of gains and state go into
-    the function's name by a checksum: were they declared in another file, numba would not see them change.
-    """
-    declared = interface(law)
-    name, source = getattr(law, "__name__", "law"), getattr(plain(law), "__code__", None)
-    checksum = zlib.crc32(repr((declared.gains.shapes, declared.state.shapes)).encode())
-    code = _ON_ROWS[signature][1].__code__
-    if source is not None:
-        code = code.replace(co_filename=source.co_filename, co_firstlineno=source.co_firstlineno)
-    bound = {"_law": law, "_gains": _reader(declared.gains), "_state": _reader(declared.state), "range": range}
-    function = FunctionType(code.replace(co_name=f"{name}_on_rows"), bound, f"{name}_on_rows")
-    function.__module__ = law.__module__
-    function.__qualname__ = f"{getattr(law, '__qualname__', name)}_on_rows_{checksum:08x}"
-    return function
-
 
 def for_team(law: Law, signature: Any) -> Law:
     """The law for the Python path: on rows of float64, as the loop calls it; applied to every agent in turn, a behavior to one.
 
     The function raises ConfigurationError where the law reads a name that it does not declare.
     """
-    team = _on_rows(law, signature)
+    team = on_rows(law, signature)
 
     def checked(*arguments: Any) -> Any:
         try:
@@ -219,7 +89,7 @@ def _declare(function: Law, signature: Any, gains: Declared, state: Declared = (
     vars(function)["interface"] = Interface(signature, Names.of(gains), Names.of(state))
     law: Any = allocation_free(function)
     if is_compiled(law):
-        law.entry = allocation_free(_on_rows(law, signature), cache=not getattr(function, "__closure__", None))
+        law.entry = allocation_free(on_rows(law, signature), cache=not getattr(function, "__closure__", None))
     return cast(Law, law)
 
 
@@ -273,7 +143,7 @@ def address(law: Law, signature: Any) -> int:
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
-    kind, entry = _ON_ROWS[signature][0], cast(Any, law).entry
+    kind, entry = ON_ROWS[signature][0], cast(Any, law).entry
     try:
         law.compile(_arguments(interface(law)))
         entry.compile(kind.args)
