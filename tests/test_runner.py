@@ -1,6 +1,7 @@
 """The runner of studies: the same results, progress and errors in one process and in several."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -12,8 +13,17 @@ from pathlib import Path
 
 import pytest
 
+from marlbc_mj.scenarios import paper
+from marlbc_mj.studies.ablation import AblationStudy, select_questions
+from marlbc_mj.studies.bench import BenchConfig, BenchStudy
+from marlbc_mj.studies.calibration import CalibrationStudy
+from marlbc_mj.studies.draws import DrawsStudy
+from marlbc_mj.studies.learners.trainings import LearnerStudy
+from marlbc_mj.studies.perf import PerfStudy
 from marlbc_mj.studies.protocol import Report, Stopped, Watch
+from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
+from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.progress import silent
 
@@ -141,6 +151,33 @@ def test_counting_tells_how_much_of_a_stage_is_done() -> None:
     for job in (2, 1, 4):
         tell(job, None)
     assert told == [("even", 1, 2), ("odd", 1, 2), ("even", 2, 2)]
+
+
+STUDIES = {
+    "bench": BenchStudy(paper(), BenchConfig()),
+    "draws": DrawsStudy(paper(), (("scripted", "sorlc"), ("fsams", "pd")), (0, 1)),
+    "ablation": AblationStudy(select_questions(())),
+    "calibrate": CalibrationStudy(),
+    "gate": GateStudy(("disc", "omni"), ("scripted",)),
+    "perf": PerfStudy(),
+    "scale": ScaleStudy(),
+    "study": LearnerStudy(Path("nowhere"), budget=5_000),
+}
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_every_study_can_be_sent_elsewhere(name: str) -> None:
+    """It and its jobs are data: they survive pickling, and no two jobs of a study are alike."""
+    study = pickle.loads(pickle.dumps(STUDIES[name]))
+    jobs = pickle.loads(pickle.dumps(STUDIES[name].jobs()))
+    assert [repr(job) for job in jobs] == [repr(job) for job in study.jobs()] and len(jobs) > 1
+    assert len({repr(job) for job in jobs}) == len(jobs)
+
+
+def test_workers_change_no_number_of_an_ablation() -> None:
+    """The command runs it in one process; its cases are jobs like any others."""
+    question = select_questions(("avoidance",))
+    assert run_jobs(AblationStudy(question), workers=2) == run_jobs(AblationStudy(question))
 
 
 PARENT = """

@@ -1,7 +1,7 @@
 """``marlbc bench``, ``run`` and ``evaluate``, and the changes to a scenario that they share."""
 
 import sys
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -114,14 +114,13 @@ class BenchCommand:
         Raises:
             ConfigurationError: a range without draws.
         """
-        from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
+        from marlbc_mj.studies.draws import with_drag_range
 
         if self.drag_range is None:
             return self.options.build(self.scenario)
         if self.seeds is None:
             raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
-        perturbation = replace(CASE_STUDY_PERTURBATION, drag_scale=self.drag_range)
-        return replace(self.options.build(self.scenario), perturbation=perturbation)
+        return with_drag_range(self.options.build(self.scenario), self.drag_range)
 
 
 @dataclass(frozen=True)

@@ -102,7 +102,7 @@ class OracleCommand:
     budget: int = 4096
     """Episodes that may be simulated."""
     threads: int = 2
-    """Worlds are shared out over this many."""
+    """Threads that share the worlds."""
     out: Path | None = None
     """Cache to add the schedule to; the one that comes with the package by default."""
 

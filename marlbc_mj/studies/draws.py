@@ -139,6 +139,11 @@ def perturbed(scenario: Scenario) -> Scenario:
     return replace(scenario, perturbation=CASE_STUDY_PERTURBATION)
 
 
+def with_drag_range(scenario: Scenario, drag_range: tuple[float, float]) -> Scenario:
+    """The scenario with the case study's perturbation, whose disturbance is multiplied by a draw from ``drag_range``."""
+    return replace(scenario, perturbation=replace(CASE_STUDY_PERTURBATION, drag_scale=drag_range))
+
+
 def fly_draws(job: DrawsJob, progress: Progress = silent) -> MethodRuns:
     """One method on every seed; ``progress`` is called with how many seeds are done."""
     law = make_controller(job.controller)

@@ -40,8 +40,8 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
 }
 """With the robot's gains per unit mass."""
 
-STILL_AT = (0.17, 0.58)  # of the mission: round the point, in the gate
-CLIP = (0.10, 0.66)  # of the mission
+STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
+CLIP = (0.10, 0.66)  # shares of the mission
 SHOWN = [name for name in ROBOTS if name != "point_mass"]
 
 

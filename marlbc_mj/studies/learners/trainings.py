@@ -102,12 +102,12 @@ class LearnerStudy:
         return train_job(job, watch)
 
     def report(self, results: Sequence[TrainingEnd], out: Path | None, progress: Progress = silent) -> Report:
-        """CSV files, table and figure of all runs in the study's folder, also those of earlier calls."""
+        """CSV files, table and figure of all runs in the folder of the study, also those of earlier calls."""
         rows, curves = records.collect(self.out)
-        if not rows:
-            return Report()
-        records.write_csvs(self.out, rows, curves)
-        return compare_learners(rows, curves, self.out)
+        if not rows or out is None:
+            return Report(to_markdown(learners_table(rows)) if rows else "")
+        records.write_csvs(out, rows, curves)
+        return compare_learners(rows, curves, out)
 
 
 def compare_learners(rows: Sequence[CsvLine], curves: Sequence[CsvLine], folder: Path) -> Report:
