@@ -6,7 +6,7 @@ on numbers in compiled code, on NumPy arrays and on torch tensors, so that learn
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Policy(NamedTuple):
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
-RISK_SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
+RISK_SLACK = cast(float, np.float32(0.05))  # float32 in compiled code, as it is in torch
 """Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
 
