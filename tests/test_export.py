@@ -11,7 +11,7 @@ import pytest
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
 from marlbc_mj.policies.greedy import Policy, greedy
-from marlbc_mj.policies.shipped import checkpoint_path
+from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.policies.states import make_state
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import LEARNED
@@ -70,9 +70,9 @@ def test_a_runtime_gives_the_policys_values_and_orders(dueling, risk, joint, tmp
 @pytest.mark.parametrize("name", LEARNED)
 def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     """Every kind of checkpoint that comes with the package, on states of flight."""
-    policy, _ = read_policy(checkpoint_path(name))
+    policy, _ = read_policy(shipped(name))
     out = tmp_path / "policy.onnx"
-    main(["export", str(checkpoint_path(name)), str(out)])
+    main(["export", str(shipped(name)), str(out)])
     session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(2)
     states = rng.uniform(-1.0, 1.0, (500, len(policy.scale))).astype(np.float32)

@@ -20,7 +20,17 @@ TO_RENAME = {
     # robots, scenarios and recording
     *("COLORS", "FULL", "Field", "LEAST", "MOST", "TRIES", "WHEEL", "disc"),
     # results and report
-    *("CONTROLLERS", "COST_MAX", "COST_TOTAL", "FAILED", "INPUT_MAX", "INPUT_TOTAL", "Outcome", "SUPERVISORS", "SWITCHES"),
+    *(
+        "CONTROLLERS",
+        "COST_MAX",
+        "COST_TOTAL",
+        "FAILED",
+        "INPUT_MAX",
+        "INPUT_TOTAL",
+        "DecisionOutcome",
+        "SUPERVISORS",
+        "SWITCHES",
+    ),
     *("by_controller", "by_supervisor", "make_tables", "same_actuator", "summary", "write_csv"),
     # training
     *("LARGEST_GRADIENT",),

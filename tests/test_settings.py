@@ -37,7 +37,7 @@ class Outer:
     kind: Literal["a", "b"] = "a"
     flag: bool = False
     name: str = ""
-    limit: float = math.inf
+    limit: Annotated[float, POSITIVE] = math.inf
     length: Annotated[float, POSITIVE] = 1.0
     pair: tuple[float, float] = (0.0, 0.0)
     points: tuple[Point, ...] = ()
@@ -75,6 +75,7 @@ def test_a_table_fills_every_kind_of_field():
         ({"count": 1, "kind": ["a"]}, "unknown kind ['a']; choose from: a, b"),
         ({"count": 1, "length": math.inf}, "length must be finite, got inf"),
         ({"count": 1, "limit": math.nan}, "limit must be finite, got nan"),
+        ({"count": 1, "limit": -1.0}, "limit must be positive, got -1.0"),
         ({"count": 1, "limit": "no"}, "limit must be a number, got 'no'"),
         ({"count": 1, "pair": 3}, "pair must be a list, got 3"),
         ({"count": 1, "pair": [1, 2, 3]}, "pair must be a list of 2, got [1, 2, 3]"),

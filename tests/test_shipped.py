@@ -7,7 +7,7 @@ import pytest
 from marlbc_mj import World, make_supervisor, measure, paper, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.policies.actions import ACTIONS
-from marlbc_mj.policies.shipped import checkpoint_path
+from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors import LEARNED
 from marlbc_mj.training.config import make_config
 from marlbc_mj.training.run import episode_scores, train
@@ -17,7 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 @pytest.mark.parametrize("name", LEARNED)
 def test_a_shipped_policy_does_what_its_card_says(name):
-    path = checkpoint_path(name)
+    path = shipped(name)
     said = json.loads(path.with_suffix(".json").read_text())["evaluation"]
     did = episode_scores(measure(run_episode(World(paper(), record=True), make_supervisor(name))))
     assert did == {key: said[key] for key in did}

@@ -63,7 +63,7 @@ class BaseTrainer(ABC):
     @property
     @abstractmethod
     def temperature(self) -> float:
-        """How random the actions are meant to be; it falls from 1."""
+        """Wanted randomness of the actions; it falls from 1."""
 
     @property
     @abstractmethod
@@ -81,7 +81,7 @@ class BaseTrainer(ABC):
         return outcome
 
     def judge(self, outcome: DecisionOutcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What a decision means for each agent.
+        """Rewards of a decision and its consequences for each agent.
 
         Returns:
             (B, N) float32 rewards to learn from; (B, N) bool, whether the agent's return ends here, by the end of the mission or

@@ -267,7 +267,7 @@ def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "")
     Args:
         config: the dataclass.
         settings: the texts; ``hidden=64,64`` gives a tuple.
-        prefix: of the names in messages.
+        prefix: text before the fields' names in messages.
 
     Raises:
         ConfigurationError: no such field, or a value of the wrong kind.

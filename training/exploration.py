@@ -83,7 +83,7 @@ class Exploration:
         probability s an order is under way, with the rest of its length left.
 
         Args:
-            columns: of ``left`` and ``held``: the agents' or the team's.
+            columns: the columns of ``left`` and ``held`` that are meant, the agents' or the team's.
             share: s of each column.
             runs: bool, whether a column runs.
             rng: random numbers of the draws.

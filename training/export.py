@@ -34,9 +34,14 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
 
     Inputs are ``state`` (batch, S) float32, of the kind that the signature names, and ``last`` (batch, N) int64, the actions in
     force; a row with a negative entry has none. Outputs are ``values`` (batch, N, A) float32 as ``Policy.values`` gives them,
-    minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as ``policy.greedy`` chooses: indices into the
-    action set, the last action unless the best is better by more than the margin. A network over joint actions has ``values``
-    (batch, 1, A^N).
+    minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as :func:`marlbc_mj.policies.greedy.greedy`
+    chooses: indices into the action set, the last action unless the best is better by more than the margin. A network over joint
+    actions has ``values`` (batch, 1, A^N).
+
+    Args:
+        checkpoint: the checkpoint's file.
+        out: the ONNX file.
+        overwrite: whether an existing file may be replaced.
 
     The file's metadata are texts: ``signature`` (JSON, what the policy is tied to), ``actions`` (JSON, the order that each index
     stands for), ``margin`` and ``risk``.

@@ -23,7 +23,7 @@ from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
-from marlbc_mj.training.saved import CONFIG, check_origin, check_snapshot, saved_config, saved_rows
+from marlbc_mj.training.saved import CONFIG_FILE, check_origin, check_snapshot, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_folder, remove_leftovers, staged_file, write_json, writing
@@ -96,13 +96,13 @@ def train(
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         remove_run(out)
-    write_json(out / CONFIG, {**run.origin, "train": config})
+    write_json(out / CONFIG_FILE, {**run.origin, "train": config})
     return run.go(progress)
 
 
 def remove_run(out: Path) -> None:
     """Remove what a run left in its folder, beginning with what :func:`resume` would take for a new run's."""
-    for name in (RESUME, CONFIG, *TABLES):
+    for name in (RESUME, CONFIG_FILE, *TABLES):
         (out / name).unlink(missing_ok=True)
     for name in (CHECKPOINT, TENSORBOARD):
         if (out / name).is_dir():

@@ -24,7 +24,7 @@ SAVED_KINDS: dict[str, type | tuple[type, ...]] = {
     "wall_s": (int, float),
 }
 """Types of the entries of a saved run's description."""
-CONFIG = "config.json"
+CONFIG_FILE = "config.json"
 
 Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
 """Arrays, and the rest as JSON data."""
@@ -61,7 +61,7 @@ def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
     odd = sorted(found.keys() ^ flat_settings(plain_data(config)).keys())
     if odd:
         raise ConfigurationError(f"{path} was saved by another version: it and this one do not both have {', '.join(odd)}")
-    beside = path.with_name(CONFIG)
+    beside = path.with_name(CONFIG_FILE)
     try:
         said = flat_settings(json.loads(beside.read_text())["train"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:

@@ -49,7 +49,7 @@ def shaped_reward(outcome: "DecisionOutcome", shaping: Shaping) -> np.ndarray:
     """(B, N) float32 rewards of a decision: (formation + violation - centre - own costs) / scale; see :func:`lost`.
 
     Args:
-        outcome: of the decision, with the published terms.
+        outcome: the published terms of the decision.
         shaping: the weights.
     """
     team = outcome.formation + shaping.violation * outcome.violation + outcome.switching - shaping.centre * outcome.steps

@@ -78,11 +78,7 @@ class Trainer(BaseTrainer):
             self._fit_hash()
         codes = self.hash((self.state / self.batch.read.scale).astype(np.float32))
         warmth = self.temperatures.read(codes)
-        values = self.learner.values(self.state)
-        best = greedy(values, self.batch.last, self.batch.fresh, config.switching_margin)
-        allowed = values > -np.inf if config.risk_gamma else None
-        actions = self.exploration(best, warmth.mean(axis=-1), self.rng, last=self.batch.last, allowed=allowed)
-        self.explored = float((actions != best).mean())
+        actions = self._choose(warmth)
         lenient = leniency(np.take_along_axis(warmth, actions[..., None], axis=-1)[..., 0])
         with self._learning(share):
             outcome = self.step(actions)
@@ -102,6 +98,15 @@ class Trainer(BaseTrainer):
         self.state = outcome.state
         self.steps += config.worlds * config.interval
         return outcome
+
+    def _choose(self, warmth: np.ndarray) -> np.ndarray:
+        """(B, N) actions by the temperatures ``warmth`` (B, N, A): greedy ones, some replaced by the exploration."""
+        values, last = self.learner.values(self.state), self.batch.last
+        best = greedy(values, last, self.batch.fresh, self.config.switching_margin)
+        allowed = values > -np.inf if self.config.risk_gamma else None
+        actions = self.exploration(best, warmth.mean(axis=-1), self.rng, last=last, allowed=allowed)
+        self.explored = float((actions != best).mean())
+        return actions
 
     def _seen_enough(self) -> bool:
         """Whether the buffer holds states of the whole mission.

@@ -23,6 +23,7 @@ from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.imperfections import sense, weaken
 from marlbc_mj.core.laws import allocation_free, compiled, inlined, threaded
 from marlbc_mj.core.motion import move
+from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
@@ -137,7 +138,7 @@ def verdict(p, clearance, mission):
     agents = p.shape[0]
     violated = False
     for i in range(agents):
-        violated |= clearance[i] <= mission.safe_distance
+        violated |= violates(clearance[i], mission.safe_distance)
     mean_x, mean_y = 0.0, 0.0
     for i in range(agents):
         mean_x += p[i, 0] / agents

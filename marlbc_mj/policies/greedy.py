@@ -6,7 +6,7 @@ on numbers in compiled code, on NumPy arrays and on torch tensors, so that learn
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple, TypeVar, cast
 
 import numpy as np
 
@@ -49,7 +49,7 @@ class Policy(NamedTuple):
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
-RISK_SLACK: float = np.float32(0.05)  # type: ignore[assignment]  # float32 in compiled code, as it is in torch
+RISK_SLACK = cast(float, np.float32(0.05))  # float32 in compiled code, as it is in torch
 """Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
 
@@ -137,7 +137,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):
     for bias in biases:
         widest = max(widest, bias.shape[2])
     values = np.empty((len(state), networks, actions), dtype=np.float32)
-    layers, risks, one = np.empty((2, widest), dtype=np.float32), np.empty(actions, dtype=np.float32), np.float32(1.0)
+    layers, risks = np.empty((2, widest), dtype=np.float32), np.empty(actions, dtype=np.float32)
     for b in range(len(state)):
         x = state[b] / scale
         for i in range(networks):
@@ -155,13 +155,20 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):
                 for a in range(actions):
                     q[a] = dueling_value(y[0], q[a], mean)
             if limit > 0.0:
-                for a in range(actions):
-                    risks[a] = one / (one + np.exp(-y[dueling + actions + a]))
-                least = risks.min()
-                for a in range(actions):
-                    if not admissible(risks[a], least, limit):
-                        q[a] = -np.inf
+                exclude_risky(q, y[dueling + actions :], limit, risks)
     return values
+
+
+@compiled
+def exclude_risky(values, logits, limit, risks):
+    """Set the ``values`` (A,) of actions that are too risky to -inf; ``risks`` (A,) becomes the sigmoid of ``logits`` (A,)."""
+    one = np.float32(1.0)
+    for a in range(len(values)):
+        risks[a] = one / (one + np.exp(-logits[a]))
+    least = risks.min()
+    for a in range(len(values)):
+        if not admissible(risks[a], least, limit):
+            values[a] = -np.inf
 
 
 @compiled

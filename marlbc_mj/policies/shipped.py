@@ -6,6 +6,6 @@ from pathlib import Path
 FOLDER = Path(str(files("marlbc_mj") / "training" / "checkpoints"))
 
 
-def checkpoint_path(name: str) -> Path:
+def shipped(name: str) -> Path:
     """Path of the checkpoint that is shipped under this name; it need not exist."""
     return FOLDER / f"{name}.safetensors"

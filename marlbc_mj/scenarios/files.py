@@ -24,7 +24,7 @@ from marlbc_mj.scenarios.families import FAMILIES
 from marlbc_mj.scenarios.family import Family, Mission
 from marlbc_mj.scenarios.layout import Motion
 from marlbc_mj.util.errors import ConfigurationError, unknown
-from marlbc_mj.util.settings import annotations, choose, convert, misfit, tables
+from marlbc_mj.util.settings import choose, convert, field_types, misfit, tables
 
 SUFFIX = ".toml"
 MOST_BYTES = 1_000_000
@@ -94,7 +94,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def _changes(content: Mapping[str, Any]) -> dict[str, Any]:
     """Fields of a scenario that a file gives another value; those that follow from others are out of its reach."""
-    valid = {name: hint for name, hint in annotations(Scenario).items() if name not in ("behaviors", "layout", "split")}
+    valid = {name: hint for name, hint in field_types(Scenario).items() if name not in ("behaviors", "layout", "split")}
     for key in content:
         if key not in valid:
             raise unknown("key", key, valid)

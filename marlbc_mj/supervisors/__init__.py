@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 
-from marlbc_mj.policies.shipped import checkpoint_path
+from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
@@ -34,11 +34,11 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
         "the same over 6 s of simulated candidates, which sees the agents lag; minutes an episode",
     ),
     "marlms": (
-        lambda: Learned.load(checkpoint_path("marlms")),
+        lambda: Learned.load(shipped("marlms")),
         "MARLMS: the shipped checkpoint of lenient, dueling, averaged Q-networks, one per agent",
     ),
     "rlms": (
-        lambda: Learned.load(checkpoint_path("rlms")),
+        lambda: Learned.load(shipped("rlms")),
         "RLMS: the shipped checkpoint of single-agent Q-networks side by side, formation with or without avoidance",
     ),
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),

@@ -62,7 +62,7 @@ def orders_at(times: np.ndarray, schedule: Schedule) -> np.ndarray:
 
 
 @compiled
-def _play(time, schedule, orders):  # type: ignore[no-untyped-def]
+def _play(time, schedule, orders):
     """Put the orders of the windows that are open at ``time`` (B,) [s] into ``orders`` (B, N), which are the default."""
     for b in range(len(time)):
         for w in range(len(schedule.start)):

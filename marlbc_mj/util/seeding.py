@@ -7,7 +7,7 @@ def stream(seed: int, world: int = 0) -> np.random.Generator:
     """The random stream of one world under a seed.
 
     Args:
-        seed: of the whole batch.
+        seed: seed of all worlds together.
         world: number of the world, from 0.
     """
     return np.random.default_rng(np.random.SeedSequence([seed, world]))

@@ -1,6 +1,6 @@
-"""Dataclasses of settings: rules beside their fields, and values read from TOML tables, JSON data and texts by their annotations.
+"""Dataclasses of settings: rules in the annotations of their fields, and conversion from TOML tables, JSON data and texts.
 
-The conversion is cattrs'; what is added here are this package's messages, which name the place, the value and the valid ones.
+cattrs converts; this file adds the messages, which name the place, the value and the valid ones.
 """
 
 import math
@@ -24,10 +24,10 @@ Unlimited = NewType("Unlimited", float)
 
 
 class Rule(NamedTuple):
-    """What a setting must be; stands in its annotation, ``Annotated[int, AT_LEAST_ONE]``."""
+    """A condition on the value of a field; it stands in the annotation, as in ``Annotated[int, AT_LEAST_ONE]``."""
 
-    words: str
-    holds: Callable[[Any], bool]
+    words: str  # the condition, for messages: "must be at least 1"
+    holds: Callable[[Any], bool]  # whether a value meets it
 
 
 AT_LEAST_ONE = Rule("must be at least 1", lambda value: value >= 1)
@@ -37,14 +37,14 @@ NOT_NEGATIVE = Rule("must not be negative", lambda value: value >= 0)
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Hold every field of a dataclass against the ``Literal`` or the rules of its annotation.
+    """Check every field of a dataclass by the ``Literal`` or the rules in its annotation.
 
     Args:
         settings: the dataclass.
-        prefix: written before the fields' names.
+        prefix: text before the fields' names in messages.
 
     Raises:
-        ConfigurationError: the first value that breaks a rule, with the field's name.
+        ConfigurationError: naming the first field that breaks a rule, and its value.
     """
     kind: Any = type(settings)
     for name, hint in annotations(kind).items():
@@ -58,15 +58,20 @@ def check(settings: Any, prefix: str = "") -> None:
 
 @cache
 def annotations(kind: type) -> dict[str, Any]:
-    """Annotations of a dataclass's fields by name, those that are set when it is made. A number that is infinite by default is
-    :data:`Unlimited`.
-    """
+    """Annotations, by name, of the fields of a dataclass that are set when it is made."""
     hints = get_type_hints(kind, include_extras=True)
-    return {f.name: Unlimited if f.default == math.inf else hints[f.name] for f in fields(kind) if f.init}
+    return {f.name: hints[f.name] for f in fields(kind) if f.init}
+
+
+@cache
+def field_types(kind: type) -> dict[str, Any]:
+    """What the fields of a dataclass are read as: their annotations, but :data:`Unlimited` where the default is infinite."""
+    unlimited = {f.name: Unlimited for f in fields(kind) if f.init and f.default == math.inf}
+    return annotations(kind) | unlimited
 
 
 class _Misfit(ValueError):
-    """A value of the wrong kind; what it says depends on the place that the value has in the whole."""
+    """A value of the wrong kind. ``at`` makes the error for the place of the value, which a hook does not know."""
 
     def __init__(self, at: Callable[[str], ConfigurationError]) -> None:
         super().__init__()
@@ -84,7 +89,10 @@ def choose(value: object, valid: Mapping[str, T], entry: str = "") -> T:
     Args:
         value: the name.
         valid: the table.
-        entry: where the name stood below its place.
+        entry: end of the place in the message, ``.kind`` for a name that stood under that key.
+
+    Raises:
+        ValueError: no such name; :func:`convert` makes a ConfigurationError of it.
     """
     if not isinstance(value, str) or value not in valid:
         raise _Misfit(lambda place: unknown(place + entry, value, valid))
@@ -159,7 +167,7 @@ def _choice(value: Any, hint: Any) -> Any:
 
 def _dataclass_hook(kind: type, converter: BaseConverter) -> Hook:
     unlimited = override(struct_hook=converter.get_structure_hook(Unlimited))
-    hooks: dict[str, Any] = {name: unlimited for name, hint in annotations(kind).items() if hint is Unlimited}
+    hooks: dict[str, Any] = {name: unlimited for name, hint in field_types(kind).items() if hint is Unlimited}
     fill: Hook = make_dict_structure_fn(kind, converter, _cattrs_forbid_extra_keys=True, **hooks)
 
     def structure(value: Any, _: Any) -> Any:
