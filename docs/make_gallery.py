@@ -12,7 +12,7 @@ from PIL import Image
 
 from marlbc_mj import World, make_controller, make_supervisor, paper, run_episode
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
-from marlbc_mj.recording.video import render_still, render_video
+from marlbc_mj.recording.video import VideoStyle, render_still, render_video
 from marlbc_mj.robots import make_robot
 from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, SHOWN, fly_gate
 
@@ -60,14 +60,7 @@ def draw(shot: Shot) -> None:
         render_video(
             shot.log,
             large,
-            camera=shot.camera,
-            speed=shot.speed,
-            fps=20,
-            start=start,
-            end=end,
-            width=width,
-            height=height,
-            samples=4,
+            VideoStyle(camera=shot.camera, speed=shot.speed, fps=20, start=start, end=end, width=width, height=height, samples=4),
         )
         squeeze = ["-crf", str(QUALITY[1]), "-preset", "veryslow", "-movflags", "+faststart"]
         ffmpeg = [imageio_ffmpeg.get_ffmpeg_exe(), "-loglevel", "error", "-y", "-i", str(large)]

@@ -161,9 +161,18 @@ class FormationBatch:
             self._restart(terminal | truncated)
             now = self.states()
         return DecisionOutcome(
-            now, final, formation, violation, reward - formation - violation, switches, clearance, before.age,
-            np.full(self.world.worlds, self.interval), terminal, truncated,
-        )  # fmt: skip
+            now,
+            final,
+            formation,
+            violation,
+            reward - formation - violation,
+            switches,
+            clearance,
+            before.age,
+            np.full(self.world.worlds, self.interval),
+            terminal,
+            truncated,
+        )
 
     def _hold(self, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Orders (B, N) for all mission steps of a decision: (B,) sums of r1 + r2, of the formation's and of the violation's part

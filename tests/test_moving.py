@@ -141,7 +141,7 @@ def test_logs_and_pictures_show_obstacles_at_the_right_time(episode, tmp_path):
     """Through the file and back: the same motions, and the drawn model has its discs where they are."""
     scenario, law = episode.scenario, SORLC()
     path = tmp_path / "traffic.mcap"
-    with LogWriter(path, scenario, law, supervisor="fsams", controller_name="sorlc", seed=2, config={}) as log:
+    with LogWriter(path, scenario, law, names=("fsams", "sorlc"), seed=2, config={}) as log:
         run_episode(World(scenario, law, record=True), make_supervisor("fsams"), seed=2, on_frame=log.write)
     written, derived = read_log(path), from_trajectory(episode, law)
     for name in ("obstacles", "motions", "position", "clearance", "formation"):

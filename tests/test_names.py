@@ -13,30 +13,6 @@ PROTOCOL = {
 }
 """Names that modules share on purpose, since they do the same for different things."""
 
-TO_RENAME = {
-    # engine, supervisors and core
-    *("CONFIG", "HEADER", "KINDS", "MEMORY", "SCRATCH", "SLACK", "STARTS", "STATE", "judge", "measure", "plain"),
-    *("roll_out", "save", "shipped"),
-    # robots, scenarios and recording
-    *("COLORS", "FULL", "Field", "LEAST", "MOST", "TRIES", "WHEEL", "disc"),
-    # results and report
-    *(
-        "CONTROLLERS",
-        "COST_MAX",
-        "COST_TOTAL",
-        "FAILED",
-        "INPUT_MAX",
-        "INPUT_TOTAL",
-        "DecisionOutcome",
-        "SUPERVISORS",
-        "SWITCHES",
-    ),
-    *("by_controller", "by_supervisor", "make_tables", "same_actuator", "summary", "write_csv"),
-    # training
-    *("LARGEST_GRADIENT",),
-}
-"""Names that still stand twice and should not; they go from this list as they are renamed."""
-
 
 def defined(path: Path) -> Iterator[str]:
     """Public functions, classes and constants at the top level of a file."""
@@ -61,7 +37,7 @@ def repeated(root: Path) -> dict[str, list[str]]:
 
 
 def test_every_public_name_stands_once() -> None:
-    assert {name: files for name, files in repeated(ROOT).items() if name not in PROTOCOL | TO_RENAME} == {}
+    assert {name: files for name, files in repeated(ROOT).items() if name not in PROTOCOL} == {}
 
 
 def test_nothing_in_studies_or_cli_shares_a_name() -> None:

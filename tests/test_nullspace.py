@@ -7,23 +7,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from marlbc_mj.core.nullspace import RANK_TOLERANCE, compose
+from marlbc_mj.core.nullspace import RANK_TOLERANCE, add_behavior
 
 OA, FM, FR = 0, 1, 2
 seeds = st.integers(0, 2**32 - 1)
 
 
 def composed(order, velocities, jacobians, rows) -> np.ndarray:
+    """The sum (12), term by term, as :func:`marlbc_mj.engine.composition.compose` makes it."""
     n = velocities.shape[1]
-    out = np.full(n, np.nan)
-    compose(np.array(order, dtype=np.int64), velocities, jacobians, np.array(rows, dtype=np.int64), np.empty((n, n)), out)
+    out, basis, rank = np.zeros(n), np.empty((n, n)), 0
+    for j in order:
+        rank = add_behavior(velocities[j], jacobians[j], rows[j], basis, rank, out)
     return out
 
 
 def projector(stack: np.ndarray) -> np.ndarray:
     """N = I - A^+ A for a stack of Jacobians, (m, n) -> (n, n): the textbook form.
 
-    It drops directions relative to the largest singular value, ``compose`` relative to each row's own length.
+    It drops directions relative to the largest singular value, ``add_behavior`` relative to each row's own length.
     """
     return np.eye(stack.shape[1]) - np.linalg.pinv(stack, rcond=RANK_TOLERANCE) @ stack
 

@@ -41,7 +41,7 @@ JSON_TOPICS = [topic.name for topic in schemas.TOPICS]
 
 
 def writer(path: Path, scenario: Scenario, controller: str = "sorlc", **changes) -> LogWriter:
-    names = {"supervisor": "scripted", "controller_name": controller, "seed": 0, "config": CONFIG}
+    names = {"names": ("scripted", controller), "seed": 0, "config": CONFIG}
     return LogWriter(path, scenario, make_controller(controller), **{**names, **changes})
 
 
@@ -122,9 +122,9 @@ def test_round_trip_of_a_drawn_episode(tmp_path):
 @given(values=st.lists(st.tuples(st.floats(), st.floats(), st.floats(), st.floats()), min_size=1, max_size=4))
 def test_encoded_numbers_are_json_and_exact(values):
     """Finite floats come back bit for bit, others are left out: no NaN, no Infinity."""
-    rows = strict_json(schemas.encode(schemas.STATE, np.array(values), time=0.1))["agents"]
+    rows = strict_json(schemas.encode(schemas.STATE_TOPIC, np.array(values), time=0.1))["agents"]
     for row, expected in zip(rows, values, strict=True):
-        finite = {n: x for n, x in zip(schemas.STATE.columns, expected, strict=True) if math.isfinite(x)}
+        finite = {n: x for n, x in zip(schemas.STATE_TOPIC.columns, expected, strict=True) if math.isfinite(x)}
         assert row == finite
 
 
@@ -422,7 +422,7 @@ from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
 
 scenario, controller = paper(), make_controller("sorlc")
-log = LogWriter(sys.argv[1], scenario, controller, supervisor="scripted", controller_name="sorlc", seed=0, config={})
+log = LogWriter(sys.argv[1], scenario, controller, names=("scripted", "sorlc"), seed=0, config={})
 
 def slowly(frame):
     log.write(frame)

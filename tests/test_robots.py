@@ -249,7 +249,7 @@ def test_poses_travel_through_a_log_into_the_picture(tmp_path):
     """x, y, z and quaternion of every body come back bit for bit, and pose the model that is drawn."""
     scenario, controller = short_gate("crazyflie"), PD(9.0, 6.0)
     path = tmp_path / "log.mcap"
-    names = {"supervisor": "scripted", "controller_name": "pd", "seed": 0, "config": {}}
+    names = {"names": ("scripted", "pd"), "seed": 0, "config": {}}
     with LogWriter(path, scenario, controller, **names) as log:
         trajectory = run_episode(World(scenario, controller, record=True), Scripted(), on_frame=log.write)
     read = read_log(path)

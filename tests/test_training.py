@@ -17,7 +17,7 @@ from marlbc_mj.training.exploration import Exploration, shares
 from marlbc_mj.training.learner import HYSTERESIS, LARGEST_GRADIENT, Learner, clip_each, td_weight
 from marlbc_mj.training.leniency import DECAY, KAPPA, RHO, Temperatures, leniency
 from marlbc_mj.training.methods import METHODS
-from marlbc_mj.training.networks import TargetRing, TeamNetwork
+from marlbc_mj.training.networks import NetworkSize, TargetRing, TeamNetwork
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import RLMS, VDN
 from marlbc_mj.training.shaping import Shaping, lost, shaped_reward
@@ -32,7 +32,9 @@ def generator(seed=0):
 
 
 def network(dueling=True, seed=0, risk=False):
-    return TeamNetwork(N, S, A, (6, 7), torch.arange(1.0, S + 1), dueling=dueling, risk=risk, generator=generator(seed))
+    return TeamNetwork(
+        NetworkSize(N, S, A, (6, 7)), torch.arange(1.0, S + 1), dueling=dueling, risk=risk, generator=generator(seed)
+    )
 
 
 def one_agent(net, agent, state):
@@ -128,7 +130,7 @@ def test_a_last_action_that_is_none_is_refused():
 
 def test_networks_have_a_hidden_layer():
     with pytest.raises(ConfigurationError, match="hidden"):
-        TeamNetwork(N, S, A, (), torch.ones(S))
+        TeamNetwork(NetworkSize(N, S, A, ()), torch.ones(S))
 
 
 def test_leniency_is_the_printed_formula():

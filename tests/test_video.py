@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import mujoco
@@ -20,7 +21,7 @@ from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.marks import corner_indices
 from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
-from marlbc_mj.recording.video import frame_times, render_still, render_video
+from marlbc_mj.recording.video import VideoStyle, frame_times, render_still, render_video
 from marlbc_mj.recording.view import HOME, LEFT, RIGHT, SPACE, Playback, view
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import AGENT_COLORS, BEHAVIOR_COLORS, agent_color, ink_on, rgba
@@ -62,7 +63,7 @@ def test_video_decodes_to_what_was_asked_for(log: EpisodeLog, tmp_path: Path) ->
     """Two seconds of the mission at 4x and 20 frames a second are ten frames, and the first one is the still of its time."""
     path = tmp_path / "clip.mp4"
     counted: list[tuple[int, int]] = []
-    count = render_video(log, path, start=19, end=21, fps=20, **SMALL, progress=lambda *done: counted.append(done))
+    count = render_video(log, path, VideoStyle(start=19, end=21, fps=20, **SMALL), progress=lambda *done: counted.append(done))
     said, frames = _read(path)
     for part in ("Video: h264", "yuv420p(tv, bt709", "320x180", "20 fps"):
         assert part in said
@@ -79,9 +80,9 @@ def test_video_replaces_a_file_only_when_told(log: EpisodeLog, tmp_path: Path) -
     path = tmp_path / "clip.mp4"
     path.write_bytes(b"mine")
     with pytest.raises(ConfigurationError, match="exists"):
-        render_video(log, path, **SMALL)
+        render_video(log, path, VideoStyle(**SMALL))
     assert path.read_bytes() == b"mine"
-    render_video(log, path, start=0, end=0.2, **SMALL, overwrite=True)
+    render_video(log, path, VideoStyle(start=0, end=0.2, **SMALL), overwrite=True)
     assert len(_read(path)[1]) == 2
 
 
@@ -92,7 +93,7 @@ def test_interrupted_video_leaves_nothing(log: EpisodeLog, tmp_path: Path) -> No
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        render_video(log, tmp_path / "clip.mp4", **SMALL, progress=stop)
+        render_video(log, tmp_path / "clip.mp4", VideoStyle(**SMALL), progress=stop)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -176,10 +177,10 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
         ({"start": 200.0}, "leave nothing"),
     ],
 )
-def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, object], message: str) -> None:
+def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     """What cannot be used is refused before anything is written."""
     with pytest.raises(ConfigurationError, match=message):
-        render_video(log, tmp_path / "clip.mp4", **{**SMALL, **changes})  # type: ignore[arg-type]
+        render_video(log, tmp_path / "clip.mp4", VideoStyle(**{**SMALL, **changes}))
     assert list(tmp_path.iterdir()) == []
 
 

@@ -19,7 +19,7 @@ from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
-from marlbc_mj.training.networks import TeamNetwork, mask_risky
+from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file
 
@@ -95,10 +95,7 @@ class TeamPolicy(nn.Module):
         super().__init__()
         networks, hidden = len(policy.weights[0]), tuple(bias.shape[2] for bias in policy.biases[:-1])
         self.network = TeamNetwork(
-            networks,
-            len(policy.scale),
-            policy.columns,
-            hidden,
+            NetworkSize(networks, len(policy.scale), policy.columns, hidden),
             torch.tensor(policy.scale),
             dueling=policy.dueling,
             risk=policy.risk > 0,

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from marlbc_mj.training.config import TrainConfig
-from marlbc_mj.training.networks import TargetRing, TeamNetwork, as_tensor, mask_risky, restore, saved, with_moments
+from marlbc_mj.training.networks import NetworkSize, TargetRing, TeamNetwork, as_tensor, mask_risky, restore, saved, with_moments
 from marlbc_mj.training.replay import Batch
 
 HYSTERESIS = 0.5
@@ -47,10 +47,7 @@ class Learner:
         self.generator = generator
         networks, outputs = self.shape(agents, actions)
         self.network = TeamNetwork(
-            networks,
-            len(scale),
-            outputs,
-            config.hidden,
+            NetworkSize(networks, len(scale), outputs, config.hidden),
             torch.from_numpy(scale),
             dueling=config.dueling,
             risk=config.risk_gamma > 0,

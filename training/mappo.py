@@ -10,7 +10,7 @@ from marlbc_mj.tasks.batch import DecisionOutcome
 from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.learner import LARGEST_GRADIENT
-from marlbc_mj.training.networks import TeamNetwork, as_tensor, restore, saved, with_moments
+from marlbc_mj.training.networks import NetworkSize, TeamNetwork, as_tensor, restore, saved, with_moments
 
 LAST_LAYER = 0.01
 """Factor of the initial weights of an actor's last layer, so that all actions are about equally likely."""
@@ -39,7 +39,8 @@ class MAPPO(BaseTrainer):
 
         def network(networks: int, outputs: int) -> TeamNetwork:
             scale = torch.from_numpy(read.scale)
-            plain = TeamNetwork(networks, read.size, outputs, config.hidden, scale, dueling=False, generator=self.generator)
+            size = NetworkSize(networks, read.size, outputs, config.hidden)
+            plain = TeamNetwork(size, scale, dueling=False, generator=self.generator)
             return plain.to(config.device)
 
         self.actors = network(agents, self.batch.actions)

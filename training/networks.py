@@ -5,6 +5,7 @@ and optimisers are saved.
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -14,14 +15,20 @@ from marlbc_mj.policies.greedy import admissible, dueling_value
 from marlbc_mj.util.errors import ConfigurationError
 
 
+class NetworkSize(NamedTuple):
+    """How many networks there are, and how large each is."""
+
+    agents: int  # N networks
+    state: int  # S inputs
+    actions: int  # A outputs, before those of dueling and risk
+    hidden: tuple[int, ...]  # widths of the hidden layers
+
+
 class TeamNetwork(nn.Module):
     """One dueling network per agent, Q_i(s, b) = V_i(s) + B_i(s, b) - mean_b B_i (Wang et al. 2016), all on the same state.
 
     Args:
-        agents: N.
-        state: S, the size of the state.
-        actions: A.
-        hidden: widths of the ReLU layers, at least one.
+        size: number and size of the networks, at least one hidden layer (ReLU).
         scale: (S,) divisor of the state.
         dueling: False makes the last layer give Q itself.
         risk: whether the last layer also gives the logit of a risk for every action.
@@ -35,10 +42,7 @@ class TeamNetwork(nn.Module):
 
     def __init__(
         self,
-        agents: int,
-        state: int,
-        actions: int,
-        hidden: tuple[int, ...],
+        size: NetworkSize,
         scale: Tensor,
         *,
         dueling: bool = True,
@@ -47,6 +51,7 @@ class TeamNetwork(nn.Module):
         mask: Tensor | None = None,
     ) -> None:
         super().__init__()
+        agents, state, actions, hidden = size
         if not hidden:
             raise ConfigurationError(f"networks must have at least one hidden layer, got {hidden}")
         self.dueling = dueling
@@ -79,7 +84,7 @@ class TeamNetwork(nn.Module):
 
     def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
         """Action values and logits of the risks, both (N, B, A); networks without risks give no columns of these."""
-        return self.split(apply(list(self.weights), list(self.biases), state / self.scale))
+        return self.split(feed_forward(list(self.weights), list(self.biases), state / self.scale))
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
         """Action values (..., A) and logits of the risks (..., A) from outputs (..., O) of the last layer."""
@@ -120,7 +125,7 @@ def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
     return weight.permute(1, 0, 2).reshape(inputs, networks * width), bias.reshape(-1)
 
 
-def apply(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[Tensor, Tensor] | None = None) -> Tensor:
+def feed_forward(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: tuple[Tensor, Tensor] | None = None) -> Tensor:
     """(N, B, O) outputs of N networks of two or more layers, with ReLU in between.
 
     Args:
@@ -186,7 +191,7 @@ class TargetRing:
         weights, biases = self.tensors[:layers], self.tensors[layers:]
         if self.first_layer is None and state.ndim == 2:
             self.first_layer = side_by_side(weights[0], biases[0])
-        outputs = apply(weights, biases, state / self.network.scale, self.first_layer)
+        outputs = feed_forward(weights, biases, state / self.network.scale, self.first_layer)
         values, risks = self.network.split(outputs.view(self.copies, self.agents, *outputs.shape[1:]))
         return values.mean(dim=0), torch.sigmoid(risks).mean(dim=0)
 

@@ -1,7 +1,7 @@
 """``marlbc video``, ``view`` and ``log``: what is made from an MCAP log."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
@@ -41,7 +41,7 @@ class VideoCommand:
         """Render, with progress; the backend is named once there is a first frame."""
         from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
-        from marlbc_mj.recording.video import render_video
+        from marlbc_mj.recording.video import VideoStyle, render_video
 
         out = self.out or self.log.with_suffix(".mp4")
         with progress_bars() as progress:
@@ -51,20 +51,8 @@ class VideoCommand:
                     print(f"marlbc: off-screen rendering with {choose_gl()}", file=sys.stderr)
                 progress("video", done, total)
 
-            render_video(
-                read_log(self.log),
-                out,
-                speed=self.speed,
-                fps=self.fps,
-                width=self.width,
-                height=self.height,
-                camera=self.camera,
-                start=self.start,
-                end=self.end,
-                samples=self.samples,
-                overwrite=self.overwrite,
-                progress=show,
-            )
+            style = VideoStyle(**{field.name: getattr(self, field.name) for field in fields(VideoStyle)})
+            render_video(read_log(self.log), out, style, overwrite=self.overwrite, progress=show)
         print(out)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.core import laws
 
-GAINS = (
+_GAINS = (
     "model_weight",  # of f^
     "velocity_gain",  # a
     "position_gain",  # b
@@ -40,7 +40,7 @@ def phi(x, power):
     return np.sign(x) * (abs(x) if abs(x) < 1.0 else 1.0) ** power
 
 
-@laws.controller(gains=GAINS)
+@laws.controller(gains=_GAINS)
 def homogeneous(gains, state, p, v, p_r, v_r, drag, h, force_out):
     """u = -f^ - a e_v - b sig(e_p)^q - phi_s(e_v) - c sig(e_p)^r - d sig(e_v)^t, then the limit; no state."""
     for axis in range(2):

@@ -9,7 +9,7 @@ import numpy as np
 
 from marlbc_mj.core.laws import allocation_free, compiled
 
-_COLUMNS, _ROWS, _X, _Y, _SIZE, _WIDEST, HEADER = 0, 1, 2, 3, 4, 5, 6
+_COLUMNS, _ROWS, _X, _Y, _SIZE, _WIDEST, _HEADER = 0, 1, 2, 3, 4, 5, 6
 LARGEST = 1e12  # coordinates beyond this are not put into a grid [m]
 FARTHEST = 1e6  # [cells] a query from farther away tries all points
 SLACK = 1e-6  # [cells] by which rounding may put a point into the cell beside its own
@@ -21,7 +21,7 @@ at 65 000."""
 @allocation_free
 def room(points):
     """Length of the array for a grid of that many points."""
-    return HEADER + 4 * points + 8
+    return _HEADER + 4 * points + 8
 
 
 @allocation_free
@@ -45,10 +45,10 @@ def fill(points, grid):
     if size < 1e-9:
         size = 1.0
     columns, rows = int(width / size) + 1, int(height / size) + 1
-    if HEADER + n + columns * rows > grid.shape[0]:
+    if _HEADER + n + columns * rows > grid.shape[0]:
         return
     grid[_COLUMNS], grid[_ROWS], grid[_X], grid[_Y], grid[_SIZE], grid[_WIDEST] = columns, rows, low_x, low_y, size, widest
-    following, first = grid[HEADER : HEADER + n], grid[HEADER + n :]
+    following, first = grid[_HEADER : _HEADER + n], grid[_HEADER + n :]
     for cell in range(columns * rows):
         first[cell] = -1.0
     for k in range(n):
@@ -77,7 +77,7 @@ def nearest(p, points, grid, own):
     if not abs(x) + abs(y) < FARTHEST:
         return _of_all(p, points, own)
     column, row = int(x), int(y)
-    following, first = grid[HEADER : HEADER + n], grid[HEADER + n :]
+    following, first = grid[_HEADER : _HEADER + n], grid[_HEADER + n :]
     ring = max(0, -column, column - columns + 1, -row, row - rows + 1)
     last = max(column, columns - 1 - column, row, rows - 1 - row)
     best, found = np.inf, -1

@@ -1,7 +1,9 @@
 """How laws and the helpers that they call are compiled: by numba, on first use, cached on disk."""
 
 import os
+import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, cast
 
 # Read once, when the first OpenMP library loads. Threads that spin while they wait would take the cores from torch's (and from
@@ -16,15 +18,34 @@ Law = Callable[..., Any]
 """A compiled law, or, of every kind but behaviors, a plain Python function with the same arguments."""
 
 
+def sources_stamp(package: Path) -> int:
+    """Checksum of all source files below ``package`` that hold compiled code.
+
+    numba keeps compiled code until the file of its function changes. What a function calls is compiled into it, from whatever
+    file, so code of this package is kept until any of these files changes.
+    """
+    texts = (path.read_bytes() for path in sorted(package.rglob("*.py")))
+    return zlib.crc32(b"".join(text for text in texts if any(mark in text for mark in COMPILED_MARKS)))
+
+
+COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
+"""What is found in files that hold compiled code."""
+SOURCES = sources_stamp(Path(__file__).parents[1])
+
+
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
     """Compile, and keep the result on disk where there is a place for it: not for a function typed at a prompt, nor without a
     writable folder.
     """
     options = {"error_model": "numpy", "nogil": True, **options}
     try:
-        return cast(Law, numba.njit(cache=cache, **options)(function))
+        law = numba.njit(cache=cache, **options)(function)
     except RuntimeError:
         return cast(Law, numba.njit(**options)(function))
+    if cache and is_compiled(law):
+        index = law._cache._cache_file
+        index._source_stamp = (index._source_stamp, SOURCES)
+    return cast(Law, law)
 
 
 def threaded(function: Law) -> Law:

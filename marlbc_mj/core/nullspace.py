@@ -1,4 +1,9 @@
-"""Null-space composition of behaviors: equation (12) with errata 5 (Moore-Penrose, Jacobians above j only)."""
+"""The terms of null-space composition (12): what one behavior adds, and which directions it shuts (erratum 5).
+
+A^+ A is the orthogonal projector onto the row space of A, the Jacobians of all behaviors of higher priority. So N = I - A^+ A is
+applied through an orthonormal basis of that space: no inverse is formed, a rank-deficient stack needs no special case, and any
+number of behaviors with any Jacobians composes by the same lines. :func:`marlbc_mj.engine.composition.compose` is the whole sum.
+"""
 
 import numpy as np
 
@@ -6,28 +11,6 @@ from marlbc_mj.core.laws import allocation_free
 
 RANK_TOLERANCE = 1e-9
 """A row whose part outside the span of the rows above it is shorter than this times its length adds no direction."""
-
-
-@allocation_free
-def compose(order, velocities, jacobians, rows, basis, out):
-    """Composite velocity v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12).
-
-    A stacks the Jacobians of all behaviors of higher priority. A^+ A is the orthogonal projector onto the row space of A,
-    so N is applied through an orthonormal basis of that space: no inverse is formed, a rank-deficient stack (erratum 5) needs no
-    special case, and any number of behaviors with any Jacobians composes by the same lines.
-
-    Args:
-        order: (M,) int64, behavior indices, highest priority first.
-        velocities: (M, n) [m/s], desired velocity of each behavior (8).
-        jacobians: (M, r, n), the first ``rows[j]`` rows of each are used.
-        rows: (M,) int64.
-        basis: (n, n), scratch.
-        out: (n,) [m/s], the composite velocity, written in place.
-    """
-    out[:] = 0.0
-    rank = 0
-    for j in order:
-        rank = add_behavior(velocities[j], jacobians[j], rows[j], basis, rank, out)
 
 
 @allocation_free

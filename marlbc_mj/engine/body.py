@@ -44,7 +44,7 @@ def actuate(drive, plant, state, qpos, qvel, force, h, ctrl):
 
 
 @inlined
-def measure(reading, plant, state, qpos, qvel, actuator_force, p, v, force):
+def read_robot(reading, plant, state, qpos, qvel, actuator_force, p, v, force):
     """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators really gave."""
     if plant.spans.shape[1] > 0:
         law = as_reading(reading)

@@ -14,7 +14,7 @@ from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.native import as_behavior
 
 WORKSPACE = 9
-"""Rows of two numbers that a :class:`Scene` is made from."""
+"""Rows of two numbers that a :class:`TeamView` is made from."""
 
 
 class Behaviors(NamedTuple):
@@ -31,8 +31,8 @@ class Behaviors(NamedTuple):
     acceleration_limit: float  # of references [m/s^2]
 
 
-class Scene(NamedTuple):
-    """What behaviors look at in one team, and room to evaluate them in."""
+class TeamView(NamedTuple):
+    """What behaviors look at in one team, and room to desired_velocity them in."""
 
     at: np.ndarray  # (N, 2) positions at which they are evaluated [m]
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move
@@ -53,42 +53,42 @@ def path_at(t, path, out):
 
 
 @inlined
-def make_scene(t, behaviors, at, obstacles, grid, workspace):
-    """The :class:`Scene` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids, where there is room, are filled."""
+def make_view(t, behaviors, at, obstacles, grid, workspace):
+    """The :class:`TeamView` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids, where there is room, are filled."""
     path = workspace[0:2]
     path_at(t, behaviors.path, path)
     if grid.shape[0] > 0:
         count = obstacles.shape[0]
         fill(obstacles, grid[: room(count)])
         fill(at, grid[room(count) :])
-    return Scene(at, obstacles, path, grid, workspace[2], workspace[3:5], workspace[5:7], workspace[7:9])
+    return TeamView(at, obstacles, path, grid, workspace[2], workspace[3:5], workspace[5:7], workspace[7:9])
 
 
 @inlined
-def evaluate(j, i, behaviors, scene):
-    """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the scene; returns the Jacobian's rows.
+def desired_velocity(j, i, behaviors, view):
+    """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the view; returns the Jacobian's rows.
 
-    A law that looks only at the nearest obstacle or neighbor is handed that one alone where the scene has a grid to find it in.
+    A law that looks only at the nearest obstacle or neighbor is handed that one alone where the view has a grid to find it in.
     """
-    obstacles, team, own = scene.obstacles, scene.at, i
-    if scene.grid.shape[0] > 0:
-        count = scene.obstacles.shape[0]
+    obstacles, team, own = view.obstacles, view.at, i
+    if view.grid.shape[0] > 0:
+        count = view.obstacles.shape[0]
         if behaviors.sees[j] == NEAREST_OBSTACLE:
-            k = nearest(scene.at[i], scene.obstacles, scene.grid[: room(count)], -1)
+            k = nearest(view.at[i], view.obstacles, view.grid[: room(count)], -1)
             if k >= 0:
-                obstacles = scene.obstacles[k : k + 1]
+                obstacles = view.obstacles[k : k + 1]
         elif behaviors.sees[j] == NEAREST_NEIGHBOR:
-            k = nearest(scene.at[i], scene.at, scene.grid[room(count) :], i)
+            k = nearest(view.at[i], view.at, view.grid[room(count) :], i)
             if k >= 0:
-                own, team = 1 if i > k else 0, scene.pair
+                own, team = 1 if i > k else 0, view.pair
                 for axis in range(2):
-                    team[own, axis], team[1 - own, axis] = scene.at[i, axis], scene.at[k, axis]
+                    team[own, axis], team[1 - own, axis] = view.at[i, axis], view.at[k, axis]
     law = as_behavior(behaviors.laws[j])
-    return law(behaviors.params[j, i], scene.at[i], scene.path, obstacles, team, own, scene.velocity, scene.jacobian)
+    return law(behaviors.params[j, i], view.at[i], view.path, obstacles, team, own, view.velocity, view.jacobian)
 
 
 @inlined
-def compose(order, i, behaviors, scene, v_r):
+def compose(order, i, behaviors, view, v_r):
     """v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12), for agent ``i``, into ``v_r`` (2,) [m/s].
 
     ``order`` (M,) lists behavior indices, highest priority first. A stacks the Jacobians of all behaviors above j (erratum 5).
@@ -99,8 +99,8 @@ def compose(order, i, behaviors, scene, v_r):
     for j in order:
         if rank == 2:
             break
-        rows = evaluate(j, i, behaviors, scene)
-        rank = add_behavior(scene.velocity, scene.jacobian, rows, scene.basis, rank, v_r)
+        rows = desired_velocity(j, i, behaviors, view)
+        rank = add_behavior(view.velocity, view.jacobian, rows, view.basis, rank, v_r)
 
 
 @allocation_free
@@ -112,14 +112,14 @@ def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
         orders: (N,) int64, indices into ``behaviors.table``.
         behaviors: of the scenario.
         at: (N, 2) positions at which they are evaluated [m].
-        obstacles: (K, 3 or 5), see :class:`Scene`.
+        obstacles: (K, 3 or 5), see :class:`TeamView`.
         grid: room for a grid of the obstacles and one of the team, or empty, which has every law try all of them.
         workspace: (WORKSPACE, 2) scratch.
         v_r: (N, 2), written in place.
     """
-    scene = make_scene(t, behaviors, at, obstacles, grid, workspace)
+    view = make_view(t, behaviors, at, obstacles, grid, workspace)
     for i in range(orders.shape[0]):
-        compose(behaviors.table[orders[i]], i, behaviors, scene, v_r[i])
+        compose(behaviors.table[orders[i]], i, behaviors, view, v_r[i])
 
 
 @allocation_free

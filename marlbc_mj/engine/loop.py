@@ -13,18 +13,15 @@ objects; the dm_control task calls its parts from composer's hooks. Its order:
 
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
-from numba import types
-from numba.experimental import structref
 
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.imperfections import sense, weaken
-from marlbc_mj.core.laws import allocation_free, compiled, inlined, threaded
+from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
-from marlbc_mj.engine.body import DIVERGED, actuate, measure, scale_rows
+from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
 
@@ -33,7 +30,7 @@ FORMATION_REWARD = 5.0  # (14), times G
 SWITCH_REWARD = -3.0  # (15), once per team (erratum 11)
 
 
-class Mission(NamedTuple):
+class MissionRules(NamedTuple):
     """The mission's clocks and what it is judged by."""
 
     mission_step: float  # between decisions [s]
@@ -255,7 +252,7 @@ def apply(b, k, mission, native, plant, team):
 
 @inlined
 def settle(b, k, mission, native, plant, team, record):
-    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, measure what was reached, p_r += h v_r."""
+    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read_robot what was reached, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
     recording = record.force.shape[1] > 0
     if recording:
@@ -267,7 +264,7 @@ def settle(b, k, mission, native, plant, team, record):
                 record.reference_velocity[b, k, i, axis] = v_r[i, axis]
     qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
     actuator_force = doubles(native.actuator_force[b], plant.nu)
-    measure(native.reading, plant, team.robot[b], qpos, qvel, actuator_force, p, v, force)
+    read_robot(native.reading, plant, team.robot[b], qpos, qvel, actuator_force, p, v, force)
     for i in range(p.shape[0]):
         for axis in range(2):
             if recording:
@@ -312,83 +309,6 @@ def mission_step(b, orders, given, mission, behaviors, native, plant, team, reco
     return 1 if team.status[b] else 0
 
 
-# What is compiled around it ---------------------------------------------------------------------------------------------------
-
 apply_compiled = allocation_free(apply)
 settle_compiled = allocation_free(settle)
-
-
-@structref.register
-class _ArgumentsType(types.StructRef):
-    """numba's type of :class:`Arguments`."""
-
-
-class Arguments(structref.StructRefProxy):
-    """What a World hands to the compiled loop at every mission step, bundled: passing it costs 1 us, its seventy parts 25 us."""
-
-
-structref.define_proxy(Arguments, _ArgumentsType, ["mission", "behaviors", "native", "plant", "team", "record"])
-
-
-@compiled
-def bundle(mission, behaviors, native, plant, team, record):
-    """The :class:`Arguments` of one World."""
-    return Arguments(mission, behaviors, native, plant, team, record)
-
-
-@threaded
-def _step_parallel(worlds, orders, given, mission, behaviors, native, plant, team, record):
-    failed = 0
-    for b in numba.prange(worlds):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
-@compiled
-def step_parallel(orders, given, a):
-    """:func:`mission_step` of every world, shared out over numba's threads; the same numbers as in series."""
-    worlds = a.team.steps.shape[0]
-    return _step_parallel(worlds, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
-
-
-@compiled
-def step_serial(orders, given, a):
-    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
-    mission, behaviors, native, plant, team, record = a.mission, a.behaviors, a.native, a.plant, a.team, a.record
-    failed = 0
-    for b in range(team.steps.shape[0]):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
-@compiled
-def roll_out(b, sequence, given, mission, behaviors, native, plant, team, record):
-    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
-
-    Returns the sum of rewards, up to the step that failed if one did.
-    """
-    total = 0.0
-    for m in range(sequence.shape[0]):
-        if mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record):
-            break
-        total += team.reward[b]
-    return total
-
-
-@threaded
-def _rollout_parallel(returns, sequence, given, mission, behaviors, native, plant, team, record):
-    for b in numba.prange(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, mission, behaviors, native, plant, team, record)
-
-
-@compiled
-def rollout_parallel(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series."""
-    _rollout_parallel(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
-
-
-@compiled
-def rollout_serial(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), one after the other."""
-    for b in range(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+"""The parts that need MuJoCo between them, compiled for callers that step it themselves."""

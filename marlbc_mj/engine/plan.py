@@ -14,7 +14,7 @@ from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.composition import Behaviors
-from marlbc_mj.engine.loop import Mission, Native, Plant
+from marlbc_mj.engine.loop import MissionRules, Native, Plant
 from marlbc_mj.engine.native import step_address
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
@@ -33,7 +33,7 @@ class Plan:
     robot: Robot
     xml: str  # the assembled MJCF
     model: mujoco.MjModel
-    mission: Mission
+    mission: MissionRules
     behaviors: Behaviors
     plant: Plant
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
@@ -111,9 +111,9 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
     )
 
 
-def make_mission(scenario: Scenario) -> Mission:
+def make_mission(scenario: Scenario) -> MissionRules:
     """The clocks of a scenario and what it is judged by, as the loop takes them."""
-    return Mission(
+    return MissionRules(
         mission_step=float(scenario.mission_step),
         substep=float(scenario.substep),
         substeps=int(scenario.substeps),

@@ -9,7 +9,7 @@ import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core import laws
-from marlbc_mj.engine import loop, team
+from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
@@ -82,7 +82,7 @@ class World:
         plan = self.plan
         self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
         arguments = (plan.mission, plan.behaviors, self.side, plan.plant, self.state, self._record)
-        return loop.bundle(*arguments) if self.native else arguments
+        return drivers.bundle(*arguments) if self.native else arguments
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
         """Start episodes anew: all of them, or those where ``mask`` (B,) is true.
@@ -186,7 +186,7 @@ class World:
             raise ConfigurationError("rollout needs compiled laws; use step")
         sequence = np.stack([self._checked(row) for row in np.asarray(orders)])
         returns = np.zeros(self.worlds)
-        run = loop.rollout_serial if self._serial() else loop.rollout_parallel
+        run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
         run(returns, sequence, self._orders_alone, self._arguments)
         self.raise_if_diverged()
         return returns
@@ -210,7 +210,7 @@ class World:
         """
         given = self._orders_alone if velocity is None else velocity
         if self.native:
-            run = loop.step_serial if self._serial() else loop.step_parallel
+            run = drivers.step_serial if self._serial() else drivers.step_parallel
             return int(run(orders, given, self._arguments))
         mission_step = laws.plain(loop.mission_step)
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))

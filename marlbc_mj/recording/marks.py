@@ -66,8 +66,8 @@ def ribbon(a: np.ndarray, b: np.ndarray, width: float, height: float, color: Col
     return Mark(mujoco.mjtGeom.mjGEOM_BOX, size, np.array([*(0.5 * (a + b)), height]), frame, color)
 
 
-def disc(center: np.ndarray, radius: float, height: float, color: Color, scale: float = 1.0) -> Mark:
-    """A flat disc around ``center`` (2,), ``height`` [m] above the ground."""
+def flat_disc(center: np.ndarray, radius: float, height: float, color: Color, scale: float = 1.0) -> Mark:
+    """A flat flat_disc around ``center`` (2,), ``height`` [m] above the ground."""
     size = np.array([radius, SHEET * scale, 0.0])
     return Mark(mujoco.mjtGeom.mjGEOM_CYLINDER, size, np.array([*center, height]), _UPRIGHT, color)
 

@@ -17,7 +17,7 @@ SCHEMA_ENCODING = "jsonschema"
 MESSAGE_ENCODING = "json"
 
 
-class Field(NamedTuple):
+class MessageField(NamedTuple):
     """One field of a topic."""
 
     type: str  # "number", "integer" or "string"
@@ -31,8 +31,8 @@ class Topic(NamedTuple):
     name: str
     schema_name: str
     description: str
-    agents: Mapping[str, Field]
-    scalars: Mapping[str, Field] = {}
+    agents: Mapping[str, MessageField]
+    scalars: Mapping[str, MessageField] = {}
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -40,21 +40,21 @@ class Topic(NamedTuple):
         return tuple(self.agents)
 
 
-def _plane(kind: str) -> dict[str, Field]:
-    return {axis: Field("number", f"{kind}, {axis} axis") for axis in ("x", "y")}
+def _plane(kind: str) -> dict[str, MessageField]:
+    return {axis: MessageField("number", f"{kind}, {axis} axis") for axis in ("x", "y")}
 
 
-def _motion(position: str, velocity: str) -> dict[str, Field]:
-    rates = {f"v{axis}": Field("number", f"{velocity}, {axis} axis [m/s]") for axis in ("x", "y")}
+def _motion(position: str, velocity: str) -> dict[str, MessageField]:
+    rates = {f"v{axis}": MessageField("number", f"{velocity}, {axis} axis [m/s]") for axis in ("x", "y")}
     return {**_plane(f"{position} [m]"), **rates}
 
 
-STATE = Topic(
+STATE_TOPIC = Topic(
     "/state",
     "marlbc.State",
     "measured motion at the start of a mission step",
     _motion("position p", "velocity v"),
-    {"time": Field("number", "start of the mission step [s]")},
+    {"time": MessageField("number", "start of the mission step [s]")},
 )
 REFERENCE = Topic(
     "/reference",
@@ -68,8 +68,8 @@ PRIORITIES = Topic(
     "marlbc.Priorities",
     "what the mission supervisor commands",
     {
-        "command": Field("string", "behaviors from the highest priority down, OA>FM for example"),
-        "index": Field("integer", "the same as an index into the scenario's commands"),
+        "command": MessageField("string", "behaviors from the highest priority down, OA>FM for example"),
+        "index": MessageField("integer", "the same as an index into the scenario's commands"),
     },
 )
 WEIGHTS = Topic(
@@ -77,22 +77,22 @@ WEIGHTS = Topic(
     "marlbc.Weights",
     "adaptive state of SORLC at the start of a mission step",
     {
-        "identifier": Field("number", "Frobenius norm of w_f", required=False),
-        "actor": Field("number", "Frobenius norm of w_a", required=False),
-        "critic": Field("number", "Frobenius norm of w_c", required=False),
-        "tau_x": Field("number", "saturation compensator tau, x axis", required=False),
-        "tau_y": Field("number", "saturation compensator tau, y axis", required=False),
+        "identifier": MessageField("number", "Frobenius norm of w_f", required=False),
+        "actor": MessageField("number", "Frobenius norm of w_a", required=False),
+        "critic": MessageField("number", "Frobenius norm of w_c", required=False),
+        "tau_x": MessageField("number", "saturation compensator tau, x axis", required=False),
+        "tau_y": MessageField("number", "saturation compensator tau, y axis", required=False),
     },
 )
 METRICS = Topic(
     "/metrics",
     "marlbc.Metrics",
     "verdicts on a mission step",
-    {"clearance": Field("number", "distance to the nearest obstacle [m]; absent without obstacles", required=False)},
+    {"clearance": MessageField("number", "distance to the nearest obstacle [m]; absent without obstacles", required=False)},
     {
-        "formation": Field("integer", "G at the start: 2 in formation, 1 in column, 0 neither"),
-        "reward": Field("number", "r1 + r2 of this mission step"),
-        "decision_ms": Field("number", "what the supervisor took [ms]"),
+        "formation": MessageField("integer", "G at the start: 2 in formation, 1 in column, 0 neither"),
+        "reward": MessageField("number", "r1 + r2 of this mission step"),
+        "decision_ms": MessageField("number", "what the supervisor took [ms]"),
     },
 )
 POSE = Topic(
@@ -100,12 +100,12 @@ POSE = Topic(
     "marlbc.Pose",
     "where the bodies of robots with a free joint are and how they are turned, at the start of a mission step",
     {
-        **{axis: Field("number", f"position of the body, {axis} axis [m]") for axis in ("x", "y", "z")},
-        **{f"q{part}": Field("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
+        **{axis: MessageField("number", f"position of the body, {axis} axis [m]") for axis in ("x", "y", "z")},
+        **{f"q{part}": MessageField("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
     },
 )
-TOPICS = (STATE, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
-REQUIRED = (STATE, REFERENCE, FORCE, PRIORITIES, METRICS)
+TOPICS = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
+REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
 Robots with a free joint have ``POSE`` too.
@@ -122,7 +122,7 @@ def json_schema(topic: Topic) -> dict[str, Any]:
     return {**head, "description": topic.description, **schema}
 
 
-def _object(fields: Mapping[str, Field]) -> dict[str, Any]:
+def _object(fields: Mapping[str, MessageField]) -> dict[str, Any]:
     properties = {name: {"type": f.type, "description": f.description} for name, f in fields.items()}
     return {"type": "object", "properties": properties, "required": [n for n, f in fields.items() if f.required]}
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from marlbc_mj.engine.assembly import LEAST_SOLID, POINT_RADIUS, agent_prefix
 from marlbc_mj.recording.log import EpisodeLog
-from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, disc, make_trail, ribbon
+from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, flat_disc, make_trail, ribbon
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
 
@@ -90,8 +90,8 @@ class Stage:
         marks, unit = [], self.scale
         for i, command in enumerate(self.commands(time)):
             radius = float(self.radii[i])
-            marks.append(disc(position[i], HALO * radius, 0.06 * unit, rgba("#FFFFFF"), unit))
-            marks.append(disc(position[i], (HALO - RIM) * radius, 0.09 * unit, rgba(command_color(command)), unit))
+            marks.append(flat_disc(position[i], HALO * radius, 0.06 * unit, rgba("#FFFFFF"), unit))
+            marks.append(flat_disc(position[i], (HALO - RIM) * radius, 0.09 * unit, rgba(command_color(command)), unit))
             far = bool(np.hypot(*(reference[i] - position[i])) > radius)
             if far:
                 marks.append(ribbon(position[i], reference[i], 0.1 * unit, 0.12 * unit, agent_color(i), unit))
@@ -174,7 +174,7 @@ def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]
     """Where the clearance to an obstacle (3,) is below the safe distance [m]: a tinted disc in a dashed circle."""
     center, radius = obstacle[:2], float(obstacle[2]) + safe_distance
     circle = dashed_circle(center, radius, rgba(SAFE_DISTANCE_COLOR), unit)
-    return [disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
+    return [flat_disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
 
 
 def _enlarge(model: mujoco.MjModel, prefix: str, least: float) -> float:

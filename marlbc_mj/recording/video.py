@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import closing
+from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
@@ -16,35 +17,42 @@ from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import staged_file
 
-LEAST, MOST = 64, 4096  # pixels, either side
+LEAST_PIXELS, MOST_PIXELS = 64, 4096  # pixels, either side
 MOST_SAMPLES = 16  # per pixel
 COLORS = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
 ENCODING = ["-vf", COLORS, "-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
 """Colors as players expect them of a high-definition picture, constant quality, and an index at the file's beginning."""
 
 
+@dataclass(frozen=True)
+class VideoStyle:
+    """Which part of an episode a video shows, and how."""
+
+    speed: float = 4.0  # seconds of the mission per second of video
+    fps: int = 30  # frames per second of video
+    width: int = 1280  # [pixels], even
+    height: int = 720  # [pixels], even
+    camera: str = "track"  # ``track``, ``top``, ``close`` or a camera of the model
+    start: float | None = None  # first moment of the mission that is shown [s]; None: its beginning
+    end: float | None = None  # last one [s]; None: its end
+    samples: int = 0  # per pixel; 4 smooths edges and takes about twice as long
+
+
 def render_video(
     log: EpisodeLog,
     path: str | Path,
+    style: VideoStyle = VideoStyle(),
     *,
-    speed: float = 4.0,
-    fps: int = 30,
-    width: int = 1280,
-    height: int = 720,
-    camera: str = "track",
-    start: float | None = None,
-    end: float | None = None,
     overwrite: bool = False,
-    samples: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
     """Write an H.264 MP4 of an episode; the file appears under its name when it is complete.
 
     Args:
-        speed: seconds of the mission per second of video.
-        camera: ``track``, ``top`` or a camera of the model.
-        start, end: part of the mission [s]; all of it by default.
-        samples: per pixel; 4 smooths edges and takes about twice as long.
+        log: the episode.
+        path: a name that ends in ``.mp4``.
+        style: what is shown, and how.
+        overwrite: replace an existing file.
         progress: called after every frame with how many are done and how many there are.
 
     Returns:
@@ -57,13 +65,14 @@ def render_video(
     path = Path(path)
     if path.suffix.lower() != ".mp4":
         raise ConfigurationError(f"a video's name must end in .mp4, got {path.name!r}")
-    if not 0 <= samples <= MOST_SAMPLES:
-        raise ConfigurationError(f"samples must be from 0 to {MOST_SAMPLES}, got {samples}")
-    times = frame_times(log, speed=speed, fps=fps, start=start, end=end)
-    pictures = _frames(log, times, width=width, height=height, camera=camera, samples=samples, speed=speed)
+    if not 0 <= style.samples <= MOST_SAMPLES:
+        raise ConfigurationError(f"samples must be from 0 to {MOST_SAMPLES}, got {style.samples}")
+    times = frame_times(log, speed=style.speed, fps=style.fps, start=style.start, end=style.end)
+    size = style.width, style.height
+    pictures = _frames(log, times, size, camera=style.camera, samples=style.samples, speed=style.speed)
     with staged_file(path, overwrite=overwrite) as partial, closing(pictures):
         try:
-            _encode(pictures, partial, (width, height), fps, len(times), progress)
+            _encode(pictures, partial, size, style.fps, len(times), progress)
         except OSError as error:
             raise SimulationError(f"cannot write video {path}: {str(error).splitlines()[0]}") from error
     return len(times)
@@ -77,7 +86,7 @@ def render_still(
     Raises:
         ConfigurationError: an argument that cannot be used, or no OpenGL.
     """
-    frames = _frames(log, np.array([time]), width=width, height=height, camera=camera, samples=samples, speed=None)
+    frames = _frames(log, np.array([time]), (width, height), camera=camera, samples=samples, speed=None)
     with closing(frames):
         return next(frames)
 
@@ -102,18 +111,18 @@ def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None,
 
 
 def _frames(
-    log: EpisodeLog, times: np.ndarray, *, width: int, height: int, camera: str, samples: int, speed: float | None
+    log: EpisodeLog, times: np.ndarray, size: tuple[int, int], *, camera: str, samples: int, speed: float | None
 ) -> Generator[np.ndarray, None, None]:
     """(height, width, 3) uint8 for every time [s]."""
-    _check_size(width, height)
+    _check_size(*size)
     stage = make_stage(log)
-    caption = Caption(log, width, height, speed, badges=bool(stage.free))
-    size = width, caption.picture_height
-    view = make_camera(camera, stage, size[0] / size[1])
-    with Offscreen(stage, view, *size, samples=samples) as offscreen:
+    caption = Caption(log, *size, speed, badges=bool(stage.free))
+    scene = size[0], caption.picture_height
+    view = make_camera(camera, stage, scene[0] / scene[1])
+    with Offscreen(stage, view, *scene, samples=samples) as offscreen:
         for time in times:
             picture = offscreen.render(float(time))
-            labels, radii = project(offscreen.scene, stage.middles(), stage.radii, *size)
+            labels, radii = project(offscreen.scene, stage.middles(), stage.radii, *scene)
             yield np.asarray(caption.frame(picture, float(time), stage.step(float(time)), labels, radii))
 
 
@@ -146,5 +155,5 @@ def _encode(
 
 def _check_size(width: int, height: int) -> None:
     for name, value in (("width", width), ("height", height)):
-        if not LEAST <= value <= MOST or value % 2:
-            raise ConfigurationError(f"{name} must be an even number of pixels from {LEAST} to {MOST}, got {value}")
+        if not LEAST_PIXELS <= value <= MOST_PIXELS or value % 2:
+            raise ConfigurationError(f"{name} must be an even number of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, got {value}")

@@ -55,7 +55,7 @@ class LogWriter:
     Args:
         path: a name that ends in ``.mcap``; missing folders are made.
         scenario, controller: what runs.
-        supervisor, controller_name: their names.
+        names: supervisor's and controller's.
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.
         overwrite: replace a log, finished or partial, of the same name.
@@ -71,8 +71,7 @@ class LogWriter:
         scenario: Scenario,
         controller: Controller,
         *,
-        supervisor: str,
-        controller_name: str,
+        names: tuple[str, str],
         seed: int,
         config: dict[str, Any],
         overwrite: bool = False,
@@ -82,8 +81,8 @@ class LogWriter:
         self._overwrite = overwrite
         draw = _draw(scenario, seed)
         metadata = {
-            "supervisor": supervisor,
-            "controller": controller_name,
+            "supervisor": names[0],
+            "controller": names[1],
             "seed": str(seed),
             "config_sha256": config_hash(config),
             "revision": git_revision(),
@@ -188,7 +187,7 @@ class LogWriter:
         yield SCENE_TOPIC, scene
         yield TRANSFORMS_TOPIC, transforms
         motion = np.concatenate([first.position, first.velocity], axis=1)
-        yield "/state", schemas.encode(schemas.STATE, motion, time=float(seen.time))
+        yield "/state", schemas.encode(schemas.STATE_TOPIC, motion, time=float(seen.time))
         reference = np.concatenate([first.reference, first.reference_velocity], axis=1)
         yield "/reference", schemas.encode(schemas.REFERENCE, reference)
         yield "/force", schemas.encode(schemas.FORCE, first.force)

@@ -5,19 +5,19 @@ from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-HOME = "marlbc_mj.report"
+_HOME = "marlbc_mj.report"
 """The package whose templates every page may extend or include."""
 
 
 @cache
 def _environment(package: str) -> Environment:
-    loaders = [PackageLoader(name, "") for name in dict.fromkeys((package, HOME))]
+    loaders = [PackageLoader(name, "") for name in dict.fromkeys((package, _HOME))]
     return Environment(
         loader=ChoiceLoader(loaders), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
 
 
-def render(template: str, package: str = HOME, **values: Any) -> str:
+def render(template: str, package: str = _HOME, **values: Any) -> str:
     """Fill a template.
 
     Args:

@@ -13,11 +13,11 @@ from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.wheels import heading, inertia
 
 DIFF_DRIVE = "6.6 kg base on two driven wheels and a caster, led by a point 0.15 m ahead of its axle"
-WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, how far ahead the point is [m]
+_WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, how far ahead the point is [m]
 _MJCF = MODELS / "robots" / "diff_drive.xml"
 
 
-GAINS = (
+_GAINS = (
     "wheel",  # r, radius of a wheel [m]
     "half_track",  # b [m]
     "ahead",  # l, of the point in front of the axle [m]
@@ -26,10 +26,15 @@ GAINS = (
     "offset",  # m d [kg m]
     "torque_limit",  # [N m]
 )
-STATE = ("heading", "speed", "turn_rate", "saturated")  # t [rad], u [m/s], w [rad/s], substeps in which a torque was at its limit
+_STATE = (
+    "heading",
+    "speed",
+    "turn_rate",
+    "saturated",
+)  # t [rad], u [m/s], w [rad/s], substeps in which a torque was at its limit
 
 
-@laws.drive(gains=GAINS, state=STATE)
+@laws.drive(gains=_GAINS, state=_STATE)
 def diff_drive_drive(gains, state, qpos, qvel, force, h, ctrl_out):
     """Torques of the left and right wheel for p'' = F / m."""
     r, b, ahead, mass, turn, offset = gains.wheel, gains.half_track, gains.ahead, gains.mass, gains.inertia, gains.offset
@@ -45,7 +50,7 @@ def diff_drive_drive(gains, state, qpos, qvel, force, h, ctrl_out):
         state.saturated += 0.5 if ctrl_out[k] != wish else 0.0
 
 
-@laws.reading(gains=GAINS, state=STATE)
+@laws.reading(gains=_GAINS, state=_STATE)
 def diff_drive_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
     """p, v of the point ahead; force = m p'' for the torques given, at the motion that the drive saw."""
     r, b, ahead, mass, turn, offset = gains.wheel, gains.half_track, gains.ahead, gains.mass, gains.inertia, gains.offset
@@ -63,7 +68,7 @@ def diff_drive_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, f
 def diff_drive() -> Robot:
     """Inertias are read from the MJCF; spinning wheels add 2 I / r^2 to the mass and 2 I (b / r)^2 to the turning inertia."""
     own = inertia(mujoco.MjSpec.from_file(str(_MJCF)))
-    mass, turn = own.mass + 2.0 * own.wheel / WHEEL**2, own.turn + 2.0 * own.wheel * (TRACK / WHEEL) ** 2
+    mass, turn = own.mass + 2.0 * own.wheel / _WHEEL**2, own.turn + 2.0 * own.wheel * (TRACK / _WHEEL) ** 2
     return Robot(
         name="diff_drive",
         mjcf=_MJCF,
@@ -74,7 +79,7 @@ def diff_drive() -> Robot:
         drive=diff_drive_drive,
         reading=diff_drive_reading,
         params={
-            "wheel": WHEEL,
+            "wheel": _WHEEL,
             "half_track": TRACK,
             "ahead": AHEAD,
             "mass": mass,

@@ -10,7 +10,7 @@ from marlbc_mj.core import laws
 
 MOST_ROTORS = 32
 MOST_TILT = np.radians(32.0)  # that is asked for
-GAINS = {
+_GAINS = {
     "mass": (),  # [kg]
     "gravity": (),  # [m/s^2]
     "height": (),  # [m]
@@ -26,7 +26,7 @@ GAINS = {
     "most": MOST_ROTORS,
     "lift": MOST_ROTORS,  # thrust of each rotor per force of its actuator
 }
-STATE = {
+_STATE = {
     "axis": 3,  # b, the body's z axis in the world
     "thrust": (),  # [N]
     "saturated": (),  # substeps in which a rotor was at its limit
@@ -36,7 +36,7 @@ STATE = {
 REPORT = ("saturated", "height_error", "tilt")
 
 
-@laws.drive(gains=GAINS, state=STATE)
+@laws.drive(gains=_GAINS, state=_STATE)
 def rotor_drive(gains, state, qpos, qvel, force, h, ctrl_out):
     """Tilt and thrust that give the planar force and hold the height, then the rotors' shares of thrust and moments."""
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
@@ -77,7 +77,7 @@ def allot(gains, thrust, roll, pitch, yaw, qvel, ctrl_out):
     return saturated
 
 
-@laws.reading(gains=GAINS, state=STATE)
+@laws.reading(gains=_GAINS, state=_STATE)
 def rotor_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
     """p, v of the body; the planar part of the rotors' thrust along the axis that the drive saw."""
     thrust = 0.0

@@ -8,16 +8,16 @@ from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.wheels import heading, inertia
 
 OMNI = "5.5 kg base on three omnidirectional wheels with motors, heading held"
-WHEEL, ARM = 0.04, 0.16  # radius of a wheel, its distance from the middle [m]
+_WHEEL, ARM = 0.04, 0.16  # radius of a wheel, its distance from the middle [m]
 STIFFNESS, DAMPING = 60.0, 15.0  # of the heading [1/s^2, 1/s]
 _MJCF = MODELS / "robots" / "omni.xml"
 
 
-GAINS = ("wheel", "arm", "inertia", "torque_limit", "stiffness", "damping")  # [m, m, kg m^2, N m, 1/s^2, 1/s]
-STATE = ("heading", "saturated")  # [rad], substeps in which a torque was at its limit
+_GAINS = ("wheel", "arm", "inertia", "torque_limit", "stiffness", "damping")  # [m, m, kg m^2, N m, 1/s^2, 1/s]
+_STATE = ("heading", "saturated")  # [rad], substeps in which a torque was at its limit
 
 
-@laws.drive(gains=GAINS, state=STATE)
+@laws.drive(gains=_GAINS, state=_STATE)
 def omni_drive(gains, state, qpos, qvel, force, h, ctrl_out):
     """tau_k = r (2/3 t_k . F + M / (3 R)), t_k the direction that wheel k drives in; M turns the heading back to zero."""
     state.heading = heading(qpos[3:7])
@@ -32,7 +32,7 @@ def omni_drive(gains, state, qpos, qvel, force, h, ctrl_out):
     state.saturated += saturated
 
 
-@laws.reading(gains=GAINS, state=STATE)
+@laws.reading(gains=_GAINS, state=_STATE)
 def omni_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
     """p, v of the middle; F = sum of t_k tau_k / r with the heading that the drive saw."""
     for axis in range(2):
@@ -48,8 +48,8 @@ def omni_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_o
 def omni() -> Robot:
     """Inertias are read from the MJCF; a planar force also spins the wheels, which adds 3/2 I / r^2 to the mass."""
     own = inertia(mujoco.MjSpec.from_file(str(_MJCF)))
-    turn = own.turn + 3.0 * own.wheel * (ARM / WHEEL) ** 2
-    gains = {"wheel": WHEEL, "arm": ARM, "inertia": turn, "torque_limit": 1.2, "stiffness": STIFFNESS, "damping": DAMPING}
+    turn = own.turn + 3.0 * own.wheel * (ARM / _WHEEL) ** 2
+    gains = {"wheel": _WHEEL, "arm": ARM, "inertia": turn, "torque_limit": 1.2, "stiffness": STIFFNESS, "damping": DAMPING}
     return Robot(
         name="omni",
         mjcf=_MJCF,
@@ -61,7 +61,7 @@ def omni() -> Robot:
         reading=omni_reading,
         params=gains,
         report=("heading", "saturated"),
-        mass=own.mass + 1.5 * own.wheel / WHEEL**2,
+        mass=own.mass + 1.5 * own.wheel / _WHEEL**2,
         force_limit=12.0,
         speed_limit=1.5,
         acceleration_limit=1.5,

@@ -19,7 +19,7 @@ class Attitude(NamedTuple):
     thrust_lag: float  # [s]
 
 
-class Numbers(NamedTuple):
+class RotorNumbers(NamedTuple):
     """What the two laws need to know of a robot, and its mass."""
 
     params: dict[str, Any]
@@ -27,7 +27,7 @@ class Numbers(NamedTuple):
     mass: float  # [kg]
 
 
-def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> Numbers:
+def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNumbers:
     """Gains and state of the two laws for a robot at rest, and its mass.
 
     Raises:
@@ -47,7 +47,7 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> Numbers
         **attitude._asdict(),
         **_rotors(model, data, spec.modelname),
     }
-    return Numbers(params, {"axis": (0.0, 0.0, 1.0), "thrust": mass * gravity}, mass)
+    return RotorNumbers(params, {"axis": (0.0, 0.0, 1.0), "thrust": mass * gravity}, mass)
 
 
 def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:

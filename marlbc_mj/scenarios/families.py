@@ -215,11 +215,19 @@ class Crossing(Family):
         lows, highs = self.slots.min(axis=0) - zone, self.slots.max(axis=0) + zone
         boxes = tuple((x + lows[0], x + highs[0], lows[1], highs[1]) for x in (0.0, self.length))
         return Traffic(
-            count=self.obstacles, swinging=self.swinging, radius=self.radius, speed=self.obstacle_speed, swing=self.swing,
-            x=(self.way[0] + self.radius[1], self.way[1] - self.radius[1]), y=0.5 * self.reach,
-            arrival=(0.0, 1.0 / self.speed), spread=0.1 * self.length / self.speed, end=self.length / self.speed,
-            keep_out=boxes, gap=self.gap,
-        )  # fmt: skip
+            count=self.obstacles,
+            swinging=self.swinging,
+            radius=self.radius,
+            speed=self.obstacle_speed,
+            swing=self.swing,
+            x=(self.way[0] + self.radius[1], self.way[1] - self.radius[1]),
+            y=0.5 * self.reach,
+            arrival=(0.0, 1.0 / self.speed),
+            spread=0.1 * self.length / self.speed,
+            end=self.length / self.speed,
+            keep_out=boxes,
+            gap=self.gap,
+        )
 
     def schedule(self) -> tuple[Window, ...]:
         return ()

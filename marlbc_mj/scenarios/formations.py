@@ -6,7 +6,7 @@ import numpy as np
 
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
-LEAST, MOST = 2, 256  # agents
+_LEAST, _MOST = 2, 256  # agents
 
 
 def line(agents: int, spacing: float) -> np.ndarray:
@@ -53,8 +53,8 @@ def make_formation(name: str, agents: int, spacing: float) -> np.ndarray:
     """
     if name not in FORMATIONS:
         raise unknown("formation", name, FORMATIONS)
-    if not LEAST <= agents <= MOST:
-        raise ConfigurationError(f"agents must be from {LEAST} to {MOST}, got {agents}")
+    if not _LEAST <= agents <= _MOST:
+        raise ConfigurationError(f"agents must be from {_LEAST} to {_MOST}, got {agents}")
     if not (np.isfinite(spacing) and spacing > 0):
         raise ConfigurationError(f"spacing must be positive and finite, got {spacing}")
     return FORMATIONS[name][0](agents, spacing)

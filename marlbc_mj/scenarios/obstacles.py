@@ -14,7 +14,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 TRIES = 400  # places tried for one obstacle
 RESTARTS = 20  # layouts begun before a family says that it found none
-FULL = 0.55  # share of an area that discs thrown at random can cover; beyond it there is no use in trying
+_FULL = 0.55  # share of an area that discs thrown at random can cover; beyond it there is no use in trying
 
 Range = tuple[float, float]
 
@@ -33,7 +33,7 @@ class Scatter:
         """Discs thrown one after the other, where they have room."""
         mean = 0.5 * sum(self.radius) + 0.5 * self.gap
         area = (self.x[1] - self.x[0] + 2.0 * mean) * (self.y[1] - self.y[0] + 2.0 * mean)
-        if self.count * np.pi * mean**2 > FULL * area:
+        if self.count * np.pi * mean**2 > _FULL * area:
             raise ConfigurationError(self._reason("the discs and their gaps alone would cover it"))
         most = 0
         for _ in range(RESTARTS):

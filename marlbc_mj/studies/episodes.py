@@ -145,8 +145,7 @@ def open_log(flight: Flight, folder: Path, *, overwrite: bool = False) -> LogWri
         folder / "logs" / f"{job.key}.mcap",
         job.scenario,
         flight.law,
-        supervisor=job.supervisor,
-        controller_name=job.controller,
+        names=(job.supervisor, job.controller),
         seed=job.seed,
         config={
             "scenario": job.scenario,

@@ -12,7 +12,7 @@ from marlbc_mj.controllers import PD, SORLC, Controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, Trajectory, run_episode
 from marlbc_mj.recording.log import from_trajectory
-from marlbc_mj.recording.video import render_still, render_video
+from marlbc_mj.recording.video import VideoStyle, render_still, render_video
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
@@ -209,11 +209,13 @@ def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str
     render_video(
         log,
         folder / f"{name}.mp4",
-        camera="close",
-        start=start,
-        end=end,
-        speed=float(max(1, round((end - start) / 10.0))),
-        width=960,
-        height=540,
-        samples=4,
+        VideoStyle(
+            speed=float(max(1, round((end - start) / 10.0))),
+            width=960,
+            height=540,
+            camera="close",
+            start=start,
+            end=end,
+            samples=4,
+        ),
     )

@@ -154,9 +154,15 @@ def _judge_parallel(kinematic, behaviors, problem, teams, pairs, scratch, trails
 
 
 def judge_pairs(
-    scenario: Scenario, behaviors: Behaviors, weights: CostWeights, teams: Teams, pairs: Pairs, *,
-    threads: int = 1, trails: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    scenario: Scenario,
+    behaviors: Behaviors,
+    weights: CostWeights,
+    teams: Teams,
+    pairs: Pairs,
+    *,
+    threads: int = 1,
+    trails: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
     """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
     ``trails`` given are judged as they are, else the kinematic reference is predicted.
