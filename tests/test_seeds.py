@@ -255,6 +255,6 @@ def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, f
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), workers=0), "workers must be at least 1, got 0"),
     ],
 )
-def test_bad_input_is_one_line(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_line(call, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         call()

@@ -146,6 +146,6 @@ def test_wilson_bounds_solve_its_quadratic() -> None:
         (lambda: wilson(4, 3), "got 4 of 3"),
     ],
 )
-def test_bad_input_is_one_line(call, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_one_line(call, message: str) -> None:
     with pytest.raises(ConfigurationError, match=message):
         call()

@@ -43,7 +43,7 @@ class Temperatures:
 
 
 @compiled
-def _cool(table, nu, codes, actions, world, first, last):  # type: ignore[no-untyped-def]
+def _cool(table, nu, codes, actions, world, first, last):
     rows = codes.shape[0]
     factor = RHO
     for k in range(last, first - 1, -1):

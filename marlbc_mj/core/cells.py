@@ -19,13 +19,13 @@ at 65 000."""
 
 
 @allocation_free
-def room(points):  # type: ignore[no-untyped-def]
+def room(points):
     """Length of the array for a grid of that many points."""
     return HEADER + 4 * points + 8
 
 
 @allocation_free
-def fill(points, grid):  # type: ignore[no-untyped-def]
+def fill(points, grid):
     """Sort ``points`` (n, 2 or more; a third column is a radius) into ``grid`` (room(n),), in place; O(n)."""
     n = points.shape[0]
     grid[_COLUMNS] = 0.0
@@ -59,7 +59,7 @@ def fill(points, grid):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def nearest(p, points, grid, own):  # type: ignore[no-untyped-def]
+def nearest(p, points, grid, own):
     """Index k of the least |p - points_k| - radius_k, the first of equals; -1 where there is none.
 
     Args:
@@ -97,7 +97,7 @@ def nearest(p, points, grid, own):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def _of_all(p, points, own):  # type: ignore[no-untyped-def]
+def _of_all(p, points, own):
     """What :func:`nearest` says, from its definition."""
     best, found = np.inf, -1
     for k in range(points.shape[0]):
@@ -108,14 +108,14 @@ def _of_all(p, points, own):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def _gap(p, points, k):  # type: ignore[no-untyped-def]
+def _gap(p, points, k):
     x, y = p[0] - points[k, 0], p[1] - points[k, 1]
     distance = np.sqrt(x * x + y * y)
     return distance - points[k, 2] if points.shape[1] > 2 else distance
 
 
 @compiled
-def _fill_spacing(positions, grid, out):  # type: ignore[no-untyped-def]
+def _fill_spacing(positions, grid, out):
     for m in range(positions.shape[0]):
         team = positions[m]
         if grid.shape[0] > 0:

@@ -14,7 +14,7 @@ MOVING = 5
 
 
 @allocation_free
-def move(t, anchors, motions, out):  # type: ignore[no-untyped-def]
+def move(t, anchors, motions, out):
     """o(t) = anchor + v t + a sin(w t + phase), and its velocity.
 
     Args:
@@ -33,7 +33,7 @@ def move(t, anchors, motions, out):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def drift(t, obstacles, out):  # type: ignore[no-untyped-def]
+def drift(t, obstacles, out):
     """Where obstacles (K, 5) are after ``t`` [s] if each keeps the velocity it has, (K, 5) in ``out``: a tracker's prediction."""
     for k in range(obstacles.shape[0]):
         for axis in range(2):
@@ -43,7 +43,7 @@ def drift(t, obstacles, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fill_moved(times, anchors, motions, out):  # type: ignore[no-untyped-def]
+def _fill_moved(times, anchors, motions, out):
     for m in range(times.shape[0]):
         move(times[m], anchors, motions, out[m])
 

@@ -9,7 +9,7 @@ RANK_TOLERANCE = 1e-9
 
 
 @allocation_free
-def compose(order, velocities, jacobians, rows, basis, out):  # type: ignore[no-untyped-def]
+def compose(order, velocities, jacobians, rows, basis, out):
     """Composite velocity v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12).
 
     A stacks the Jacobians of all behaviors of higher priority. A^+ A is the orthogonal projector onto the row space of A,
@@ -31,7 +31,7 @@ def compose(order, velocities, jacobians, rows, basis, out):  # type: ignore[no-
 
 
 @allocation_free
-def add_behavior(velocity, jacobian, rows, basis, rank, out):  # type: ignore[no-untyped-def]
+def add_behavior(velocity, jacobian, rows, basis, rank, out):
     """One term of (12): add the part of ``velocity`` that those above leave free, and shut the directions of ``jacobian``.
 
     The first ``rank`` rows of ``basis`` span the Jacobians above; returns the new rank. At full rank nothing is left to add.
@@ -55,7 +55,7 @@ def add_behavior(velocity, jacobian, rows, basis, rank, out):  # type: ignore[no
 
 
 @allocation_free
-def _project(vector, basis, rank):  # type: ignore[no-untyped-def]
+def _project(vector, basis, rank):
     """Put the part of ``vector`` (n,) outside the span of the first ``rank`` rows of ``basis`` into row ``rank``; its length.
 
     The projection is done twice, which brings it to machine precision.
@@ -74,7 +74,7 @@ def _project(vector, basis, rank):  # type: ignore[no-untyped-def]
 
 
 @allocation_free
-def _length(vector):  # type: ignore[no-untyped-def]
+def _length(vector):
     square = 0.0
     for axis in range(vector.shape[0]):
         square += vector[axis] * vector[axis]

@@ -78,7 +78,7 @@ def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: floa
 
 
 @compiled
-def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
+def best_actions(values, last, fresh, margin):
     """:func:`greedy` for values (B, N, A)."""
     best = np.empty(last.shape, dtype=np.int64)
     for b in range(last.shape[0]):
@@ -92,7 +92,7 @@ def best_actions(values, last, fresh, margin):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def action_values(state, scale, weights, biases, dueling, actions, limit):  # type: ignore[no-untyped-def]
+def action_values(state, scale, weights, biases, dueling, actions, limit):
     """(B, N, A) values of ``Policy``'s networks for states (B, S), all float32; ``limit`` is the largest admissible risk, or 0.
 
     For one team, loops take less time than a BLAS call a layer and a NumPy call an operation.
@@ -129,7 +129,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):  # ty
 
 
 @compiled
-def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
+def dense(x, weight, bias, out):
     """``x @ weight + bias`` into ``out``, summed in the order of the inputs, those that are 0 left out."""
     out[:] = bias
     for j in range(len(x)):
@@ -140,7 +140,7 @@ def dense(x, weight, bias, out):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def rectify(x):  # type: ignore[no-untyped-def]
+def rectify(x):
     """The larger of ``x`` and 0, in place; NaN passes through."""
     for j in range(len(x)):
         if x[j] < 0.0:

@@ -89,7 +89,7 @@ class ExtendedState:
 
 
 @laws.compiled
-def nearest_surface(point, obstacles, out):  # type: ignore[no-untyped-def]
+def nearest_surface(point, obstacles, out):
     """Write into ``out`` (3,) [m]: offset of the nearest obstacle's surface along x and y, and the clearance, at most ``RANGE``,
     seen from ``point`` (2,) among ``obstacles`` (K, 3). Without obstacles the offset is zero.
     """
@@ -98,7 +98,7 @@ def nearest_surface(point, obstacles, out):  # type: ignore[no-untyped-def]
 
 
 @laws.compiled
-def _fill(position, velocity, command, formation, obstacles, age, slots, path, safe, out):  # type: ignore[no-untyped-def]
+def _fill(position, velocity, command, formation, obstacles, age, slots, path, safe, out):
     """The extended state of every world into ``out`` (B, S), which is 0."""
     agents = position.shape[1]
     width = (out.shape[1] - TEAM_ENTRIES) // agents

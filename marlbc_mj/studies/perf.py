@@ -34,7 +34,7 @@ class _PlainSORLC(SORLC):
 
 
 @compiled
-def _bare_serial(step, model, data, substeps):  # type: ignore[no-untyped-def]
+def _bare_serial(step, model, data, substeps):
     """A mission step of bare physics: every world its substeps, one world after the other, as the closed loop does."""
     for b in range(data.shape[0]):
         for _ in range(substeps):
@@ -42,7 +42,7 @@ def _bare_serial(step, model, data, substeps):  # type: ignore[no-untyped-def]
 
 
 @threaded
-def _bare_parallel(step, model, data, substeps):  # type: ignore[no-untyped-def]
+def _bare_parallel(step, model, data, substeps):
     for b in numba.prange(data.shape[0]):
         for _ in range(substeps):
             call_step(step, model, data[b])
