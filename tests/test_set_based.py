@@ -271,7 +271,7 @@ def test_all_views_of_a_world_compose_alike():
     compiled.reset(0), python.reset(0), environment.reset()
     for row in orders:
         one, other, timestep = compiled.step(row[None]), python.step(row[None]), environment.step(row)
-        assert one.observation.reference_velocity.tobytes() == other.observation.reference_velocity.tobytes()
+        assert one.observation.reference.tobytes() == other.observation.reference.tobytes()
         qpos = environment.physics.data.qpos[compiled.plan.plant.qpos_index]
         np.testing.assert_array_equal(qpos, one.observation.position[0])
         np.testing.assert_array_equal(other.observation.position, one.observation.position)

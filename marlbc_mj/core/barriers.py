@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.laws import allocation_free
 
 
 class Barrier(NamedTuple):
@@ -81,7 +81,7 @@ def bound_neighbors(team, i, distance, level, barrier, planes, count):
     return count
 
 
-@inlined
+@allocation_free
 def _normal(x, y, length, otherwise, plane):
     """Unit vector along (x, y) into the first two of ``plane``; (``otherwise``, 0) where that has no direction."""
     plane[0] = x / length if length > 0.0 else otherwise

@@ -11,7 +11,7 @@ line, so at the end of the way and before it is at least d + n . v |v| / (2 A).
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.laws import allocation_free
 
 BISECTIONS = 8
 """Halvings of the change of velocity, where all of it cannot be had."""
@@ -84,7 +84,7 @@ def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
     return True
 
 
-@inlined
+@allocation_free
 def stopping_time(x, y, barrier):
     """L(s) / s [s], where L(s) = (s + A T / 2)^2 / (2 A) is the length of the way from a velocity (x, y) of speed s.
 
@@ -95,7 +95,7 @@ def stopping_time(x, y, barrier):
     return (speed + half) ** 2 / (2.0 * barrier.braking * speed) if speed > 0.0 else 0.0
 
 
-@inlined
+@allocation_free
 def brake(x, y, barrier):
     """The velocity (x, y) [m/s] one mission step later if it brakes straight."""
     speed, loss = np.sqrt(x * x + y * y), barrier.braking * barrier.duration
@@ -116,7 +116,7 @@ def least_distance(x, y, a, b, c, d):
     return min(along_first, _from_origin(x, y, -c, -d), _from_origin(x + a, y + b, -c, -d))
 
 
-@inlined
+@allocation_free
 def _from_origin(x, y, a, b):
     """Distance of the segment from (x, y) to (x + a, y + b) from the origin."""
     square = a * a + b * b

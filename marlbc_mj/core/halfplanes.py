@@ -12,7 +12,7 @@ A half-plane is a row of four: n_x, n_y (a unit normal), b [m/s], level. Rows ar
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.laws import allocation_free
 
 PARALLEL = 1e-12  # sine below which two borders are parallel
 ROUNDING = 1e-12  # violation that is none [m/s]
@@ -91,7 +91,7 @@ def _insert(goal, planes, stop, first, most, speed, v):
     return True
 
 
-@inlined
+@allocation_free
 def _border(planes, k, first, most):
     """Unit normal and bound of row ``k`` as :func:`_insert` takes it."""
     if most < 0 or k < first:
@@ -132,7 +132,7 @@ def _on_border(goal, planes, k, first, most, speed, v):
     return True
 
 
-@inlined
+@allocation_free
 def _shorten(vector, length, out):
     """``vector`` (2,), no longer than ``length``, into ``out`` (2,)."""
     size = np.sqrt(vector[0] ** 2 + vector[1] ** 2)
