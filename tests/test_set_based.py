@@ -335,6 +335,6 @@ def test_logs_and_provenance_name_the_composition(tmp_path):
     path = tmp_path / "run.mcap"
     config = {"scenario": scenario}
     with LogWriter(path, scenario, SORLC(), names=("scripted", "sorlc"), seed=0, config=config) as log:
-        run_episode(World(scenario), FM_ALONE, on_frame=log.write)
+        run_episode(World(scenario, record=True), FM_ALONE, on_frame=log.write)
     assert log_info(path)["metadata"][METADATA]["composition"] == "set-based"
     assert plain_data(config)["scenario"]["composition"] == "set-based"
