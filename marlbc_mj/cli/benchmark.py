@@ -23,6 +23,8 @@ class ScenarioOptions:
     """Physics and control step [s]; must divide the mission step of 0.05 s."""
     reference: str | None = None
     """Where behaviors are evaluated: virtual (at the reference) or actual (at the measured position)."""
+    composition: str | None = None
+    """How an order becomes a reference: null-space (avoidance as an equality task) or set-based (as an inequality)."""
     two_sided: bool = False
     """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
     disturbance: str | None = None
@@ -41,7 +43,7 @@ class ScenarioOptions:
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
 
-        keys = ("substep", "reference", "force_limit", "duration", "split")
+        keys = ("substep", "reference", "composition", "force_limit", "duration", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
         if self.two_sided:
             changes["two_sided"] = True

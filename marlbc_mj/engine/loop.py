@@ -103,7 +103,7 @@ class Team(NamedTuple):
     status: np.ndarray  # (B,) int64, 0, or 1 + agent + N * substep that diverged in the last mission step
     drag: np.ndarray  # (B, N, 2) of the last substep [N]; before the first one, v_r of the last mission step
     force: np.ndarray  # (B, N, 2) of the last substep: the law's, then what the actuators gave [N]
-    workspace: np.ndarray  # (B, WORKSPACE, 2) scratch
+    workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.plan.workspace_rows
     grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 where none pays
 
 

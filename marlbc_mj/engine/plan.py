@@ -10,10 +10,11 @@ import numpy as np
 
 from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.core import laws
-from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
+from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.composition import Behaviors
+from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
 from marlbc_mj.engine.loop import MissionRules, Native, Plant
 from marlbc_mj.engine.native import step_address
 from marlbc_mj.robots import Robot, make_robot
@@ -44,6 +45,11 @@ class Plan:
     def grid_room(self) -> int:
         """Length of a world's array for grids of obstacles and team; 0 for a team so small that trying all pairs costs less."""
         return grid_room(self.scenario)
+
+    @property
+    def workspace_rows(self) -> int:
+        """Rows of two of a world's scratch, see :func:`workspace_rows`."""
+        return workspace_rows(self.scenario)
 
     @property
     def native(self) -> bool:
@@ -130,16 +136,20 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         ConfigurationError: a law that is not compiled, or not a behavior's.
     """
     addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
+    set_based = scenario.composition == "set-based"
     return Behaviors(
         laws=addresses,
         params=params,
         sees=sees_array(scenario.behaviors),
-        table=scenario.orders.table,
+        table=inequalities_first(scenario) if set_based else scenario.orders.table,
         command_of=scenario.orders.command_of,
         path=np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64),
         virtual=scenario.reference == "virtual",
         speed_limit=float(scenario.speed_limit),
         acceleration_limit=float(scenario.acceleration_limit),
+        set_based=set_based,
+        keeps=keeps_array(scenario.behaviors),
+        barrier=make_barrier(scenario),
     )
 
 
@@ -220,11 +230,6 @@ def grid_room(scenario: Scenario) -> int:
     agents, obstacles = scenario.agents, len(scenario.obstacles)
     neighbors = agents if NEAREST_NEIGHBOR in sees_array(scenario.behaviors) else 0
     return int(room(obstacles) + room(agents)) if agents * max(obstacles, neighbors) > WORTH else 0
-
-
-def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
-    """(M,) what each behavior's law looks at; everything, where it does not say."""
-    return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)
 
 
 def _padded(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:

@@ -11,7 +11,6 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.imperfections import sense
 from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.composition import WORKSPACE
 from marlbc_mj.engine.loop import Record, Team, judge
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
@@ -49,7 +48,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         status=np.zeros(worlds, dtype=np.int64),
         drag=np.zeros(pairs),
         force=np.zeros(pairs),
-        workspace=np.zeros((worlds, WORKSPACE, 2)),
+        workspace=np.zeros((worlds, plan.workspace_rows, 2)),
         grid=np.zeros((worlds, plan.grid_room)),
     )
 

@@ -235,6 +235,7 @@ def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[st
     """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
+        "composition": scenario.composition,
         "mission_step": repr(float(scenario.mission_step)),
         "safe_distance": repr(float(scenario.safe_distance)),
         "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",

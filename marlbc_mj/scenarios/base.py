@@ -19,6 +19,8 @@ Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
 MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
+COMPOSITIONS = ("null-space", "set-based")
+"""Avoidance as an equality task (12), or as an inequality."""
 YOUNG = {"young": True}
 """Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
 
@@ -103,6 +105,8 @@ class Scenario:
     motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one an obstacle, or none: all at rest
     layout: Layout | None = field(default=None, metadata=YOUNG)  # draws obstacles and motions anew for every seed
     split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # whose layouts are drawn
+    # how an order becomes a reference: avoidance as an equality task (12), or as an inequality
+    composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
@@ -208,6 +212,8 @@ class Scenario:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive, got {getattr(self, name)}")
         if self.reference not in REFERENCE_MODES:
             raise unknown("reference mode", self.reference, REFERENCE_MODES)
+        if self.composition not in COMPOSITIONS:
+            raise unknown("composition", self.composition, COMPOSITIONS)
         if self.split not in SPLITS:
             raise unknown("split", self.split, SPLITS)
         arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}
@@ -233,6 +239,10 @@ class Scenario:
             offsets = getattr(behavior, "offsets", None)
             if offsets is not None:
                 self._check_slots(behavior.name, offsets)
+            if self.composition == "set-based" and getattr(behavior, "two_sided", False):
+                raise ConfigurationError(
+                    f"scenario {self.name!r}: a two-sided {behavior.name} is an equality task, but composition is set-based"
+                )
         check_motions(self.motions, len(self.obstacles))
         first = obstacles_at(0.0, self.obstacle_array(), motion_array(self.motions))
         starts = np.array(self.starts, dtype=np.float64)

@@ -8,7 +8,7 @@ the velocity may change, even jump, without one, and no label says that its comp
 Their sources describe other robots and other behaviors. What is read into them here is said at each class.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,7 +46,9 @@ def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) 
     """
     orders = np.array([scenario.orders.index(_LABELS[name]) for name in names])
     place = [b.name for b in scenario.behaviors]
-    alone = make_behaviors(scenario)._replace(table=np.array([[place.index(name)] for name in names]))
+    alone = make_behaviors(replace(scenario, composition="null-space"))._replace(
+        table=np.array([[place.index(name)] for name in names])
+    )
     return Repertoire(alone, orders, scenario.safe_distance, give_way(scenario), np.zeros(grid_room(scenario)))
 
 

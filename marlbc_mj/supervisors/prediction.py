@@ -13,14 +13,11 @@ import numpy as np
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
-from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.composition import Behaviors, compose_team, keep, limit, path_at
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.plan import grid_room
+from marlbc_mj.engine.plan import grid_room, workspace_rows
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-
-PAIR_ROOM = WORKSPACE + 1
-"""Rows of two that one pair needs: those of a composition, and a normal."""
 
 
 class CostWeights(NamedTuple):
@@ -65,7 +62,7 @@ class Pairs(NamedTuple):
 class Scratch(NamedTuple):
     """What a pair needs room for."""
 
-    rows: np.ndarray  # (C, PAIR_ROOM, 2)
+    rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.plan.workspace_rows
     velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
     obstacles: np.ndarray  # (C, K, 3 or 5)
     grid: np.ndarray  # (C, room)
@@ -91,7 +88,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
         keep(behaviors, v_r, before_v)
         seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
         t = (teams.first[b] + k) * duration
-        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c, :WORKSPACE], v_r)
+        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c], v_r)
         limit(behaviors, duration, before_v, v_r)
         for i in range(before.shape[0]):
             for axis in range(2):
@@ -116,7 +113,7 @@ def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
     Slots are those of the desired centroid.
     """
     b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
-    now, normal = scratch.rows[c, :2], scratch.rows[c, WORKSPACE]
+    now, normal = scratch.rows[c, :2], scratch.rows[c, 2]
     cost = 0.0
     for k in range(trail.shape[0]):
         path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
@@ -172,7 +169,7 @@ def judge_pairs(
         trails = np.empty((count, *pairs.orders.shape[1:], 2))
     costs = np.empty(count)
     scratch = Scratch(
-        np.zeros((count, PAIR_ROOM, 2)),
+        np.zeros((count, workspace_rows(scenario), 2)),
         np.zeros((count, 2, scenario.agents, 2)),
         np.zeros((count, *teams.obstacles.shape[1:])),
         np.zeros((count, grid_room(scenario))),
