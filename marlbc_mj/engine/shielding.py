@@ -72,9 +72,9 @@ def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
     blurred = (errors.position_noise > 0 or errors.delay > 0) and shield.position_error == 0
     if blurred or ((errors.velocity_noise > 0 or errors.delay > 0) and shield.velocity_error == 0):
         raise ConfigurationError(
-            f"shield: sensors have noise of {errors.position_noise:g} m and {errors.velocity_noise:g} m/s and are {errors.delay:g} s "
-            f"late; position_error and velocity_error must bound what that makes, got {shield.position_error:g} m and "
-            f"{shield.velocity_error:g} m/s"
+            f"shield: sensors have noise of {errors.position_noise:g} m and {errors.velocity_noise:g} m/s and are "
+            f"{errors.delay:g} s late; position_error and velocity_error must bound what that makes, got "
+            f"{shield.position_error:g} m and {shield.velocity_error:g} m/s"
         )
 
 
