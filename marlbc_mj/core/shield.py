@@ -137,6 +137,13 @@ def stopping_distance(numbers, speed):
 
 
 @allocation_free
+def drift(numbers, h, speed):
+    """What a retreat at ``speed`` [m/s] may cost of the gap to other things in one substep [m]: 2 h^2 B / m + L(2 h B / m)."""
+    fastest = 2.0 * h * force_bound(numbers, speed) / numbers.mass
+    return h * fastest + stopping_distance(numbers, fastest)
+
+
+@allocation_free
 def speed_of(numbers, view, i):
     """Greatest speed that agent ``i`` may have [m/s]."""
     x, y = view.v[i, 0], view.v[i, 1]
@@ -231,42 +238,56 @@ def within(x, y, centre_x, centre_y, radius):
 
 
 @allocation_free
+def most_violated(numbers, view, i, a, need, x, y):
+    """(thing, excess): the disc that w = (x, y) is farthest out of [m/s]; -1 where it is in all of them."""
+    worst, found = 0.0, -1
+    for k in range(view.obstacles.shape[0] + view.p.shape[0]):
+        if k != view.obstacles.shape[0] + i and near(numbers, view, i, k, need):
+            over = excess(numbers, view, i, k, a, x, y)
+            if over > worst:
+                worst, found = over, k
+    return found, worst
+
+
+@allocation_free
 def nearest_safe(numbers, view, i, x, y):
-    """The wish (x, y) [m/s] projected on the disc that it is farthest out of, time and again; one thing needs one round."""
+    """The wish (x, y) [m/s] projected on the disc that it is farthest out of, time and again; one thing needs one round.
+
+    The result is within what the actuators reach; whether it is safe is for :func:`stays_safe` to say.
+    """
     authority = view.h * numbers.force_limit / numbers.mass
-    now = speed_of(numbers, view, i)
-    x, y = within(x, y, view.v[i, 0], view.v[i, 1], authority)
-    spread = spread_of(numbers, view, i)
-    speed = min(numbers.speed_cap, now + authority)
-    x, y = within(x, y, 0.0, 0.0, max(speed - spread - TINY, 0.0))
+    speed = min(numbers.speed_cap, speed_of(numbers, view, i) + authority)
     a = braking(numbers, speed)
-    if not a > 0.0:
-        return x, y
-    need = speed * (0.5 * speed / a + view.h)
+    need = speed * (0.5 * speed / a + view.h) if a > 0.0 else 0.0
+    fastest = max(speed - spread_of(numbers, view, i) - TINY, 0.0)
+    x, y = within(x, y, view.v[i, 0], view.v[i, 1], authority)
     for _ in range(ROUNDS):
-        worst, found = 0.0, -1
-        for k in range(view.obstacles.shape[0] + view.p.shape[0]):
-            if k != view.obstacles.shape[0] + i and near(numbers, view, i, k, need):
-                over = excess(numbers, view, i, k, a, x, y)
-                if over > worst:
-                    worst, found = over, k
-        if found < 0:
+        k, over = -1, 0.0
+        if a > 0.0:
+            k, over = most_violated(numbers, view, i, a, need, x, y)
+        if k < 0 and x * x + y * y <= fastest * fastest:
             break
-        _, normal_x, normal_y = gap_to(numbers, view, i, found)
-        centre_x, centre_y = a * view.h * normal_x, a * view.h * normal_y
-        radius = np.sqrt((x - centre_x) ** 2 + (y - centre_y) ** 2) - worst
-        x, y = within(x, y, centre_x, centre_y, max(radius - TINY, 0.0))
+        x, y = within(x, y, 0.0, 0.0, fastest)
+        if k >= 0:
+            _, normal_x, normal_y = gap_to(numbers, view, i, k)
+            centre_x, centre_y = a * view.h * normal_x, a * view.h * normal_y
+            radius = np.sqrt((x - centre_x) ** 2 + (y - centre_y) ** 2) - over
+            x, y = within(x, y, centre_x, centre_y, max(radius - TINY, 0.0))
         x, y = within(x, y, view.v[i, 0], view.v[i, 1], authority)
     return x, y
 
 
 @allocation_free
 def last_resort(numbers, view, i, k):
-    """Braking with all there is, down to rest; from a slow motion, a retreat from thing ``k``, as far as f may push meanwhile."""
-    x, y = view.v[i, 0], view.v[i, 1]
+    """Braking with all there is, down to rest; of an agent that is slow already, what is nearest to rest and safe, and where
+    nothing is, a retreat from thing ``k``, as far as f may push meanwhile.
+    """
     authority = view.h * numbers.force_limit / numbers.mass
-    x, y = within(0.0, 0.0, x, y, authority)
+    x, y = within(0.0, 0.0, view.v[i, 0], view.v[i, 1], authority)
     if k < 0 or x != 0.0 or y != 0.0 or stays_safe(numbers, view, i, 0.0, 0.0):
+        return x, y
+    x, y = nearest_safe(numbers, view, i, 0.0, 0.0)
+    if stays_safe(numbers, view, i, x, y):
         return x, y
     _, normal_x, normal_y = gap_to(numbers, view, i, k)
     retreat = spread_of(numbers, view, i)

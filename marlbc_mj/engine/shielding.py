@@ -2,16 +2,16 @@
 
 import numpy as np
 
-from marlbc_mj.core.shield import ForceBound, Shield, ShieldNumbers, stopping_distance
+from marlbc_mj.core.shield import ForceBound, Shield, ShieldNumbers, drift, stopping_distance
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 
 GREATEST_SHARE = 0.25
 """Of the force limit, that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating keep S."""
-CREEP = 4.0
-"""Substeps of drift h^2 B(0) / m that the margin leaves to agents that several things press at once."""
-LEAST_CREEP = 1e-5  # the same where f vanishes at rest [m]
+CREEP = 2.0
+"""Retreats at rest, each with its :func:`drift`, that the margin has room for where several things press at once."""
+LEAST_CREEP = 1e-5  # more, for the drift of a slow motion that ends [m]
 
 
 def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
@@ -40,7 +40,6 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
             f"shield: at the speed cap of {cap:g} m/s the disturbance may be {bound.at(cap):.3g} N, so a force limit of "
             f"{force:g} N leaves nothing to brake with; lower speed_cap"
         )
-    creep = LEAST_CREEP + CREEP * scenario.substep**2 * bound.constant / scenario.mass
     kept = scenario.safe_distance if shield.clearance is None else shield.clearance
     between = 2.0 * robot.radius if shield.agent_distance is None else shield.agent_distance
     numbers = ShieldNumbers(
@@ -49,9 +48,14 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
         mass=float(scenario.mass),
         **{name: float(value) for name, value in bound._asdict().items()},
         speed_cap=float(cap),
-        clearance=float(kept + shield.margin + creep + shield.position_error),
-        agent_distance=float(between + shield.margin + 2.0 * (creep + shield.position_error)),
+        clearance=float(kept),
+        agent_distance=float(between),
         velocity_error=float(shield.velocity_error),
+    )
+    creep = LEAST_CREEP + CREEP * drift(numbers, scenario.substep, 0.0)
+    numbers = numbers._replace(
+        clearance=numbers.clearance + shield.margin + creep + shield.position_error,
+        agent_distance=numbers.agent_distance + shield.margin + 2.0 * (creep + shield.position_error),
     )
     check_start(numbers, np.array(scenario.starts, dtype=np.float64), scenario.obstacle_array())
     return numbers

@@ -14,6 +14,7 @@ from marlbc_mj.core.shield import (
     ShieldCounts,
     ShieldNumbers,
     ShieldView,
+    drift,
     force_bound,
     gap_to,
     shield_team,
@@ -39,7 +40,7 @@ class Trial(NamedTuple):
         """The shield's: it keeps 0.5 m from obstacles and 1 m between agents."""
         believed = self.bound if self.believed is None else self.believed
         force = self.force_limit if self.believed_force is None else self.believed_force
-        return ShieldNumbers(force, np.inf, self.mass, *believed, self.speed_cap, 0.5, 1.0, 0.0)
+        return ShieldNumbers(force, force, self.mass, *believed, self.speed_cap, 0.5, 1.0, 0.0)
 
     def truth(self) -> ShieldNumbers:
         """The plant's."""
@@ -49,7 +50,7 @@ class Trial(NamedTuple):
 def leave_rate(trial: Trial, states: int, seed: int = 0) -> float:
     """Share of random states on the edge of S that one substep leads out of it.
 
-    With several things a drift of h^2 B(|v|) / m is let pass, which the margin of a shield leaves room for.
+    With several things the :func:`drift` of a retreat is let pass, which the margin of a shield leaves room for.
     """
     return float(_leave_rate(trial.numbers(), trial.truth(), trial.substep, trial.things, states, np.random.default_rng(seed)))
 
@@ -69,7 +70,7 @@ def _leave_rate(numbers, truth, h, things, states, rng):
         allowed = ROUNDING
         if things > 1:
             for i in range(agents):
-                allowed += h * h * force_bound(truth, np.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2)) / truth.mass
+                allowed += drift(truth, h, np.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2))
         for i in range(agents):
             _push(rng, numbers, truth, view, i, force[i])
         for i in range(agents):
@@ -127,10 +128,10 @@ def _draw_wish(rng, numbers, view, i, force):
 
 @compiled
 def _push(rng, numbers, truth, view, i, force):
-    """v+ of agent ``i``: the actuators give what they can, and f is at its bound, where it hurts most, or anywhere."""
-    size, per = np.sqrt(force[0] ** 2 + force[1] ** 2), view.h / truth.mass
-    if size > truth.force_limit:
-        force[0], force[1] = force[0] * (truth.force_limit / size), force[1] * (truth.force_limit / size)
+    """v+ of agent ``i``: actuators are as weak as they are, and f is at its bound, where it hurts most, or anywhere."""
+    per = view.h / truth.mass
+    for axis in range(2):
+        force[axis] *= truth.force_limit / numbers.force_limit
     speed = np.sqrt(view.v[i, 0] ** 2 + view.v[i, 1] ** 2)
     x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
     angle = 2.0 * np.pi * rng.random()
