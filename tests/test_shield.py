@@ -251,7 +251,7 @@ def test_a_snapshot_has_the_counts_too():
 def test_a_world_outside_the_assumptions_is_counted(changes, shield):
     """Apart, by the assumption that does not hold; inside them nothing is counted."""
     world = World(corridor(**changes), PD(), record=True, shield=shield)
-    harass(world, steps=60)
+    harass(world, steps=60, speed=4.0)
     assert ASSUMPTIONS[FORCE] == "force"
     assert world.state.breaches[..., FORCE].sum() > 10
     inside = World(corridor(), PD(), record=True, shield=True)
@@ -274,7 +274,7 @@ def test_assumptions_are_checked_when_a_world_is_made():
     assert "at most the actuators' 200 N, got 250 N" in refusal(case, Shield(force_limit=250.0))
     assert "agent 1 starts at a clearance of 1.500 m from obstacle 1" in refusal(paper(obstacles=(Obstacle(-0.5, 8.0),)))
     assert "agents 1 and 2 start 16.000 m apart" in refusal(case, Shield(agent_distance=20.0))
-    assert "force_error is missing" in refusal(make_scenario("case_study", robot="crazyflie"))
+    assert "force_error is missing" in refusal(make_scenario("robot_gate", robot="crazyflie"))
     assert "move" in refusal(make_scenario("traffic"))
     noisy = replace(case, imperfections=Imperfections(position_noise=0.01))
     assert "0.01 m" in refusal(noisy)

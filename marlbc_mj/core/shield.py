@@ -93,6 +93,7 @@ class ShieldNumbers(NamedTuple):
     clearance: float  # kept from obstacles, with margin and error [m]
     agent_distance: float  # D, with margin and errors [m]
     velocity_error: float  # [m/s]
+    slack: float = 0.0  # part of the margin that drifts may use up before the state counts as outside S [m]
 
 
 NO_SHIELD = ShieldNumbers(0.0, np.inf, 1.0, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)
@@ -137,7 +138,7 @@ def stopping_distance(numbers, speed):
 
 
 @allocation_free
-def drift(numbers, h, speed):
+def retreat_drift(numbers, h, speed):
     """What a retreat at ``speed`` [m/s] may cost of the gap to other things in one substep [m]: 2 h^2 B / m + L(2 h B / m)."""
     fastest = 2.0 * h * force_bound(numbers, speed) / numbers.mass
     return h * fastest + stopping_distance(numbers, fastest)
@@ -336,7 +337,7 @@ def shield_agent(numbers, view, i, force, counts):
     a = braking(numbers, worst)
     need = max(worst * (0.5 * worst / a + view.h) if a > 0.0 else FAR, view.stopping[i])
     k = most_pressing(numbers, view, i, need)
-    if k >= 0 and gap_to(numbers, view, i, k)[0] < -TINY:
+    if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
         counts.breaches[i, STATE] += 1.0
     if stays_safe(numbers, view, i, x, y):
         return

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from marlbc_mj.core.shield import ForceBound, Shield, ShieldNumbers, drift, stopping_distance
+from marlbc_mj.core.shield import ForceBound, Shield, ShieldNumbers, retreat_drift, stopping_distance
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -52,10 +52,11 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
         agent_distance=float(between),
         velocity_error=float(shield.velocity_error),
     )
-    creep = LEAST_CREEP + CREEP * drift(numbers, scenario.substep, 0.0)
+    creep = LEAST_CREEP + CREEP * retreat_drift(numbers, scenario.substep, 0.0)
     numbers = numbers._replace(
         clearance=numbers.clearance + shield.margin + creep + shield.position_error,
         agent_distance=numbers.agent_distance + shield.margin + 2.0 * (creep + shield.position_error),
+        slack=creep,
     )
     check_start(numbers, np.array(scenario.starts, dtype=np.float64), scenario.obstacle_array())
     return numbers

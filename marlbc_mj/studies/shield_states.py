@@ -14,9 +14,9 @@ from marlbc_mj.core.shield import (
     ShieldCounts,
     ShieldNumbers,
     ShieldView,
-    drift,
     force_bound,
     gap_to,
+    retreat_drift,
     shield_team,
     stopping_distance,
 )
@@ -70,7 +70,7 @@ def _leave_rate(numbers, truth, h, things, states, rng):
         allowed = ROUNDING
         if things > 1:
             for i in range(agents):
-                allowed += drift(truth, h, np.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2))
+                allowed += retreat_drift(truth, h, np.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2))
         for i in range(agents):
             _push(rng, numbers, truth, view, i, force[i])
         for i in range(agents):
