@@ -89,7 +89,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
             v_r[i, axis] = teams.moving[b, i, axis]
     for k in range(orders.shape[0]):
         keep(behaviors, v_r, before_v)
-        seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
+        seen = extrapolate(k * duration, teams.obstacles[b], scratch.obstacles[c])
         t = (teams.first[b] + k) * duration
         compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c, :WORKSPACE], v_r)
         limit(behaviors, duration, before_v, v_r)
@@ -100,7 +100,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
 
 
 @allocation_free
-def _after(t, obstacles, drifted):
+def extrapolate(t, obstacles, drifted):
     """Obstacles after ``t`` [s]: themselves where they are at rest."""
     if obstacles.shape[1] == 3:
         return obstacles
@@ -120,7 +120,7 @@ def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
     cost = 0.0
     for k in range(trail.shape[0]):
         path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
-        seen = _after((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
+        seen = extrapolate((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
         for i in range(trail.shape[1]):
             for which in range(2):
                 x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
