@@ -81,7 +81,7 @@ def barrier_plane(between, distance, least, pole, share, plane):
         least: distance that is wanted, so that h = D - least [m].
         pole: rho [1/s].
         share: of the constraint that the agent takes, 1/2 or 1.
-        plane: (3,), written in place; the normal is (1, 0) where both middles are in one place.
+        plane: (3 or more,), written in place; the normal is (1, 0) where both middles are in one place.
     """
     n_x, n_y = (-between[0, 0] / distance, -between[0, 1] / distance) if distance > 0.0 else (1.0, 0.0)
     rate = -(n_x * between[1, 0] + n_y * between[1, 1])
@@ -95,7 +95,7 @@ def barrier_plane(between, distance, least, pole, share, plane):
 def _accelerate(wish, bodies, pole, rate, most, out):
     """Accelerations (B, N, 2) [m/s^2] of all agents of all teams into ``out``."""
     agents, obstacles = wish.at.shape[1], wish.obstacles.shape[1]
-    planes, room = np.empty((agents + obstacles, 3)), np.empty((agents + obstacles, 3))
+    planes = np.empty((2 * (agents + obstacles), 4))  # rows: normal, offset, level
     between, still, wanted = np.empty((2, 2)), np.zeros(2), np.empty(2)
     for b in range(wish.at.shape[0]):
         for i in range(agents):
@@ -106,12 +106,14 @@ def _accelerate(wish, bodies, pole, rate, most, out):
                 distance = relative(p, v, body, body[3:5] if wish.obstacles.shape[2] > 3 else still, between)
                 if distance - least < bodies.sight:
                     barrier_plane(between, distance, least, pole, 1.0, planes[count])
+                    planes[count, 3] = 0.0
                     count += 1
             for j in range(agents):
                 distance = relative(p, v, wish.at[b, j], wish.velocity[b, j], between)
                 if j != i and distance - bodies.agents < bodies.sight:
                     barrier_plane(between, distance, bodies.agents, pole, 0.5, planes[count])
+                    planes[count, 3] = 1.0
                     count += 1
             for axis in range(2):
                 wanted[axis] = rate * (wish.wanted[b, i, axis] - v[axis])
-            nearest_velocity(planes[:count], wanted, most, room, out[b, i])
+            nearest_velocity(wanted, most, planes, count, out[b, i])

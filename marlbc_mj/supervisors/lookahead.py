@@ -1,8 +1,8 @@
 """Look ahead: the column while the formation's own lanes are blocked, else the formation (project).
 
 A *lane* is the way of an FM slot along the path. It is blocked while the slot, moved along the path from ``behind`` ago until
-``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the column
-while at least ``blocked`` lanes are blocked: one agent can go around, several cannot at once.
+``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the
+column while at least ``blocked`` lanes are blocked: one agent can go around, several cannot at once.
 
 The order in which an agent avoids comes from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published
 composition FM and FR alone would run into whatever is in the way. Under the set-based composition it is FM or FR alone.

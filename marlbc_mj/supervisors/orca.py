@@ -70,7 +70,7 @@ def orca_plane(between, radius, v, share, times, plane):
         v: (2,) velocity of the agent now [m/s].
         share: of the change u that the agent takes, 1/2 or 1.
         times: tau, and the time in which bodies that overlap are to part [s].
-        plane: (3,), written in place.
+        plane: (3 or more,), written in place.
     """
     x, y = between[0, 0], between[0, 1]
     square = x * x + y * y
@@ -97,7 +97,7 @@ def orca_plane(between, radius, v, share, times, plane):
 def _avoid(wish, bodies, horizon, out):
     """New velocities (B, N, 2) [m/s] of all agents of all teams into ``out``."""
     agents, obstacles = wish.at.shape[1], wish.obstacles.shape[1]
-    planes, room = np.empty((agents + obstacles, 3)), np.empty((agents + obstacles, 3))
+    planes = np.empty((2 * (agents + obstacles), 4))  # rows: normal, offset, level
     between, still, times = np.empty((2, 2)), np.zeros(2), (horizon, bodies.step)
     for b in range(wish.at.shape[0]):
         for i in range(agents):
@@ -108,9 +108,11 @@ def _avoid(wish, bodies, horizon, out):
                 moves = body[3:5] if wish.obstacles.shape[2] > 3 else still
                 if relative(p, v, body, moves, between) - radius < bodies.sight:
                     orca_plane(between, radius, v, 1.0, times, planes[count])
+                    planes[count, 3] = 0.0
                     count += 1
             for j in range(agents):
                 if j != i and relative(p, v, wish.at[b, j], wish.velocity[b, j], between) - bodies.agents < bodies.sight:
                     orca_plane(between, bodies.agents, v, 0.5, times, planes[count])
+                    planes[count, 3] = 1.0
                     count += 1
-            nearest_velocity(planes[:count], wish.wanted[b, i], bodies.speed, room, out[b, i])
+            nearest_velocity(wish.wanted[b, i], bodies.speed, planes, count, out[b, i])

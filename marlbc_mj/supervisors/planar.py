@@ -16,23 +16,24 @@ ROUNDING = 1e-9
 
 
 @allocation_free
-def nearest_velocity(planes, wish, speed, room, out):
+def nearest_velocity(wish, speed, planes, count, out):
     """argmin |v - wish| over |v| <= speed and n_k^T v >= c_k for all k; the least greatest violation where there is no such v.
 
     Args:
-        planes: (K, 3) unit normal and offset (n_k, c_k) of each half-plane.
         wish: (2,).
-        speed: bound of the length of v, infinite for none.
-        room: (K, 3) scratch.
+        speed: bound of the length of v.
+        planes: (2 K or more, 3 or more) rows n_x, n_y, c: unit normal and offset of each half-plane; rows from K on are scratch.
+        count: K.
         out: (2,) v, written in place.
 
     Returns:
-        The greatest violation max_k (c_k - n_k^T v), 0 where all half-planes hold.
+        Whether all half-planes hold.
     """
-    failed = _insert_all(planes, wish[0], wish[1], speed, False, out)
-    if failed == planes.shape[0]:
-        return 0.0
-    return _least_violation(planes, failed, speed, room, out)
+    failed = _insert_all(planes[:count], wish[0], wish[1], speed, False, out)
+    if failed == count:
+        return True
+    _least_violation(planes[:count], failed, speed, planes[count:], out)
+    return False
 
 
 @allocation_free
@@ -74,17 +75,15 @@ def _on_line(i, planes, x, y, speed, outward, out):
     if low > high + ROUNDING:
         return False
     along = n_x * y - n_y * x
-    if outward:
-        place = high if along > 0.0 else low
-    else:
-        place = min(max(along, low), high)
+    farthest = high if along > 0.0 else low
+    place = farthest if outward else min(max(along, low), high)
     out[0], out[1] = offset * n_x - place * n_y, offset * n_y + place * n_x
     return True
 
 
 @allocation_free
 def _least_violation(planes, first, speed, room, out):
-    """The point of the disc with the least greatest violation, from half-plane ``first`` on, into ``out``; returns that violation.
+    """The point of the disc with the least greatest violation, from half-plane ``first`` on, into ``out``.
 
     Where half-plane i is violated most, no other may be violated more: (n_j - n_i)^T v >= c_j - c_i for all j before it, and v
     goes along n_i as far as those let it.
@@ -105,4 +104,3 @@ def _least_violation(planes, first, speed, room, out):
         if _insert_all(room[:count], planes[i, 0], planes[i, 1], speed, True, out) < count:
             out[0], out[1] = x, y  # there is a point; only rounding hides it
         worst = planes[i, 2] - planes[i, 0] * out[0] - planes[i, 1] * out[1]
-    return worst
