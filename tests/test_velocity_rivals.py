@@ -115,12 +115,12 @@ def test_on_the_line_of_a_body_the_agent_just_touches_it(seed):
 
 
 def test_two_agents_share_what_one_would_do_alone():
-    """Half of u each: head-on, 4 m apart at 2 m/s each, radius 1 m: each may go on at 3/4 m/s towards the other."""
+    """Half of u each; and at rest an agent may cross the gap of 3 m in no less than the horizon of 2 s."""
     whole = plane_for((4.0, 0.0), (-4.0, 0.0), 1.0, v=(2.0, 0.0))
     half = plane_for((4.0, 0.0), (-4.0, 0.0), 1.0, v=(2.0, 0.0), share=0.5)
     assert half[2] - half[:2] @ (2.0, 0.0) == pytest.approx(0.5 * (whole[2] - whole[:2] @ (2.0, 0.0)))
     away = plane_for((4.0, 0.0), (0.0, 0.0), 1.0)
-    np.testing.assert_allclose(away, [-1.0, 0.0, -1.5], atol=1e-12)  # 3 m of gap within 2 s
+    np.testing.assert_allclose(away, [-1.0, 0.0, -1.5], atol=1e-12)
 
 
 def test_bodies_that_overlap_part_within_one_mission_step():

@@ -14,7 +14,7 @@ from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.frameworks import Repertoire, behavior_velocities, evaluated_at, repertoire
 from marlbc_mj.supervisors.neighbors import give_way
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
 class Bodies(NamedTuple):
@@ -55,6 +55,8 @@ def make_cruise(scenario: Scenario, motion: str, margin: float, speed: float, si
             raise ConfigurationError(f"{name} must be positive, got {value}")
     if not (np.isfinite(margin) and margin >= 0):
         raise ConfigurationError(f"margin must be non-negative and finite, got {margin}")
+    if motion not in scenario.formation_names:
+        raise unknown("formation behavior", motion, scenario.formation_names)
     apart = give_way(scenario).distance or 2.0 * make_robot(scenario.robot).radius
     bodies = Bodies(
         agents=float(apart + margin),
