@@ -171,8 +171,8 @@ def test_the_column_takes_two_blocked_lanes():
     x, y = SLOTS[0]
     assert orders_of(LookAhead(), seen(OPEN, [(x + 5.0, y, 1.0)])) == [FM] * 4
     assert orders_of(LookAhead(blocked=1), seen(OPEN, [(x + 5.0, y, 1.0)])) == [FR] * 4
-    assert orders_of(LookAhead(), seen(OPEN, wall(x + 8.0))) == [FR] * 4
-    assert orders_of(LookAhead(ahead=2.0), seen(OPEN, wall(x + 8.0))) == [FM] * 4
+    assert orders_of(LookAhead(), seen(OPEN, wall(8.0))) == [FR] * 4
+    assert orders_of(LookAhead(ahead=2.0), seen(OPEN, wall(8.0))) == [FM] * 4
 
 
 @pytest.mark.parametrize("setting", [{"blocked": 0}, {"blocked": 1.5}, {"ahead": -1.0}, {"behind": np.inf}])
