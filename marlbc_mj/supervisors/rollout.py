@@ -24,7 +24,7 @@ from marlbc_mj.engine.composition import WORKSPACE, compose_team, keep, limit
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import REACH
-from marlbc_mj.supervisors.prediction import PAIR_ROOM, CostWeights, Problem, extrapolate, problem, trail_cost
+from marlbc_mj.supervisors.prediction import PAIR_ROOM, CostWeights, Problem, add_step_cost, extrapolate, problem
 from marlbc_mj.supervisors.set_based_rule import FORMATION, Rule, follow_rule, make_rule, rule_orders
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
@@ -33,10 +33,15 @@ STIFFNESS, DAMPING = 100.0, 100.0
 
 
 class Plans(NamedTuple):
-    """P plans over H mission steps; the first one holds the motion."""
+    """P plans over H mission steps; the first one holds the motion.
+
+    They make a tree: what two plans have in common is predicted once.
+    """
 
     changed: np.ndarray  # (P, H) int64, 1 where the motion is not the one in force
     switches: np.ndarray  # (P,) changes of the motion
+    level: np.ndarray  # (P,) int64, changes of the motion that the plan may make: 0 to 2
+    branch: np.ndarray  # (P,) int64, step at which it leaves the last plan before it of the level below; 0 for the first one
 
 
 class Lag(NamedTuple):
@@ -67,10 +72,11 @@ class Room(NamedTuple):
     """Scratch of one prediction."""
 
     rows: np.ndarray  # (1, PAIR_ROOM, 2)
-    motion: np.ndarray  # (5, N, 2) p_r, p, v, v_r now and before
+    states: np.ndarray  # (3, H + 1, 4, N, 2) p_r, p, v and v_r before every step, of the last plan of each level
+    costs: np.ndarray  # (3, H + 1) of the steps before
+    before: np.ndarray  # (N, 2) v_r of the step before [m/s]
     obstacles: np.ndarray  # (1, K, 3 or 5)
     orders: np.ndarray  # (N,) int64
-    trail: np.ndarray  # (H, N, 2)
 
 
 class Search(NamedTuple):
@@ -93,32 +99,55 @@ class Improved(NamedTuple):
 
 
 @allocation_free
-def follow_plan(b, changed, motion, search, fleet, room):
-    """Trail (H, N, 2) [m] of team ``b`` into ``room.trail``: the base policy in the loop, its motion by the plan (H,)."""
-    rule, behaviors, dt = search.rule, search.rule.behaviors, search.problem.mission_step
-    p_r, p, v, v_r, before = room.motion[0], room.motion[1], room.motion[2], room.motion[3], room.motion[4]
-    _begin(b, fleet, room.motion)
-    for k in range(changed.shape[0]):
-        keep(behaviors, v_r, before)
-        seen, t = extrapolate(k * dt, fleet.obstacles[b], room.obstacles[0]), (fleet.first[b] + k) * dt
-        at = p_r if behaviors.virtual else p
-        avoiding = follow_rule(t, motion ^ changed[k], rule, at, seen, room.rows[0], v_r, room.orders)
-        if avoiding + _give_way(at, rule.way, room.orders, rule.grid[:0]):
-            compose_team(t, room.orders, behaviors, at, seen, rule.grid, room.rows[0, :WORKSPACE], v_r)
-        limit(behaviors, dt, before, v_r)
-        follow_reference(dt, search.lag, p_r, p, v, v_r)
-        for i in range(p.shape[0]):
-            for axis in range(2):
-                room.trail[k, i, axis] = p[i, axis]
+def follow_plan(one, plan, motion, search, fleet, room):
+    """Cost of a plan for one team, whose motion in force is ``motion``; its states and costs go into ``room``."""
+    level, first = search.plans.level[plan], search.plans.branch[plan]
+    states, costs, changed = room.states[level], room.costs[level], search.plans.changed[plan]
+    if level == 0:
+        _begin(one.team[0], fleet, states[0])
+        costs[0] = 0.0
+    else:
+        _copy(room.states[level - 1, first], states[first])
+        costs[first] = room.costs[level - 1, first]
+    for k in range(first, changed.shape[0]):
+        _copy(states[k], states[k + 1])
+        predict_step(k, one.team[0], motion ^ changed[k], search, fleet, room, states[k + 1])
+        at, behaviors = states[k + 1, 1], search.rule.behaviors
+        costs[k + 1] = add_step_cost(costs[k], k, at, 0, behaviors, search.problem, fleet, one, room)
+    return costs[changed.shape[0]] + search.w_switch * search.plans.switches[plan]
 
 
 @allocation_free
-def _begin(b, fleet, motion):
-    """Copy the state of team ``b`` to where it is predicted."""
-    for i in range(motion.shape[1]):
+def predict_step(k, b, motion, search, fleet, room, state):
+    """Predicted mission step ``k`` of team ``b``, the base policy in the loop: ``state`` (4, N, 2), p_r, p, v, v_r, in place."""
+    rule, behaviors, dt = search.rule, search.rule.behaviors, search.problem.mission_step
+    p_r, p, v, v_r = state[0], state[1], state[2], state[3]
+    keep(behaviors, v_r, room.before)
+    seen, t = extrapolate(k * dt, fleet.obstacles[b], room.obstacles[0]), (fleet.first[b] + k) * dt
+    at = p_r if behaviors.virtual else p
+    avoiding = follow_rule(t, motion, rule, at, seen, room.rows[0], v_r, room.orders)
+    if avoiding + _give_way(at, rule.way, room.orders, rule.grid[:0]):
+        compose_team(t, room.orders, behaviors, at, seen, rule.grid, room.rows[0, :WORKSPACE], v_r)
+    limit(behaviors, dt, room.before, v_r)
+    follow_reference(dt, search.lag, p_r, p, v, v_r)
+
+
+@allocation_free
+def _begin(b, fleet, state):
+    """The state (4, N, 2) of team ``b`` now."""
+    for i in range(state.shape[1]):
         for axis in range(2):
-            motion[0, i, axis], motion[1, i, axis] = fleet.reference[b, i, axis], fleet.position[b, i, axis]
-            motion[2, i, axis] = motion[3, i, axis] = fleet.moving[b, i, axis]
+            state[0, i, axis], state[1, i, axis] = fleet.reference[b, i, axis], fleet.position[b, i, axis]
+            state[2, i, axis] = state[3, i, axis] = fleet.moving[b, i, axis]
+
+
+@allocation_free
+def _copy(source, out):
+    """A state (4, N, 2)."""
+    for row in range(out.shape[0]):
+        for i in range(out.shape[1]):
+            for axis in range(2):
+                out[row, i, axis] = source[row, i, axis]
 
 
 @allocation_free
@@ -156,14 +185,11 @@ def follow_reference(dt, lag, p_r, p, v, v_r):
 @compiled
 def _search(due, motion, search, fleet, room, costs):
     """Costs (D, P) of all plans for the teams ``due`` (D,), whose motions in force are ``motion`` (B,)."""
-    team = np.zeros(1, dtype=np.int64)
+    one = One(np.zeros(1, dtype=np.int64))
     for d in range(due.shape[0]):
-        b = due[d]
-        team[0] = b
+        one.team[0] = due[d]
         for plan in range(costs.shape[1]):
-            follow_plan(b, search.plans.changed[plan], motion[b], search, fleet, room)
-            cost = trail_cost(0, search.rule.behaviors, search.problem, fleet, One(team), room, room.trail)
-            costs[d, plan] = cost + search.w_switch * search.plans.switches[plan]
+            costs[d, plan] = follow_plan(one, plan, motion[due[d]], search, fleet, room)
 
 
 @dataclass(frozen=True)
@@ -224,10 +250,11 @@ class Rollout:
         columns = 5 if scenario.moving else 3
         room = Room(
             rows=np.zeros((1, PAIR_ROOM, 2)),
-            motion=np.zeros((5, scenario.agents, 2)),
+            states=np.zeros((3, plans.changed.shape[1] + 1, 4, scenario.agents, 2)),
+            costs=np.zeros((3, plans.changed.shape[1] + 1)),
+            before=np.zeros((scenario.agents, 2)),
             obstacles=np.zeros((1, len(scenario.obstacles), columns)),
             orders=np.zeros(scenario.agents, dtype=np.int64),
-            trail=np.zeros((plans.changed.shape[1], scenario.agents, 2)),
         )
         return Improved(np.full(teams, FORMATION), np.full(teams, -1), search, room)
 
@@ -270,6 +297,8 @@ def _make_plans(horizon: int, changes: tuple[int, ...], backs: tuple[int, ...]) 
     """Hold, then every change, the later ones first, each for good and then back after each of ``backs``; in mission steps."""
     spans = [(horizon, horizon)]
     spans += [(k, end) for k in sorted(set(changes), reverse=True) for end in (horizon, *(k + back for back in backs))]
+    level = np.array([0] + [1, *(2 for _ in backs)] * len(set(changes)))
+    branch = np.array([0] + [first if of == 1 else min(end, horizon) for (first, end), of in zip(spans, level, strict=True)][1:])
     step = np.arange(horizon)
     changed = np.stack([(first <= step) & (step < end) for first, end in spans]).astype(np.int64)
-    return Plans(changed, np.array([float(first < horizon) + float(end < horizon) for first, end in spans]))
+    return Plans(changed, np.array([float(first < horizon) + float(end < horizon) for first, end in spans]), level, branch)
