@@ -17,7 +17,7 @@ from marlbc_mj.core.laws import compiled
 from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.set_based_rule import COLUMN, FORMATION, Rule, make_rule, rule_orders
+from marlbc_mj.supervisors.set_based_rule import IN_COLUMN, IN_FORMATION, LocalRule, make_local_rule, rule_orders
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -27,7 +27,7 @@ class Lanes(NamedTuple):
     slots: np.ndarray  # (N, 2) of FM around the desired centroid [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
     safe_distance: float  # d_OA [m]
-    rule: Rule
+    rule: LocalRule
 
 
 @dataclass(frozen=True)
@@ -57,14 +57,14 @@ class LookAhead:
         Raises:
             ConfigurationError: the scenario lacks an order, or the margin cannot be.
         """
-        rule = make_rule(scenario, self.margin)
+        rule = make_local_rule(scenario, self.margin)
         slots = np.ascontiguousarray(scenario.formations[0])
         return Lanes(slots, rule.behaviors.path, float(scenario.safe_distance), rule)
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
         """One motion per team, avoidance per agent."""
         blocked = blocked_lanes(observation, memory, (-self.behind, self.ahead))
-        motion = np.where(blocked.sum(axis=1) >= self.blocked, COLUMN, FORMATION)
+        motion = np.where(blocked.sum(axis=1) >= self.blocked, IN_COLUMN, IN_FORMATION)
         return rule_orders(observation, motion, memory.rule), memory
 
 

@@ -25,10 +25,10 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import REACH
 from marlbc_mj.supervisors.prediction import PAIR_ROOM, CostWeights, Problem, add_step_cost, extrapolate, problem
-from marlbc_mj.supervisors.set_based_rule import FORMATION, Rule, follow_rule, make_rule, rule_orders
+from marlbc_mj.supervisors.set_based_rule import IN_FORMATION, LocalRule, follow_rule, make_local_rule, rule_orders
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-STIFFNESS, DAMPING = 100.0, 100.0
+TRACKING_STIFFNESS, TRACKING_DAMPING = 100.0, 100.0
 """Nominal feedback on errors of position [1/s^2] and velocity [1/s]: the gains of SORLC (40)."""
 
 
@@ -52,7 +52,7 @@ class Lag(NamedTuple):
     limit: float  # of the acceleration per axis [m/s^2]
 
 
-class Fleet(NamedTuple):
+class Present(NamedTuple):
     """Where predictions for B teams begin; named as :class:`~marlbc_mj.supervisors.prediction.Teams` where it means the same."""
 
     first: np.ndarray  # (B,) int64, mission steps made
@@ -82,7 +82,7 @@ class Room(NamedTuple):
 class Search(NamedTuple):
     """What stays the same over an episode."""
 
-    rule: Rule
+    rule: LocalRule
     plans: Plans
     lag: Lag
     problem: Problem
@@ -173,7 +173,7 @@ def follow_reference(dt, lag, p_r, p, v, v_r):
     for i in range(p.shape[0]):
         for axis in range(2):
             for _ in range(lag.substeps):
-                wish = -STIFFNESS * (p[i, axis] - p_r[i, axis]) - DAMPING * (v[i, axis] - v_r[i, axis])
+                wish = -TRACKING_STIFFNESS * (p[i, axis] - p_r[i, axis]) - TRACKING_DAMPING * (v[i, axis] - v_r[i, axis])
                 v[i, axis] += lag.substep * clip(wish, lag.limit)
                 p[i, axis] += lag.substep * v[i, axis]
                 p_r[i, axis] += lag.substep * v_r[i, axis]
@@ -241,7 +241,7 @@ class Rollout:
             scale=scenario.formation_tolerance,
         )
         search = Search(
-            rule=make_rule(scenario, self.margin),
+            rule=make_local_rule(scenario, self.margin),
             plans=plans,
             lag=Lag(scenario.substeps if self.lag else 0, scenario.substep, scenario.force_limit / scenario.mass),
             problem=problem(scenario, weights),
@@ -256,7 +256,7 @@ class Rollout:
             obstacles=np.zeros((1, len(scenario.obstacles), columns)),
             orders=np.zeros(scenario.agents, dtype=np.int64),
         )
-        return Improved(np.full(teams, FORMATION), np.full(teams, -1), search, room)
+        return Improved(np.full(teams, IN_FORMATION), np.full(teams, -1), search, room)
 
     def plans(self, step: float) -> Plans:
         """The plans over the horizon in mission steps of ``step`` [s]: hold, then later changes before earlier ones."""
@@ -280,7 +280,7 @@ class Rollout:
         search, seen = memory.search, observation
         fields = seen.step, seen.reference, seen.position, seen.velocity, seen.obstacles
         costs = np.empty((len(due), len(search.plans.switches)))
-        _search(due, memory.motion, search, Fleet(*map(np.ascontiguousarray, fields)), memory.room, costs)
+        _search(due, memory.motion, search, Present(*map(np.ascontiguousarray, fields)), memory.room, costs)
         lost = np.flatnonzero(~np.isfinite(costs).any(axis=1))
         if len(lost):
             b = due[lost[0]]

@@ -28,11 +28,11 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.util.errors import ConfigurationError
 
-FORMATION, COLUMN = 0, 1
+IN_FORMATION, IN_COLUMN = 0, 1
 """The motion of a team: the first of ``scenario.formation_names``, or the second."""
 
 
-class Rule(NamedTuple):
+class LocalRule(NamedTuple):
     """What the rule needs of a scenario, fixed for an episode."""
 
     behaviors: Behaviors
@@ -44,7 +44,7 @@ class Rule(NamedTuple):
     grid: np.ndarray  # scratch
 
 
-def make_rule(scenario: Scenario, margin: float) -> Rule:
+def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
     """The rule for a scenario under its composition.
 
     Raises:
@@ -55,9 +55,9 @@ def make_rule(scenario: Scenario, margin: float) -> Rule:
     free = np.array([scenario.orders.index(name) for name in scenario.formation_names])
     behaviors, step, grid = make_behaviors(scenario), float(scenario.mission_step), np.zeros(grid_room(scenario))
     if avoids_by_itself(scenario):
-        return Rule(behaviors, free, free, -np.inf, step, GiveWay(0.0, np.arange(len(scenario.orders))), grid)
+        return LocalRule(behaviors, free, free, -np.inf, step, GiveWay(0.0, np.arange(len(scenario.orders))), grid)
     avoiding = np.array([scenario.orders.index(f"OA>{name}") for name in scenario.formation_names])
-    return Rule(behaviors, free, avoiding, float(scenario.safe_distance + margin), step, give_way(scenario), grid)
+    return LocalRule(behaviors, free, avoiding, float(scenario.safe_distance + margin), step, give_way(scenario), grid)
 
 
 def avoids_by_itself(scenario: Scenario) -> bool:
@@ -71,7 +71,7 @@ def follow_rule(t, motion, rule, at, obstacles, workspace, velocity, orders):
 
     Args:
         t: mission time [s].
-        motion: of the team, FORMATION or COLUMN.
+        motion: of the team, IN_FORMATION or IN_COLUMN.
         rule: of the scenario.
         at: (N, 2) positions at which behaviors are evaluated [m].
         obstacles: (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move.
@@ -124,7 +124,7 @@ def _fill_orders(time, motion, rule, at, obstacles, orders):
         follow_rule(time[b], motion[b], rule, at[b], obstacles[b], workspace, velocity, orders[b])
 
 
-def rule_orders(observation: Observation, motion: np.ndarray, rule: Rule) -> np.ndarray:
+def rule_orders(observation: Observation, motion: np.ndarray, rule: LocalRule) -> np.ndarray:
     """(B, N) orders of B teams whose motions are ``motion`` (B,); agent avoidance on top where a neighbor is too close."""
     at = observation.reference if rule.behaviors.virtual else observation.position
     orders = np.empty(at.shape[:2], dtype=np.int64)
@@ -136,7 +136,7 @@ class Ruled(NamedTuple):
     """Memory of :class:`SetBasedRule`."""
 
     motion: np.ndarray  # (B,) of every team
-    rule: Rule
+    rule: LocalRule
 
 
 @dataclass(frozen=True)
@@ -152,7 +152,7 @@ class SetBasedRule:
         Raises:
             ConfigurationError: the scenario lacks an order, or the margin cannot be.
         """
-        return Ruled(np.full(teams, COLUMN if self.column else FORMATION), make_rule(scenario, self.margin))
+        return Ruled(np.full(teams, IN_COLUMN if self.column else IN_FORMATION), make_local_rule(scenario, self.margin))
 
     def decide(self, observation: Observation, memory: Ruled) -> tuple[np.ndarray, Ruled]:
         """Every agent by itself."""
