@@ -248,9 +248,10 @@ def _check_substep(scenario: Scenario, controller: Controller) -> None:
     if gains is None:
         return
     per_mass = scenario.unit_force / scenario.mass
-    limit = largest_stable_substep(gains[0] * per_mass, gains[1] * per_mass)
+    position_gain, velocity_gain = gains
+    limit = largest_stable_substep(position_gain * per_mass, velocity_gain * per_mass)
     if scenario.substep >= limit:
         raise ConfigurationError(
             f"substep {scenario.substep * 1e3:g} ms is beyond the stability limit {limit * 1e3:.1f} ms "
-            f"of gains {gains[0]:g} and {gains[1]:g}"
+            f"of gains {position_gain:g} and {velocity_gain:g}"
         )
