@@ -38,13 +38,14 @@ class ScenarioOptions:
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
-    def build(self, name: str) -> "Scenario":
-        """The named scenario with these changes."""
+    def build(self, name: str, **others: Any) -> "Scenario":
+        """The named scenario with these changes, and with ``others`` that are not None."""
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
 
         keys = ("substep", "reference", "composition", "force_limit", "duration", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        changes.update({key: value for key, value in others.items() if value is not None})
         if self.two_sided:
             changes["two_sided"] = True
         if self.disturbance is not None or self.drag_scale is not None:
@@ -57,7 +58,8 @@ class ScenarioOptions:
 class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
-    By default every supervisor but two (mpcms-mujoco, oracle-schedule) runs with sorlc, and scripted with every controller.
+    By default scripted runs with every controller, and every supervisor with sorlc but those that are to be named: mpcms-mujoco,
+    oracle-schedule, fixed, set-based-rule, lookahead, rollout, orca and cbf-qp.
     """
 
     scenario: Positional[str] = "paper"
@@ -180,6 +182,10 @@ class EvaluateCommand:
     """Supervisors to run."""
     controller: str = "sorlc"
     """Controller they run with."""
+    agents: int | None = None
+    """Size of the team, 4 in most families."""
+    formation: str | None = None
+    """Formation of the team: line, wedge, circle or grid."""
     seeds: int = 200
     """Number of held-out layouts."""
     seed: int = 0
@@ -210,6 +216,10 @@ class EvaluateCommand:
             shield=self.shield,
         )
         with progress_bars() as progress:
-            results = run_evaluation(self.options.build(self.scenario), config, self.out, progress=progress)
+            results = run_evaluation(self.scenario_flown(), config, self.out, progress=progress)
         print(to_markdown(outcome_table(results)))
         print(f"{self.out / 'index.html'} shows it all")
+
+    def scenario_flown(self) -> "Scenario":
+        """The scenario with the team and the changes of the command line."""
+        return self.options.build(self.scenario, agents=self.agents, formation=self.formation)

@@ -160,17 +160,21 @@ class WindGusts(_Scaled):
         super().__post_init__()
 
     def params(self) -> laws.Numbers:
+        return laws.gains_of(self, **self._harmonics())
+
+    def _harmonics(self) -> dict[str, np.ndarray]:
+        """Amplitude [N], frequency [rad/s] and phase of every sine, (2, HARMONICS) each."""
         rng = np.random.default_rng(self.seed)
         place = (np.arange(HARMONICS) + rng.uniform(0.0, 1.0, (2, HARMONICS))) / HARMONICS  # one frequency in each band
         ratio = np.exp(np.log(0.2) + np.log(50.0) * place)  # w_k T, from 0.2 to 10
         amplitude = 1.0 / np.sqrt(1.0 + ratio**2)
         amplitude *= self.strength * np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
         phase = rng.uniform(0.0, 2.0 * np.pi, (2, HARMONICS))
-        return laws.gains_of(self, amplitude=amplitude, frequency=ratio / self.time, phase=phase)
+        return {"amplitude": amplitude, "frequency": ratio / self.time, "phase": phase}
 
     def force_bound(self) -> ForceBound:
         """|f_i| <= scale (|w_i| + sum_k a_k) on each axis: the sines all at their peaks."""
-        peaks = np.abs(self.steady) + np.sum(np.asarray(self.params()["amplitude"]), axis=1)
+        peaks = np.abs(self.steady) + np.sum(self._harmonics()["amplitude"], axis=1)
         return ForceBound(abs(self.scale) * float(np.hypot(*peaks)))
 
 

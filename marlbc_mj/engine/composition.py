@@ -41,7 +41,7 @@ class Behaviors(NamedTuple):
 
 
 class TeamView(NamedTuple):
-    """What behaviors look at in one team, and room to desired_velocity them in."""
+    """What behaviors look at in one team, and room to evaluate them in."""
 
     at: np.ndarray  # (N, 2) positions at which they are evaluated [m]
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move

@@ -14,8 +14,9 @@ from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
 from marlbc_mj.engine.composition import Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.inequalities import workspace_rows
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.plan import grid_room, workspace_rows
+from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 
@@ -86,7 +87,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
             v_r[i, axis] = teams.moving[b, i, axis]
     for k in range(orders.shape[0]):
         keep(behaviors, v_r, before_v)
-        seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
+        seen = extrapolate(k * duration, teams.obstacles[b], scratch.obstacles[c])
         t = (teams.first[b] + k) * duration
         compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c], v_r)
         limit(behaviors, duration, before_v, v_r)
@@ -97,7 +98,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
 
 
 @allocation_free
-def _after(t, obstacles, drifted):
+def extrapolate(t, obstacles, drifted):
     """Obstacles after ``t`` [s]: themselves where they are at rest."""
     if obstacles.shape[1] == 3:
         return obstacles
@@ -107,24 +108,31 @@ def _after(t, obstacles, drifted):
 
 @allocation_free
 def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
-    """Cost of the trail (H, N, 2) [m] of pair ``c``.
+    """Cost of the trail (H, N, 2) [m] of pair ``c``: the sum of :func:`add_step_cost` over all predicted steps."""
+    cost = 0.0
+    for k in range(trail.shape[0]):
+        cost = add_step_cost(cost, k, trail[k], c, behaviors, problem, teams, pairs, scratch)
+    return cost
 
-    The sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
-    Slots are those of the desired centroid.
+
+@allocation_free
+def add_step_cost(cost, k, at, c, behaviors, problem, teams, pairs, scratch):
+    """``cost`` and what predicted step ``k`` of pair ``c`` adds to it, the team being ``at`` (N, 2) [m] at its end.
+
+    The sum over agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale). Slots are those of the
+    desired centroid.
     """
     b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
     now, normal = scratch.rows[c, :2], scratch.rows[c, 2]
-    cost = 0.0
-    for k in range(trail.shape[0]):
-        path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
-        seen = _after((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
-        for i in range(trail.shape[1]):
-            for which in range(2):
-                x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
-                y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
-                weight = problem.w_formation if which == 0 else problem.w_reconstruction
-                cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
-            cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(trail[k, i], seen, normal))
+    path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
+    seen = extrapolate((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
+    for i in range(at.shape[0]):
+        for which in range(2):
+            x = at[i, 0] - now[0, 0] - formations[which, i, 0]
+            y = at[i, 1] - now[0, 1] - formations[which, i, 1]
+            weight = problem.w_formation if which == 0 else problem.w_reconstruction
+            cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
+        cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(at[i], seen, normal))
     return cost
 
 
