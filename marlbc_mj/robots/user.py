@@ -119,7 +119,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
         ConfigurationError: the file is broken, or its actuators fit none of the ways above.
     """
     spec = mujoco.MjSpec.from_string(standard_text(path))
-    slides_first(spec)
+    moved = slides_first(spec)
     model = check_model(path, spec.compile())
     data = posed(model)
     root = _moving_root(path, model)
@@ -140,7 +140,8 @@ def from_mjcf(path: Path, name: str) -> Robot:
     if isinstance(motors, Reason):
         raise ConfigurationError(f"{path}: actuator {motors.name!r} is no motor: {motors.why}; {_WAY_OUT}")
     if motors is not None:
-        return _direct(fields, (motors[0].name, motors[1].name), limit)
+        turning = f"; {', '.join(moved)} taken after the slides, so that it turns about itself" if moved else ""
+        return _direct({**fields, "description": f"two motors along x and y{turning}"}, (motors[0].name, motors[1].name), limit)
     if len(base.joints) == 1:
         return _flying(fields, path, spec)
     raise ConfigurationError(_UNDRIVEN.format(path))
@@ -178,7 +179,6 @@ def _direct(fields: dict[str, Any], motors: tuple[str, str], limit: float) -> Ro
     return Robot(
         **fields,
         motors=motors,
-        description="two motors along x and y",
         force_limit=limit,
         speed_limit=min(2.0, np.sqrt(fast * fields["length"])),
         acceleration_limit=min(2.0, 0.4 * fast),

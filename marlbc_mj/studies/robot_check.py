@@ -187,7 +187,7 @@ def _measured(robot: Robot, truths: Sequence[Truth], force: np.ndarray) -> Item:
     astray = float(np.linalg.norm(offset - offset[0], axis=-1).max())
     away = float(np.linalg.norm(offset[0], axis=-1).max())
     slip = float(max(truth.velocity_error.max() for truth in truths))
-    said = f"p stays within {1e3 * astray:.3g} mm of body {robot.body!r}'s place, v within {1e3 * slip:.3g} mm/s of its velocity"
+    said = f"p stays within {1e3 * astray:.3g} mm of its place on {robot.body!r}, v within {1e3 * slip:.3g} mm/s of its velocity"
     good = astray < 1e-3 * robot.length and away < max(robot.radius, robot.length) and slip < 1e-3 * robot.length
     gaps = [float(truth.force_error.max()) for truth in truths[1:] if truth.force_error is not None]
     if gaps:
