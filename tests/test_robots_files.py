@@ -86,7 +86,7 @@ DRIVEN = {
     "forcerange alone": (cart(motors=both('<motor name="{name}" joint="{joint}" forcerange="-2 2"/>')), 2.0),
     "actuatorfrcrange": (cart(joints=SLIDES.replace('axis="', 'actuatorfrcrange="-2 2" axis="')), 2.0),
     "tendons": (cart(motors=ON_TENDONS, tail=TENDONS.format("")), 12.0),
-    "tendons with a limit": (cart(motors=ON_TENDONS, tail=TENDONS.format(' actuatorfrcrange="-4 4"')), 8.0),
+    "tendons with a limit": (cart(motors=ON_TENDONS, tail=TENDONS.format(' actuatorfrcrange="-1 1"')), 6.0),
     "site": (
         cart(shape=SHAPE + '<site name="fan"/>', motors='<motor site="fan" gear="2 0 0 0 0 0" ctrlrange="-3 3"/>'
              '<motor site="fan" gear="0 -2 0 0 0 0" ctrlrange="-3 3"/>'),
@@ -115,7 +115,7 @@ DRIVEN = {
     "buoyant": (cart(FREE, FREE_MOTORS, body='name="cart" pos="2 1 0.1" gravcomp="1"'), 12.0),
     "replicate": (cart(shape=SHAPE + '<replicate count="3" euler="0 0 120"><site pos="0.12 0 0"/></replicate>'), 12.0),
     "an arm at rest": (
-        cart(shape=SHAPE + '<body><joint name="w"/><geom size="0.01" mass="1e-6" contype="0" conaffinity="0"/></body>',
+        cart(shape=SHAPE + '<body><joint name="w"/><geom size="0.01" mass="0.5" contype="0" conaffinity="0"/></body>',
              motors=MOTORS + '<position joint="w" kp="1" ctrlrange="-1 1"/>'), 12.0),
 }  # fmt: off
 

@@ -32,18 +32,18 @@ def sources_stamp(package: Path) -> int:
 
 COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
 """What is found in files that hold compiled code."""
-PACKAGE = Path(__file__).parents[1]
-SOURCES = sources_stamp(PACKAGE)
-MOST_FILES = 500
+_PACKAGE = Path(__file__).parents[1]
+SOURCES = sources_stamp(_PACKAGE)
+_MOST_BESIDE = 500
 """More Python files in the folder of a user's law than these are not looked at."""
 
 
 def _stamp(function: Law) -> tuple[Any, ...]:
     """What compiled code of a function depends on: this package, and for a user's law the files beside it and what it uses."""
     path = Path(function.__code__.co_filename)
-    if path.is_relative_to(PACKAGE):
+    if path.is_relative_to(_PACKAGE):
         return (SOURCES,)
-    beside = sorted(path.parent.glob("*.py"))[:MOST_FILES] if path.is_file() else []
+    beside = sorted(path.parent.glob("*.py"))[:_MOST_BESIDE] if path.is_file() else []
     return (SOURCES, *(_checksum(file) for file in beside), zlib.crc32("".join(_used(function, set())).encode()))
 
 
@@ -70,7 +70,7 @@ def _used(function: Law, seen: set[int]) -> Iterator[str]:
         value = function.__globals__.get(name)
         if isinstance(value, ModuleType):
             file = getattr(value, "__file__", None)
-            if file is not None and "site-packages" not in file and not Path(file).is_relative_to(PACKAGE):
+            if file is not None and "site-packages" not in file and not Path(file).is_relative_to(_PACKAGE):
                 yield f"{name} {_checksum(Path(file))}"
         elif isinstance(plain(value), FunctionType):
             yield from _used(value, seen)

@@ -12,10 +12,10 @@ from xml.etree import ElementTree
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
-MOST_BYTES = 64_000_000  # of one file
-MOST_FILES = 2_000
-MOST_COPIES = 10_000  # that nested replicates, or a composite or flexcomp, may make
-MOST = {
+_MOST_BYTES = 64_000_000  # of one file
+_MOST_FILES = 2_000
+_MOST_COPIES = 10_000  # that nested replicates, or a composite or flexcomp, may make
+_MOST = {
     "nrow": 4096,
     "ncol": 4096,
     "width": 8192,
@@ -32,9 +32,9 @@ MOST = {
     "nuserdata": 100_000,
     "nkey": 10_000,
 }
-"""Largest value of an attribute; of those that start with ``nuser_``: MOST_USER."""
-MOST_USER = 1_000
-MOST_MEMORY = 2**30  # bytes, of ``<size memory="...">``
+"""Largest value of an attribute; of those that start with ``nuser_``: _MOST_USER."""
+_MOST_USER = 1_000
+_MOST_MEMORY = 2**30  # bytes, of ``<size memory="...">``
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
 _DIRECTORIES = ("meshdir", "texturedir", "assetdir")
 
@@ -50,7 +50,7 @@ def check_files(path: Path) -> None:
     """Check an MJCF, all that it includes and every file that it names, before MuJoCo reads any of them.
 
     Raises:
-        ConfigurationError: a file outside the MJCF's folder, missing, no regular file or too large; or a number beyond MOST.
+        ConfigurationError: a file outside the MJCF's folder, missing, no regular file or too large; or a number beyond _MOST.
     """
     folder, named = path.resolve().parent, 0
     for source in _sources(path, folder):
@@ -61,8 +61,8 @@ def check_files(path: Path) -> None:
                     named += 1
                     _locate(path, folder, source, value)
         _check_copies(path, source.root, 1)
-        if named > MOST_FILES:
-            raise ConfigurationError(f"{path} names more than {MOST_FILES} files")
+        if named > _MOST_FILES:
+            raise ConfigurationError(f"{path} names more than {_MOST_FILES} files")
 
 
 def _sources(path: Path, folder: Path) -> Iterator[_Source]:
@@ -88,8 +88,8 @@ def _is_xml(file: str) -> bool:
 def _parse(path: Path, here: Path) -> ElementTree.Element:
     try:
         size = here.stat().st_size
-        if size > MOST_BYTES:
-            raise ConfigurationError(f"{path}: {here.name} has {size} bytes; at most {MOST_BYTES} are read")
+        if size > _MOST_BYTES:
+            raise ConfigurationError(f"{path}: {here.name} has {size} bytes; at most {_MOST_BYTES} are read")
         text = here.read_bytes()
         if b"<!ENTITY" in text:
             raise ConfigurationError(f"{path}: {here.name} declares XML entities, which MuJoCo does not read")
@@ -120,18 +120,18 @@ def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:
     for place in there:
         if not place.is_file():
             raise ConfigurationError(f"{path} uses {file}, which is no regular file")
-        if place.stat().st_size > MOST_BYTES:
-            raise ConfigurationError(f"{path} uses {file} of {place.stat().st_size} bytes; at most {MOST_BYTES} are read")
+        if place.stat().st_size > _MOST_BYTES:
+            raise ConfigurationError(f"{path} uses {file} of {place.stat().st_size} bytes; at most {_MOST_BYTES} are read")
     return there[0].resolve()
 
 
 def _check_numbers(path: Path, element: ElementTree.Element) -> None:
     for key, value in element.attrib.items():
-        most = MOST_USER if key.startswith("nuser_") else MOST.get(key)
+        most = _MOST_USER if key.startswith("nuser_") else _MOST.get(key)
         if most is not None and _number(value) > most:
             raise ConfigurationError(f"{path}: {element.tag} has {key}={value!r}; at most {most} is accepted")
-        if key == "memory" and _number(value[:-1]) * _UNITS.get(value[-1:].upper(), 1) > MOST_MEMORY:
-            raise ConfigurationError(f"{path}: {element.tag} has memory={value!r}; at most {MOST_MEMORY} bytes are accepted")
+        if key == "memory" and _number(value[:-1]) * _UNITS.get(value[-1:].upper(), 1) > _MOST_MEMORY:
+            raise ConfigurationError(f"{path}: {element.tag} has memory={value!r}; at most {_MOST_MEMORY} bytes are accepted")
 
 
 def _number(text: str) -> float:
@@ -143,10 +143,10 @@ def _number(text: str) -> float:
 
 
 def _check_copies(path: Path, element: ElementTree.Element, copies: float) -> None:
-    """Raise ConfigurationError where nested elements with a count multiply beyond MOST_COPIES."""
+    """Raise ConfigurationError where nested elements with a count multiply beyond _MOST_COPIES."""
     if element.tag in ("replicate", "composite", "flexcomp"):
         copies *= prod(max(_number(part), 1.0) for part in element.get("count", "1").split())
-        if copies > MOST_COPIES:
-            raise ConfigurationError(f"{path}: {element.tag} makes {copies:g} copies; at most {MOST_COPIES} are accepted")
+        if copies > _MOST_COPIES:
+            raise ConfigurationError(f"{path}: {element.tag} makes {copies:g} copies; at most {_MOST_COPIES} are accepted")
     for child in element:
         _check_copies(path, child, copies)

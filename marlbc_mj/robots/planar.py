@@ -61,7 +61,7 @@ class Base(NamedTuple):
 
 
 def find_base(model: mujoco.MjModel, root: int) -> Base:
-    """The base of a model whose top-level body ``root`` moves; slides may be on bodies that carry one another.
+    """The base of a model whose body ``root`` is the first that moves; slides may be on bodies that carry one another.
 
     Raises:
         ConfigurationError: there is neither a free joint nor a pair of slides along x and y.
@@ -112,7 +112,7 @@ def slides_first(spec: mujoco.MjSpec) -> list[str]:
     moved: list[str] = []
     axes = posed(spec.copy().compile())
     model = axes.model
-    for body in spec.worldbody.bodies:
+    for body in spec.bodies[1:]:
         joints = list(body.joints)
         late = [k for k, joint in enumerate(joints) if joint.type == mujoco.mjtJoint.mjJNT_HINGE and _before_slide(joints[k:])]
         if late and all(abs(axes.xaxis[model.joint(joints[k].name).id][2]) > 1.0 - _PARALLEL for k in late):
@@ -204,15 +204,17 @@ def _motor(model: mujoco.MjModel, u: int, dof: int, effect: float) -> Motor:
         limits = np.sort(gain * model.actuator_ctrlrange[u])
     if model.actuator_forcelimited[u]:
         limits = np.clip(limits, *model.actuator_forcerange[u])
+    if _on_tendon(model, u) and model.tendon_actfrclimited[model.actuator_trnid[u, 0]]:
+        limits = np.clip(limits, *model.tendon_actfrcrange[model.actuator_trnid[u, 0]])
     limits = np.sort(effect * limits)
-    if model.actuator_trntype[u] == mujoco.mjtTrn.mjTRN_TENDON:
-        tendon, gear = int(model.actuator_trnid[u, 0]), float(model.actuator_gear[u, 0])
-        if model.tendon_actfrclimited[tendon]:
-            limits = np.clip(limits, *np.sort(effect / gear * model.tendon_actfrcrange[tendon]))
     joint = int(model.dof_jntid[dof])
     if model.jnt_actfrclimited[joint]:
         limits = np.clip(limits, *model.jnt_actfrcrange[joint])
     return Motor(model.actuator(u).name, effect, float(limits[0]), float(limits[1]))
+
+
+def _on_tendon(model: mujoco.MjModel, u: int) -> bool:
+    return bool(model.actuator_trntype[u] == mujoco.mjtTrn.mjTRN_TENDON)
 
 
 def largest_force(motors: tuple[Motor, Motor]) -> float:
@@ -257,6 +259,8 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
             actuator.gainprm = gains
         if len(joints) == 2:
             spec.joint(joints[axis]).actfrclimited = 0
+        if actuator.trntype == mujoco.mjtTrn.mjTRN_TENDON:
+            spec.tendon(actuator.target).actfrclimited = 0
         _limit(actuator, found.low, found.high)
 
 

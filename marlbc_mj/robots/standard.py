@@ -6,6 +6,7 @@ keyframes and lights are left out, and names get no slash, which dm_control keep
 
 import subprocess
 import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
@@ -20,8 +21,8 @@ from marlbc_mj.robots.files import check_files
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
-PATIENCE = 60.0  # that compiling a robot may take [s]
-MEMORY = 8 * 2**30  # address space that it may take [bytes]
+_TRIAL_TIME = 60.0  # that compiling a robot may take [s]
+_TRIAL_MEMORY = 8 * 2**30  # address space that it may take [bytes]
 _TRIAL = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}))
@@ -82,11 +83,11 @@ def _try_out(path: Path) -> None:
     Raises:
         ConfigurationError: it does.
     """
-    command = [sys.executable, "-c", _TRIAL.format(memory=MEMORY), str(path)]
+    command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY), str(path)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, cwd=path.resolve().parent)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_TIME, cwd=path.resolve().parent)
     except subprocess.TimeoutExpired as error:
-        raise ConfigurationError(f"{path} takes more than {PATIENCE:g} s to compile") from error
+        raise ConfigurationError(f"{path} takes more than {_TRIAL_TIME:g} s to compile") from error
     if done.returncode < 0:
         raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-done.returncode}); simplify the file")
     if done.returncode not in (0, 3):
@@ -101,7 +102,9 @@ def quiet() -> Iterator[list[str]]:
     said: list[str] = []
     mujoco.set_mju_user_warning(said.append)
     try:
-        yield said
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield said
     finally:
         mujoco.set_mju_user_warning(None)
 
@@ -109,7 +112,7 @@ def quiet() -> Iterator[list[str]]:
 def _tidy(text: str) -> str:
     """Resolve frames, name what has no name, and replace slashes in names."""
     root = ElementTree.fromstring(text)
-    for parent in list(root.iter()):
+    for parent in [element for element in root.iter() if element.tag != "frame"]:
         _resolve_frames(parent)
     for element in root.iter():
         for key, value in element.attrib.items():

@@ -148,8 +148,13 @@ def from_mjcf(path: Path, name: str) -> Robot:
 
 
 def _moving_root(path: Path, model: mujoco.MjModel) -> int:
-    """The one top-level body that moves."""
-    roots = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0 and model.body_jntnum[b] > 0]
+    """The one body that moves and is carried by none that does."""
+    moves, roots = np.zeros(model.nbody, dtype=bool), []
+    for b in range(1, model.nbody):
+        carried = bool(moves[model.body_parentid[b]])
+        moves[b] = carried or model.body_jntnum[b] > 0
+        if moves[b] and not carried:
+            roots.append(b)
     if len(roots) != 1:
         names = ", ".join(model.body(b).name for b in roots)
         still = ", ".join(repr(model.body(b).name) for b in range(1, model.nbody) if model.body_parentid[b] == 0)
@@ -165,7 +170,10 @@ def _slides_first(spec: mujoco.MjSpec) -> None:
 
 def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> dict[str, Any]:
     """Radius seen from above and mass of the moving body and all below it, and what it touches."""
-    own = [g for g in range(model.ngeom) if model.body_rootid[model.geom_bodyid[g]] == root]
+    carried = {root}
+    for b in range(root + 1, model.nbody):
+        carried |= {b} if model.body_parentid[b] in carried else set()
+    own = [g for g in range(model.ngeom) if model.geom_bodyid[g] in carried]
     reach = [np.linalg.norm(data.geom_xpos[g, :2] - data.xpos[root, :2]) + min(model.geom_rbound[g], 10.0) for g in own]
     radius = float(max(reach, default=0.1)) or 0.1
     touches = bool(model.geom_contype[own].any())

@@ -58,7 +58,7 @@ oracle itself where nothing is perturbed."""
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
 """Supervisors that nothing was trained for, without those on request."""
 
-CHECKPOINT = ".safetensors"
+CHECKPOINT_SUFFIX = ".safetensors"
 """Suffix of checkpoints."""
 
 
@@ -77,16 +77,16 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
         if lacking:
             raise ConfigurationError(f"{name} is no supervisor: {type(supervisor).__name__} lacks {', '.join(lacking)}")
         return batched(supervisor)
-    if name.endswith(CHECKPOINT):
+    if name.endswith(CHECKPOINT_SUFFIX):
         return batched(Learned.load(Path(name)))
     if name not in SUPERVISORS:
-        raise unknown("supervisor", name, (*SUPERVISORS, "FILE.py:NAME", f"a checkpoint that ends in {CHECKPOINT}"))
+        raise unknown("supervisor", name, (*SUPERVISORS, "FILE.py:NAME", f"a checkpoint that ends in {CHECKPOINT_SUFFIX}"))
     factory = SUPERVISORS[name][0]
     return batched(factory(controller) if name in ORACLES else factory())
 
 
 __all__ = [
-    "CHECKPOINT",
+    "CHECKPOINT_SUFFIX",
     "FMS",
     "FSAMS",
     "LEARNED",

@@ -11,13 +11,13 @@ from typing import Any
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
-SUFFIX = ".py"
+_SUFFIX = ".py"
 
 
 def split_name(name: str) -> tuple[str, str]:
     """File and attribute of ``file.py:Name``; a name without an attribute has an empty one."""
     file, colon, attribute = name.rpartition(":")
-    return (file, attribute) if colon and file.endswith(SUFFIX) else (name, "")
+    return (file, attribute) if colon and file.endswith(_SUFFIX) else (name, "")
 
 
 def names_attribute(name: str) -> bool:
