@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 
@@ -129,6 +130,14 @@ def test_helpers_of_one_name_in_two_folders_are_two(skate, tmp_path):
     assert found == [0.5, 0.3]
 
 
+def add_up(count):
+    """0 + 1 + ... in a loop that threads may share."""
+    total = 0
+    for k in numba.prange(count):
+        total += k
+    return total
+
+
 def test_without_a_folder_for_the_cache_code_is_compiled_in_memory(monkeypatch):
     """As in a container whose package and home are read-only: slower, and nothing else."""
     njit = compiling.numba.njit
@@ -140,7 +149,7 @@ def test_without_a_folder_for_the_cache_code_is_compiled_in_memory(monkeypatch):
 
     monkeypatch.setattr(compiling.numba, "njit", refuse)
     for make in (compiling.compiled, compiling.threaded, compiling.allocation_free):
-        assert make(lambda x: x + 1)(1) == 2
+        assert make(add_up)(4) == 6
 
 
 MINE = """

@@ -67,7 +67,7 @@ def _used(function: Law, seen: set[int]) -> Iterator[str]:
     seen.add(id(function))
     yield f"{code.co_code.hex()} {code.co_names} {[constant for constant in code.co_consts if isinstance(constant, _VALUES)]}"
     for name in code.co_names:
-        value = function.__globals__.get(name)
+        value: Any = function.__globals__.get(name)
         if isinstance(value, ModuleType):
             file = getattr(value, "__file__", None)
             if file is not None and "site-packages" not in file and not Path(file).is_relative_to(_PACKAGE):

@@ -83,7 +83,9 @@ def find_base(model: mujoco.MjModel, root: int) -> Base:
     if len(found) < 2:
         raise ConfigurationError(f"body {model.body(root).name!r} needs a free joint, or slide joints along x and y of the world")
     _refuse_turning_slides(model, found)
-    return Base(body, tuple(model.joint(found[k]).name for k in (0, 1)), tuple(int(model.jnt_dofadr[found[k]]) for k in (0, 1)))
+    along_x, along_y = found[0], found[1]
+    dofs = int(model.jnt_dofadr[along_x]), int(model.jnt_dofadr[along_y])
+    return Base(body, (model.joint(along_x).name, model.joint(along_y).name), dofs)
 
 
 def _along(direction: np.ndarray) -> int | None:

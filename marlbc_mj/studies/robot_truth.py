@@ -82,7 +82,7 @@ def try_laws(robot: Robot) -> str | None:
     return None
 
 
-def all_plain(law: Callable[..., Any], seen: dict[int, Any] | None = None) -> Callable[..., Any]:
+def all_plain(law: Callable[..., Any], seen: dict[int, laws.Law] | None = None) -> laws.Law:
     """A law as plain Python, down to every compiled helper that it calls."""
     seen = {} if seen is None else seen
     function = laws.plain(law)
@@ -90,7 +90,7 @@ def all_plain(law: Callable[..., Any], seen: dict[int, Any] | None = None) -> Ca
         return law
     if id(function) in seen:
         return seen[id(function)]
-    bound = dict(function.__globals__)
+    bound: dict[str, Any] = dict(function.__globals__)
     cells = tuple(CellType(cell.cell_contents) for cell in function.__closure__ or ())
     plain = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, cells or None)
     seen[id(function)] = plain
