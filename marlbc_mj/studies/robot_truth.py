@@ -95,8 +95,9 @@ def all_plain(law: Callable[..., Any], seen: dict[int, laws.Law] | None = None) 
     plain = FunctionType(function.__code__, bound, function.__name__, function.__defaults__, cells or None)
     seen[id(function)] = plain
     for name in function.__code__.co_names:
-        if laws.is_compiled(bound.get(name)):
-            bound[name] = all_plain(bound[name], seen)
+        value: Any = bound.get(name)
+        if laws.is_compiled(value):
+            bound[name] = all_plain(value, seen)
     for cell in cells:
         if laws.is_compiled(cell.cell_contents):
             cell.cell_contents = all_plain(cell.cell_contents, seen)
