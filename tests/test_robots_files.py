@@ -170,6 +170,7 @@ REFUSED = {
     "damper": ('<damper name="{name}" joint="{joint}" kv="1" ctrlrange="0 1"/>', "its gain depends on"),
     "constant push": (
         '<general name="{name}" joint="{joint}" biastype="affine" biasprm="3 0 0" ctrlrange="-9 9"/>', "even at control 0"),
+    "delay": ('<motor name="{name}" joint="{joint}" ctrlrange="-9 9" nsample="4" delay="0.01"/>', "acts after a delay"),
     "one side only": ('<motor name="{name}" joint="{joint}" ctrlrange="0 12"/>', "'push_e' pushes from 0 to 12 N only"),
     "no limit": ('<motor name="{name}" joint="{joint}"/>', "'push_e' has no limit"),
 }  # fmt: off
@@ -220,6 +221,8 @@ def test_a_robot_that_does_not_follow_is_a_failed_row(write):
     name = write(cart(joints=SLIDES.replace("axis", 'damping="500" axis')))
     row, _ = fly_gate(name, "scripted")
     assert row.failure is not None and "from its reference" in row.failure
+    step = next(item for item in checklist(name) if item.name == "step")
+    assert not step.passed and "its force is at the limit of 12 N" in step.said
 
 
 # Options ---------------------------------------------------------------------------------------------------------------------
@@ -423,3 +426,39 @@ def test_fields_of_the_wrong_kind_are_named(changes, message):
     """As soon as the robot is made."""
     with pytest.raises(ConfigurationError, match=message):
         direct("cart.xml", **changes)
+
+
+def test_a_direct_robot_in_python_has_the_files_gear_and_limits(write):
+    """Its motors give the planar force, and its limit may not be more than they can give."""
+    text = cart(motors=both('<motor name="{name}" joint="{joint}" gear="-30" ctrlrange="-1 1" forcerange="-0.4 1"/>'))
+    source = (
+        "from pathlib import Path\nfrom marlbc_mj.robots import Robot\n"
+        'ROBOT = Robot(name="r", mjcf=Path(__file__).with_name("cart.xml"), description="d", joints=("east", "north"),\n'
+        '    motors=("push_e", "push_n"), body="cart", radius=0.2, mass=3.0, force_limit={}, speed_limit=1.0,\n'
+        "    acceleration_limit=1.0, gains=(64.0, 16.0), substep=0.0025)\n"
+    )
+    write(text)
+    name = write(source.format("12.0"), "good.py")
+    world, _, v, force = push(name, (0.5, -0.3), 0.3, 0.5)
+    np.testing.assert_allclose(np.diff(v, axis=0), world.scenario.substep * force[:-1] / MASS, rtol=1e-6, atol=1e-9)
+    with pytest.raises(ConfigurationError, match="force_limit is 20 N, but cart.xml lets its motors give 12 N"):
+        make_robot(write(source.format("20.0"), "strong.py"))
+
+
+def test_laws_need_slides_along_the_axes(write):
+    """Disturbances are pushed into these joints."""
+    omni = make_robot("omni")
+    robot = direct(
+        write(cart(joints=SLIDES.replace("1 0 0", "-1 0 0"))),
+        motors=(),
+        **{field: getattr(omni, field) for field in ("drive", "reading", "params", "state")},
+    )
+    with pytest.raises(ConfigurationError, match=r"joints\[0\] 'east' moves along .*; it must slide along \+x"):
+        robot.spec()
+
+
+def test_the_command_line_takes_a_robot_and_its_scale(write, tmp_path):
+    """For any scenario."""
+    name = write(cart())
+    main(["run", "paper", "--robot", name, "--controller", "pd", "--duration", "0.5", "--out", str(tmp_path / "out")])
+    assert (tmp_path / "out" / "metrics.json").exists()

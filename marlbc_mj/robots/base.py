@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.core import laws
-from marlbc_mj.robots.planar import straighten
+from marlbc_mj.robots.planar import check_slides, straighten
 from marlbc_mj.robots.standard import plain_name, quiet, standard_text
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
@@ -158,11 +158,13 @@ class Robot:
             spec = mujoco.MjSpec.from_string(standard_text(self.mjcf))
             self.prepare(spec)
             self._check_names(spec)
-            if self.direct:
-                try:
+            try:
+                if self.direct:
                     straighten(spec, self.body, self.joints, self.motors)
-                except ConfigurationError as error:
-                    raise ConfigurationError(f"robot {self.name!r}, {self.mjcf.name}: {error}") from error
+                elif len(self.joints) == 2:
+                    check_slides(spec, self.joints)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"robot {self.name!r}, {self.mjcf.name}: {error}") from error
         return spec
 
     def _check_names(self, spec: mujoco.MjSpec) -> None:

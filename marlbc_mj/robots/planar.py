@@ -266,6 +266,18 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
         _limit(actuator, found.low, found.high)
 
 
+def check_slides(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
+    """Raise ConfigurationError unless two joints slide along +x and +y: unknown dynamics push there."""
+    model = spec.copy().compile()
+    directions = posed(model).xaxis
+    for axis, name in enumerate(joints):
+        k = model.joint(name).id
+        if model.jnt_type[k] != _SLIDE or directions[k][axis] < 1.0 - _PARALLEL:
+            raise ConfigurationError(
+                f"joints[{axis}] {name!r} moves along {np.round(directions[k], 3).tolist()}; it must slide along +{'xy'[axis]}"
+            )
+
+
 def _limit(actuator: Any, low: float, high: float) -> None:
     bounded = bool(np.isfinite((low, high)).all())
     actuator.ctrlrange = actuator.forcerange = (low, high) if bounded else (0.0, 0.0)

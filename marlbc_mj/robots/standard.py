@@ -83,6 +83,8 @@ def _try_out(path: Path) -> None:
     Raises:
         ConfigurationError: it does.
     """
+    if not sys.executable:  # Python is embedded in another program
+        return
     command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY), str(path)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_TIME, cwd=path.resolve().parent)

@@ -175,10 +175,21 @@ def _step_test(robot: Robot) -> Iterator[Item]:
     off = float(np.abs(p[-1] - target[-1]).max()) / robot.length
     beyond = float((p - scenario.formations[0]).max()) / robot.length
     good = off < SETTLED and beyond < OVERSHOOT
-    yield Item("step", good, f"{off:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal")
+    cause = "" if good else _cause(scenario, force, np.concatenate([r.velocity[0] for r in records if r is not None]))
+    yield Item("step", good, f"{off:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal{cause}")
     yield _measured(robot, truths, force)
     yield _saturation(robot, world, force)
     yield from _flight(robot, world, truths)
+
+
+def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
+    """What may be behind a step that is not followed, from forces and velocities (T, N, 2)."""
+    if float((force * v).sum()) < 0.0:
+        return ": it moves against its force; are axes exchanged or reversed in its drive or its reading?"
+    share = float((np.abs(force) > 0.99 * scenario.force_limit).any(axis=-1).mean())
+    if share > 0.2:
+        return f": its force is at the limit of {scenario.force_limit:g} N for {100 * share:.0f} % of the time; what brakes it?"
+    return ": mass, gains or limits do not fit what it weighs and what brakes it"
 
 
 def _measured(robot: Robot, truths: Sequence[Truth], force: np.ndarray) -> Item:
