@@ -35,6 +35,8 @@ class ScenarioOptions:
     """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
     duration: float | None = None
     """Mission time [s]."""
+    robot: str | None = None
+    """Robot, by name, path of an .xml or .py file, or FILE.py:NAME; a scenario takes its mass, force and limits."""
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
@@ -51,7 +53,18 @@ class ScenarioOptions:
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        return make_scenario(name, **changes)
+        return make_scenario(name, **self._robot_changes(name), **changes)
+
+    def _robot_changes(self, name: str) -> dict[str, Any]:
+        """What another robot changes, but for what other options set."""
+        from marlbc_mj.robots import make_robot
+
+        if self.robot is None:
+            return {}
+        if name == "robot_gate":
+            return {"robot": self.robot}
+        scale = make_robot(self.robot).scale()
+        return {key: value for key, value in scale.items() if getattr(self, key, None) is None or key == "robot"}
 
 
 @dataclass(frozen=True)

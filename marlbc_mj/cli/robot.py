@@ -15,7 +15,7 @@ class RobotCheckCommand:
     """Go through the checklist of a robot; exit status 1 if something fails."""
 
     file: Positional[str]
-    """A robot's MJCF (.xml) or Python file (.py), menagerie:FOLDER/FILE.xml, or a name from `marlbc list`."""
+    """A robot's MJCF (.xml), Python file (.py, or .py:NAME), menagerie:FOLDER/FILE.xml, or a name from `marlbc list`."""
 
     def run(self) -> None:
         """Print one line per check."""
@@ -61,6 +61,8 @@ class RobotGateCommand:
                 progress=progress,
             )
         print(done.report.text)
+        if any(row.failure for row in done.results):
+            sys.exit(3)
 
 
 @dataclass(frozen=True)

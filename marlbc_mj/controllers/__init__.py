@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from typing import cast
 
 from marlbc_mj.controllers.base import Controller, largest_stable_substep
 from marlbc_mj.controllers.homogeneous import FiniteTime, FixedTime
@@ -12,7 +13,8 @@ from marlbc_mj.controllers.predefined_time import PredefinedTime
 from marlbc_mj.controllers.rlc import RLC
 from marlbc_mj.controllers.sorlc import SORLC
 from marlbc_mj.controllers.terminal_sliding import TerminalSliding
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.modules import made, names_attribute
 
 _UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR | TerminalSliding | PredefinedTime], str]] = {
     "rlc": (RLC, "single-agent RL controller: SORLC's networks, next to no damping, no limit"),
@@ -36,14 +38,24 @@ for _name, (_law, _line) in _UNLIMITED.items():
     CONTROLLERS[f"{_name}-limited"] = (partial(replace, _law(), limited=True), _line.replace("no limit", "actuator limited"))
 
 
+CONTROLLER_PARTS = ("law", "limited", "linear_gains", "params", "initial_state")
+"""What every controller has."""
+
+
 def make_controller(name: str) -> Controller:
-    """A controller with its default gains, by name.
+    """A controller with its default gains, by name, or ``file.py:Name`` of a user's Python file.
 
     Raises:
-        ConfigurationError: unknown name.
+        ConfigurationError: unknown name, or a file that gives no controller.
     """
+    if names_attribute(name):
+        controller = made(name, Controller)
+        lacking = [each for each in CONTROLLER_PARTS if not hasattr(controller, each)]
+        if lacking:
+            raise ConfigurationError(f"{name} is no controller: {type(controller).__name__} lacks {', '.join(lacking)}")
+        return cast(Controller, controller)
     if name not in CONTROLLERS:
-        raise unknown("controller", name, CONTROLLERS)
+        raise unknown("controller", name, (*CONTROLLERS, "FILE.py:NAME"))
     return CONTROLLERS[name][0]()
 
 

@@ -2,8 +2,9 @@
 
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FunctionType, ModuleType
 from typing import Any, cast
 
 # Read once, when the first OpenMP library loads. Threads that spin while they wait would take the cores from torch's (and from
@@ -11,6 +12,7 @@ from typing import Any, cast
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
+import numpy as np
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
@@ -30,7 +32,50 @@ def sources_stamp(package: Path) -> int:
 
 COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
 """What is found in files that hold compiled code."""
-SOURCES = sources_stamp(Path(__file__).parents[1])
+_PACKAGE = Path(__file__).parents[1]
+SOURCES = sources_stamp(_PACKAGE)
+_MOST_BESIDE = 500
+"""More Python files in the folder of a user's law than these are not looked at."""
+
+
+def _stamp(function: Law) -> tuple[Any, ...]:
+    """What compiled code of a function depends on: this package, and for a user's law the files beside it and what it uses."""
+    path = Path(function.__code__.co_filename)
+    if path.is_relative_to(_PACKAGE):
+        return (SOURCES,)
+    beside = sorted(path.parent.glob("*.py"))[:_MOST_BESIDE] if path.is_file() else []
+    return (SOURCES, *(_checksum(file) for file in beside), zlib.crc32("".join(_used(function, set())).encode()))
+
+
+def _checksum(file: Path) -> int:
+    try:
+        return zlib.crc32(file.read_bytes())
+    except OSError:
+        return 0
+
+
+_VALUES = (bool, int, float, complex, str, tuple, np.generic, np.ndarray)
+"""Kinds of global values and constants that numba compiles into a function."""
+
+
+def _used(function: Law, seen: set[int]) -> Iterator[str]:
+    """Text of a function's code, and of the values and functions that it finds by global names."""
+    function = plain(function)
+    code = getattr(function, "__code__", None)
+    if code is None or id(function) in seen:
+        return
+    seen.add(id(function))
+    yield f"{code.co_code.hex()} {code.co_names} {[constant for constant in code.co_consts if isinstance(constant, _VALUES)]}"
+    for name in code.co_names:
+        value: Any = function.__globals__.get(name)
+        if isinstance(value, ModuleType):
+            file = getattr(value, "__file__", None)
+            if file is not None and "site-packages" not in file and not Path(file).is_relative_to(_PACKAGE):
+                yield f"{name} {_checksum(Path(file))}"
+        elif isinstance(plain(value), FunctionType):
+            yield from _used(value, seen)
+        elif isinstance(value, _VALUES):
+            yield f"{name} {value.tobytes().hex() if isinstance(value, np.ndarray) else value}"
 
 
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
@@ -44,8 +89,22 @@ def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
         return cast(Law, numba.njit(**options)(function))
     if cache and is_compiled(law):
         index = law._cache._cache_file
-        index._source_stamp = (index._source_stamp, SOURCES)
+        index._source_stamp = (index._source_stamp, *_stamp(function))
+        law._cache.load_overload = _forgiving(law._cache.load_overload)
+        law._cache.save_overload = _forgiving(law._cache.save_overload)
     return cast(Law, law)
+
+
+def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:
+    """Access to the cache; None where its files are torn, come from elsewhere or cannot be written: then the law is compiled."""
+
+    def attempt(*arguments: Any) -> Any:
+        try:
+            return access(*arguments)
+        except Exception:
+            return None
+
+    return attempt
 
 
 def threaded(function: Law) -> Law:

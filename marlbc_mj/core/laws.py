@@ -26,6 +26,7 @@ calls by address is the law's team form, which sees each row by its names. A law
 Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or for coverage.
 """
 
+import inspect
 from typing import Any, cast
 
 import numba
@@ -86,11 +87,32 @@ def _declare(function: Law, signature: Any, gains: Declared, state: Declared = (
 
     The team form of a law that closes over values is not cached on disk, since numba cannot see those values there.
     """
+    _check_arguments(function, signature)
     vars(function)["interface"] = Interface(signature, Names.of(gains), Names.of(state))
     law: Any = allocation_free(function)
     if is_compiled(law):
         law.entry = allocation_free(on_rows(law, signature), cache=not getattr(function, "__closure__", None))
     return cast(Law, law)
+
+
+ARGUMENTS = {
+    BEHAVIOR: "gains, p, path, obstacles, team, agent, velocity_out, jacobian_out",
+    CONTROLLER: "gains, state, p, v, p_r, v_r, drag, h, force_out",
+    DISTURBANCE: "gains, t, p, v, force_out",
+    DRIVE: "gains, state, qpos, qvel, force, h, ctrl_out",
+    READING: "gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out",
+}
+"""Arguments of every kind of law, by position."""
+
+
+def _check_arguments(function: Law, signature: Any) -> None:
+    """Raise ConfigurationError for a law with another number of arguments than its kind has."""
+    wanted = ARGUMENTS[signature]
+    try:
+        inspect.signature(function).bind(*wanted.split(", "))
+    except TypeError as error:
+        given, name = ", ".join(inspect.signature(function).parameters), name_of(function)
+        raise ConfigurationError(f"law {name!r} takes ({given}), but its kind is called with ({wanted})") from error
 
 
 def _decorator(function: Law | None, signature: Any, gains: Declared, state: Declared = ()) -> Law:

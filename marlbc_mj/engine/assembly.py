@@ -7,6 +7,7 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.robots import MODELS, Robot, make_robot
+from marlbc_mj.robots.standard import quiet
 from marlbc_mj.scenarios import Obstacle, Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
@@ -18,8 +19,10 @@ MARGIN = 4.0  # that the top camera leaves around the mission [m]
 MEMORY = 256 * 1024  # arena of one MjData [bytes]; MuJoCo's default is 13.6 MB, too much for thousands of worlds
 MEMORY_PER_AGENT = 4 * 1024  # beyond the first 32; measured with 256: 133 KiB in use. Only what is used becomes resident
 MEMORY_OF_CONTACTS = 512 * 1024  # more of it for every agent that touches ground, obstacles and others [bytes]
-CONTACT_OPTIONS = ("cone", "impratio", "noslip_iterations", "iterations", "tolerance", "integrator", "solver")
-"""Options of a robot's MJCF that its contacts depend on: the arena takes them over."""
+_OWN = ("timestep", "disableflags")
+OPTIONS = tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_") and name not in _OWN)
+"""Options of a robot's MJCF that the arena takes over, gravity and air among them: whoever flies or slides there depends on them.
+The time step is the scenario's."""
 
 
 def agent_prefix(agent: int) -> str:
@@ -50,15 +53,17 @@ def assemble(scenario: Scenario, limit: float) -> str:
     for k, obstacle in enumerate(scenario.obstacles):
         _add_obstacle(spec, k, obstacle, robot)
     _add_cameras(spec, scenario)
-    spec.compile()
-    return str(spec.to_xml())
+    with quiet():
+        spec.compile()
+        return str(spec.to_xml())
 
 
 def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
     """Take the options of contact from the robot's MJCF, and draw the ground at its scale."""
     child = robot.spec()
-    for name in CONTACT_OPTIONS:
+    for name in OPTIONS:
         setattr(spec.option, name, getattr(child.option, name))
+    spec.option.disableflags |= child.option.disableflags
     if robot.ground:
         ground = spec.geom("ground")
         ground.contype = ground.conaffinity = 1
@@ -70,8 +75,11 @@ def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
 
 def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: float) -> None:
     child = robot.spec()
+    child.option.timestep, child.option.disableflags = spec.option.timestep, spec.option.disableflags  # else they conflict
     geoms = child.body(robot.body).geoms
     total = sum(geom.mass for geom in geoms)
+    if robot.mass is None and not total > 0:
+        raise ConfigurationError(f"robot {robot.name!r} has no mass; give the geoms of body {robot.body!r} one")
     for geom in geoms:
         geom.rgba = agent_color(agent) if robot.mass is None or not geom.material else geom.rgba
         if robot.mass is None:

@@ -113,11 +113,7 @@ def make_stage(log: EpisodeLog) -> Stage:
         model = mujoco.MjModel.from_xml_string(log.mjcf)
         unit, radius = _size(model)
         free = _free_joints(model, agents)
-        joints = (
-            [[model.joint(agent_prefix(i) + axis).qposadr[0] for axis in "xy"] for i in agents]
-            if not free
-            else [[first, first + 1] for first in free]
-        )
+        joints = [_slides(model, agent_prefix(i)) for i in agents] if not free else [[first, first + 1] for first in free]
         data = mujoco.MjData(model)
         discs = [model.geom(f"obstacle{k + 1}").id for k in range(len(log.obstacles))]
         _place_obstacles(model, data, discs, log.obstacles, unit)
@@ -144,6 +140,22 @@ def _free_joints(model: mujoco.MjModel, agents: range) -> list[int]:
         if model.body(model.jnt_bodyid[j]).name.startswith(tuple(agent_prefix(i) for i in agents)):
             found.append(int(model.jnt_qposadr[j]))
     return found
+
+
+def _slides(model: mujoco.MjModel, prefix: str) -> list[int]:
+    """Addresses in qpos of an agent's slides along x and y.
+
+    Raises:
+        KeyError: it has none.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    slides = [j for j in range(model.njnt) if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE]
+    own = [j for j in slides if model.body(model.jnt_bodyid[j]).name.startswith(prefix)]
+    found = [next((j for j in own if data.xaxis[j][axis] > 1.0 - 1e-6), None) for axis in (0, 1)]
+    if None in found:
+        raise KeyError(f"{prefix} has no slides along x and y")
+    return [int(model.jnt_qposadr[j]) for j in found if j is not None]
 
 
 def _size(model: mujoco.MjModel) -> tuple[float, float]:

@@ -135,7 +135,7 @@ def _methods(results: Sequence[Result]) -> list[Plot]:
 
 def _method(result: Result, trajectory: Trajectory, supervisor: bool) -> list[Plot]:
     def own(kind: str, caption: str, draw: Callable[[], Figure], narrow: bool = False) -> Plot:
-        return Plot(f"{kind}_{result.supervisor}_{result.controller}", caption, draw, result.key, narrow)
+        return Plot(f"{kind}_{result.key.replace('+', '_')}", caption, draw, result.key, narrow)
 
     found = []
     if supervisor:

@@ -54,8 +54,16 @@ class Result:
 
 
 def method_key(supervisor: str, controller: str) -> str:
-    """The name of a method in summaries and files: ``scripted+sorlc``."""
-    return f"{supervisor}+{controller}"
+    """The name of a method in summaries and files: ``scripted+sorlc``; of what a user's file has, without its folder."""
+    return f"{_word(supervisor)}+{_word(controller)}"
+
+
+def _word(name: str) -> str:
+    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
+    file, _, attribute = name.rpartition(":")
+    if file:
+        return f"{Path(file).stem}.{attribute}"
+    return Path(name).stem if "/" in name or name.endswith(".safetensors") else name
 
 
 def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str, str]) -> dict[str, Any]:

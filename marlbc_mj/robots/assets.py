@@ -8,28 +8,40 @@ MOST_VERTICES = 4000
 
 
 def embed(spec: mujoco.MjSpec) -> None:
-    """Put meshes into the text, drop textures, and fix inertias first, so that no number of the physics changes."""
-    if not any(m.file for m in spec.meshes) and not any(t.file for t in spec.textures):
+    """Put meshes and height fields into the text, drop textures, and fix inertias first: no number of the physics changes."""
+    textures = [t for t in spec.textures if t.file or any(t.cubefiles)]
+    if not textures and not any(asset.file for asset in (*spec.meshes, *spec.hfields)):
         return
-    model = spec.copy().compile()  # a mesh that has been compiled keeps what it has read
-    for body in spec.bodies[1:]:
-        compiled = model.body(body.name)
+    copied = spec.copy()  # a mesh that has been compiled keeps what it has read
+    model = copied.compile()
+    for body, source in zip(spec.bodies[1:], copied.bodies[1:], strict=True):
+        compiled = model.body(source.id)
         body.explicitinertial, body.fullinertia = True, np.full(6, np.nan)
         body.mass, body.ipos, body.iquat = compiled.mass[0], compiled.ipos, compiled.iquat
         body.inertia = compiled.inertia
-    for mesh in spec.meshes:
+    for mesh, source in zip(spec.meshes, copied.meshes, strict=True):
         if mesh.file:
-            _inline(mesh, model)
+            _inline(mesh, model, source.id)
+    for field, source in zip(spec.hfields, copied.hfields, strict=True):
+        if field.file:
+            _inline_heights(field, model, source.id)
     for material in spec.materials:
-        material.textures = [""] * len(material.textures)
-    for texture in [t for t in spec.textures if t.file]:
+        if textures:
+            material.textures = [""] * len(material.textures)
+    for texture in textures:
         spec.delete(texture)
 
 
-def _inline(mesh: mujoco.MjsMesh, model: mujoco.MjModel) -> None:
+def _inline_heights(field: mujoco.MjsHField, model: mujoco.MjModel, k: int) -> None:
+    """Heights between 0 and 1, as MuJoCo keeps them."""
+    first, rows, columns = int(model.hfield_adr[k]), int(model.hfield_nrow[k]), int(model.hfield_ncol[k])
+    field.file, field.nrow, field.ncol = "", rows, columns
+    field.userdata = model.hfield_data[first : first + rows * columns].tolist()
+
+
+def _inline(mesh: mujoco.MjsMesh, model: mujoco.MjModel, k: int) -> None:
     """Vertices and faces in the frame and units of the file that they came from."""
-    compiled = model.mesh(mesh.name)
-    k = compiled.id
+    compiled = model.mesh(k)
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, model.mesh_quat[k])
     first, count = compiled.vertadr[0], compiled.vertnum[0]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.core import laws
+from marlbc_mj.robots.planar import check_slides, straighten
+from marlbc_mj.robots.standard import plain_name, quiet, standard_text
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
@@ -32,8 +35,10 @@ class Robot:
     """How a body's planar position and velocity are found, and how a planar force drives it. Names are those inside the MJCF.
 
     A robot without laws is *direct*: its two ``motors`` push along x and y with the scenario's force limit, and p, v are its
-    joints' own. Every other robot has a ``drive`` that turns the force into controls before each substep and a ``reading`` of p,
-    v and the force that its actuators really gave, after it.
+    joints' own; gears, reversed or offset slides and forms of limits are taken into account.
+
+    Every other robot has a ``drive`` that turns the force into controls before each substep and a ``reading`` of p, v and the
+    force that its actuators really gave, after it.
 
     ``mass`` and what follows it are the scale of a robot's missions, see :meth:`scale`. A robot with no mass of its own takes the
     scenario's, as the paper's point mass does.
@@ -70,6 +75,7 @@ class Robot:
     prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
 
     def __post_init__(self) -> None:
+        self._check_kinds()
         positive = ("radius", "mass", "force_limit", "speed_limit", "acceleration_limit", "length", "substep")
         for name in positive:
             value = getattr(self, name)
@@ -83,6 +89,24 @@ class Robot:
             raise ConfigurationError(f"robot {self.name!r} needs two motors, or a drive and a reading; got {self.motors}")
         if len(self.joints) not in (1, 2):
             raise ConfigurationError(f"robot {self.name!r}: joints must name two slides or one free joint, got {self.joints}")
+
+    def _check_kinds(self) -> None:
+        """Raise ConfigurationError for a field of the wrong kind; names lose their slashes, as those of the MJCF do."""
+        if not isinstance(self.mjcf, Path):
+            raise ConfigurationError(f"robot {self.name!r}: mjcf must be a pathlib.Path, got {self.mjcf!r}; write Path(...)")
+        if not isinstance(self.body, str):
+            raise ConfigurationError(f"robot {self.name!r}: body must be the name of a body, got {self.body!r}")
+        for field_name in ("joints", "motors", "report"):
+            value = getattr(self, field_name)
+            if not isinstance(value, tuple) or not all(isinstance(each, str) for each in value):
+                raise ConfigurationError(f"robot {self.name!r}: {field_name} must be a tuple of names, got {value!r}")
+            if field_name != "report":
+                object.__setattr__(self, field_name, tuple(map(plain_name, value)))
+        object.__setattr__(self, "body", plain_name(self.body))
+        for field_name in ("radius", "mass", "force_limit", "speed_limit", "acceleration_limit", "length", "substep", "height"):
+            value = getattr(self, field_name)
+            if not (value is None and field_name == "mass") and not isinstance(value, int | float | np.number):
+                raise ConfigurationError(f"robot {self.name!r}: {field_name} must be a number, got {value!r}")
 
     @property
     def direct(self) -> bool:
@@ -110,18 +134,60 @@ class Robot:
         """Where in the state each number is that ``report`` names."""
         return {} if self.drive is None else {name: laws.interface(self.drive).state.at(name) for name in self.report}
 
+    @property
+    def shipped(self) -> bool:
+        """Whether its MJCF comes with this package and is taken as it is."""
+        return self.mjcf.is_relative_to(MODELS)
+
     def spec(self) -> mujoco.MjSpec:
-        """The MJCF, ready to be attached.
+        """The MJCF, ready to be attached. A user's file is read once, and brought into standard form.
 
         Raises:
-            ConfigurationError: the file cannot be read or is no MJCF.
+            ConfigurationError: the file cannot be read, is no MJCF, or lacks what the robot names.
         """
+        if not self.shipped:
+            return self._prepared.copy()
         try:
             spec = mujoco.MjSpec.from_file(str(self.mjcf))
         except (ValueError, FileNotFoundError) as error:
             raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {one_line(error)}") from error
         self.prepare(spec)
         return spec
+
+    @cached_property
+    def _prepared(self) -> mujoco.MjSpec:
+        """A user's MJCF in standard form; of a direct robot with planar forces for controls."""
+        with quiet():
+            spec = mujoco.MjSpec.from_string(standard_text(self.mjcf))
+            self.prepare(spec)
+            self._check_names(spec)
+            try:
+                if self.direct:
+                    straighten(spec, self.body, self.joints, self.motors)
+                elif len(self.joints) == 2:
+                    check_slides(spec, self.joints)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"robot {self.name!r}, {self.mjcf.name}: {error}") from error
+        return spec
+
+    def _check_names(self, spec: mujoco.MjSpec) -> None:
+        """Raise ConfigurationError for a body, joint or motor that the MJCF does not have."""
+        there = {
+            "body": ((self.body,), [body.name for body in spec.bodies[1:]]),
+            "joints": (self.joints, [joint.name for joint in spec.joints]),
+            "motors": (self.motors, [actuator.name for actuator in spec.actuators]),
+        }
+        for field_name, (wanted, names) in there.items():
+            for name in wanted:
+                if name not in names:
+                    raise ConfigurationError(
+                        f"robot {self.name!r}: {field_name} names {name!r}, which {self.mjcf.name} does not have; "
+                        f"it has: {', '.join(names) or 'none'}"
+                    )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The fields alone: what was read from the file is read again."""
+        return {name: value for name, value in vars(self).items() if name != "_prepared"}
 
     def scale(self) -> dict[str, Any]:
         """The fields of a :class:`~marlbc_mj.scenarios.Scenario` that this robot sets: mass, limits, force unit, substep."""

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.robots.multirotor import MOST_ROTORS
+from marlbc_mj.robots.planar import effects, no_motor
 from marlbc_mj.util.errors import ConfigurationError
 
 HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # of the height [1/s^2, 1/s]
@@ -54,14 +55,26 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
     """The gains that are one number or row per rotor, padded with zeros to MOST_ROTORS."""
     if model.nu > MOST_ROTORS:
         raise ConfigurationError(f"{name}: at most {MOST_ROTORS} rotors, got {model.nu}")
-    effect = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(effect, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    for u in range(model.nu):
+        why = no_motor(model, u)
+        if why is not None:
+            raise ConfigurationError(f"{name}: actuator {model.actuator(u).name!r} is no motor: {why}")
+    effect = effects(model, data)
     rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
     if np.linalg.matrix_rank(rotors, tol=1e-9) < 4:
         raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and three moments")
     shares = np.linalg.pinv(rotors)
-    least, most = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf)).T
+    least, most = _control_limits(model)
     lift = rotors[0] / model.actuator_gainprm[:, 0]
     own = {"thrust_share": shares[:, 0], "moment_share": shares[:, 1:], "least": least, "most": most, "lift": lift}
     padding = MOST_ROTORS - model.nu
     return {key: [*rows.tolist(), *np.zeros((padding, *rows.shape[1:])).tolist()] for key, rows in own.items()}
+
+
+def _control_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Least and most control (rotors,) by ``ctrlrange`` and, where it is tighter, by ``forcerange``."""
+    limits = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
+    by_force = np.sort(model.actuator_forcerange / model.actuator_gainprm[:, :1], axis=1)
+    tighter = (model.actuator_forcelimited == 1)[:, None] & (np.abs(by_force) < np.abs(limits) * (1 - 1e-9))
+    least, most = np.where(tighter, by_force, limits).T
+    return least, most

@@ -1,12 +1,12 @@
 """Robots from a user's file: a Python file that makes one, or any MJCF whose way of driving can be told from its actuators.
 
-A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one.
-An MJCF is taken as it is: two slide joints or a free joint with motors along x and y are driven directly, a free joint with
-rotors that lift and turn flies. A path that starts with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
+A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one;
+``file.py:NAME`` takes another name from it. An MJCF is taken as it is: two slide joints or a free joint with motors along x and y
+are driven directly, whatever their gears, senses and order; a free joint with rotors that lift and turn flies. A path that starts
+with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
 """
 
 import os
-import runpy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,24 +14,25 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.base import Robot
 from marlbc_mj.robots.multirotor import REPORT, rotor_drive, rotor_reading
+from marlbc_mj.robots.planar import Reason, base_of, check_motors, find_base, find_motors, largest_force, posed, slides_first
 from marlbc_mj.robots.rotors import Attitude, rotor_numbers
-from marlbc_mj.util.errors import ConfigurationError, MarlbcError
-from marlbc_mj.util.text import one_line
+from marlbc_mj.robots.standard import standard_text
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.modules import guarded, load_module, made, split_name
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
-_UNDRIVEN = "{}: its actuators neither push along x and y nor lift and turn; write a Python file with a drive and a reading"
-FREE = "base_free"  # name of a free joint that has none
+_WAY_OUT = "write a Python file with a drive and a reading"
+_UNDRIVEN = "{}: its actuators neither push along x and y nor lift and turn; " + _WAY_OUT
 FLIGHT = Attitude((250.0, 250.0, 230.0), (20.0, 20.0, 25.0), 0.08)
 """A brisk attitude loop and thrust lag for rotorcraft that no one has identified: a small quadrotor's, rounded."""
 
 
 def is_file(name: str) -> bool:
     """Whether a robot's name is a path rather than a name."""
-    return name.endswith(SUFFIXES) or name.startswith(MENAGERIE)
+    return split_name(name)[0].endswith(SUFFIXES) or name.startswith(MENAGERIE)
 
 
 def find(name: str) -> Path:
@@ -40,7 +41,7 @@ def find(name: str) -> Path:
     Raises:
         ConfigurationError: it is not there, has no known suffix, or Menagerie is asked for and MENAGERIE_ROOT is not set.
     """
-    path = Path(name)
+    path = Path(split_name(name)[0])
     if name.startswith(MENAGERIE):
         root = os.environ.get(MENAGERIE_ROOT)
         if not root:
@@ -64,55 +65,51 @@ def load(name: str) -> Robot:
 
 
 def _from_python(path: Path, name: str) -> Robot:
-    try:
-        found = runpy.run_path(str(path))
-    except MarlbcError:
-        raise
-    except Exception as error:
-        raise ConfigurationError(f"robot file {path} fails: {type(error).__name__}: {error}") from error
-    make: Any = found.get("robot")
-    robot = make() if callable(make) else found.get("ROBOT")
+    attribute = split_name(name)[1]
+    robot = made(name, Robot) if attribute else _default_robot(path)
     if not isinstance(robot, Robot):
         raise ConfigurationError(f"robot file {path} defines neither ROBOT, a Robot, nor robot(), which returns one")
-    check_mjcf(robot.mjcf)
-    return replace(robot, name=name)
+    robot = replace(robot, name=name)
+    model = robot.spec().compile() if robot.shipped else check_mjcf(robot.mjcf)
+    if robot.direct and robot.mass is not None and not robot.shipped:
+        most = largest_force(check_motors(model, base_of(model, robot.body, robot.joints), robot.motors))
+        if robot.force_limit > most * (1 + 1e-9):
+            raise ConfigurationError(
+                f"robot {name!r}: force_limit is {robot.force_limit:g} N, but {robot.mjcf.name} lets its motors give {most:g} N"
+            )
+    return robot
+
+
+def _default_robot(path: Path) -> Any:
+    """``robot()`` or ``ROBOT`` of a file."""
+    module = load_module(path)
+    make = getattr(module, "robot", None)
+    return guarded(make, f"{path}: robot()") if callable(make) else getattr(module, "ROBOT", None)
 
 
 def check_mjcf(path: Path) -> mujoco.MjModel:
-    """Read and compile an MJCF by itself.
+    """Read and compile a user's MJCF by itself.
 
     Raises:
         ConfigurationError: it cannot be read, uses a file outside its folder, or has no mass or no actuator.
     """
-    try:
-        spec = mujoco.MjSpec.from_file(str(path))
-    except (ValueError, FileNotFoundError) as error:
-        raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {one_line(error)}") from error
-    _check_files(path, spec)
-    try:
-        model = spec.compile()
-    except ValueError as error:
-        raise ConfigurationError(f"{path} does not compile: {one_line(error)}") from error
+    return check_model(path, mujoco.MjSpec.from_string(standard_text(path)).compile())
+
+
+def check_model(path: Path, model: mujoco.MjModel) -> mujoco.MjModel:
+    """The model, if it has what every robot needs.
+
+    Raises:
+        ConfigurationError: no mass, no actuator, or an actuator with several controls.
+    """
     if model.nu == 0:
         raise ConfigurationError(f"{path} has no actuators; a robot needs at least two to be driven in the plane")
     if model.nbody < 2 or not model.body_subtreemass[0] > 0:
         raise ConfigurationError(f"{path} has no mass: {model.nbody - 1} bodies weigh {model.body_subtreemass[0]:g} kg")
+    many = np.flatnonzero(getattr(model, "actuator_ctrlnum", np.ones(model.nu)) != 1)
+    if len(many):
+        raise ConfigurationError(f"{path}: actuator {model.actuator(many[0]).name!r} has several controls; use a motor")
     return model
-
-
-def _check_files(path: Path, spec: mujoco.MjSpec) -> None:
-    """Raise ConfigurationError for a mesh, texture or height field outside the MJCF's folder, or missing."""
-    folder = path.resolve().parent
-    named = [(spec.meshdir, m.file) for m in spec.meshes] + [(spec.meshdir, h.file) for h in spec.hfields]
-    named += [(spec.texturedir, t.file) for t in spec.textures]
-    for directory, file in named:
-        if not file:
-            continue
-        target = (folder / directory / file).resolve()
-        if not target.is_relative_to(folder):
-            raise ConfigurationError(f"{path} uses a file outside its folder: {file}")
-        if not target.is_file():
-            raise ConfigurationError(f"{path} uses a file that is not there: {file}")
 
 
 def from_mjcf(path: Path, name: str) -> Robot:
@@ -121,82 +118,62 @@ def from_mjcf(path: Path, name: str) -> Robot:
     Raises:
         ConfigurationError: the file is broken, or its actuators fit none of the ways above.
     """
-    model = check_mjcf(path)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    roots = [b for b in range(1, model.nbody) if model.body_parentid[b] == 0 and model.body_jntnum[b] > 0]
-    if len(roots) != 1 or not model.body(roots[0]).name:
-        names = ", ".join(model.body(b).name or "(unnamed)" for b in roots)
-        still = ", ".join(repr(model.body(b).name) for b in range(1, model.nbody) if model.body_parentid[b] == 0)
-        hint = f"it has {names}" if names else f"give one of its bodies a free joint: {still}"
-        raise ConfigurationError(f"{path} must have one named body that moves by a joint of its own; {hint}")
-    body = model.body(roots[0])
-    joints = [model.joint(j) for j in range(body.jntadr[0], body.jntadr[0] + body.jntnum[0])]
-    free = [j.name for j in joints if j.type[0] == mujoco.mjtJoint.mjJNT_FREE]
-    slides = _slides(joints)
-    fields: dict[str, Any] = {"name": name, "mjcf": path, "body": body.name, "prepare": _complete, **_size(model, data, roots[0])}
-    if not free and slides is None:
-        raise ConfigurationError(f"{path}: body {body.name!r} needs a free joint, or slide joints along x and y")
-    motors = _direct_motors(model, data, roots[0])
+    spec = mujoco.MjSpec.from_string(standard_text(path))
+    moved = slides_first(spec)
+    model = check_model(path, spec.compile())
+    data = posed(model)
+    root = _moving_root(path, model)
+    try:
+        base = find_base(model, root)
+        motors = find_motors(model, base)
+        limit = largest_force(motors) if isinstance(motors, tuple) and not isinstance(motors, Reason) else np.inf
+    except ConfigurationError as error:
+        raise ConfigurationError(f"{path}: {error}") from error
+    fields: dict[str, Any] = {
+        "name": name,
+        "mjcf": path,
+        "body": model.body(base.body).name,
+        "joints": base.joints,
+        "prepare": _slides_first,
+        **_size(model, data, root),
+    }
+    if isinstance(motors, Reason):
+        raise ConfigurationError(f"{path}: actuator {motors.name!r} is no motor: {motors.why}; {_WAY_OUT}")
     if motors is not None:
-        limit = float(np.min(np.abs(model.actuator_ctrlrange[list(motors)])))
-        along_x, along_y = (model.actuator(m).name for m in motors)
-        return _direct(fields, (free[0] or FREE,) if free else slides, (along_x, along_y), limit)
-    if free:
-        return _flying(fields, free[0] or FREE, path)
+        turning = f"; {', '.join(moved)} taken after the slides, so that it turns about itself" if moved else ""
+        return _direct({**fields, "description": f"two motors along x and y{turning}"}, (motors[0].name, motors[1].name), limit)
+    if len(base.joints) == 1:
+        return _flying(fields, path, spec)
     raise ConfigurationError(_UNDRIVEN.format(path))
 
 
-def _complete(spec: mujoco.MjSpec) -> None:
-    """Name a free joint that has no name, leave lights to the arena, and take external files into the text."""
-    for light in list(spec.lights):
-        spec.delete(light)
-    for joint in spec.joints:
-        if joint.type == mujoco.mjtJoint.mjJNT_FREE and not joint.name:
-            joint.name = FREE
-    embed(spec)
+def _moving_root(path: Path, model: mujoco.MjModel) -> int:
+    """The one body that moves and is carried by none that does."""
+    moves, roots = np.zeros(model.nbody, dtype=bool), []
+    for b in range(1, model.nbody):
+        carried = bool(moves[model.body_parentid[b]])
+        moves[b] = carried or model.body_jntnum[b] > 0
+        if moves[b] and not carried:
+            roots.append(b)
+    if len(roots) != 1:
+        names = ", ".join(model.body(b).name for b in roots)
+        still = ", ".join(repr(model.body(b).name) for b in range(1, model.nbody) if model.body_parentid[b] == 0)
+        hint = f"it has {names}" if names else f"give one of its bodies a free joint: {still}"
+        raise ConfigurationError(f"{path} must have one body that moves by a joint of its own; {hint}")
+    return roots[0]
 
 
-def _slides(joints: list[Any]) -> tuple[str, str] | None:
-    """Names of the slide joints along x and y."""
-    found = []
-    for axis in np.eye(3)[:2]:
-        along = [j.name for j in joints if j.type[0] == mujoco.mjtJoint.mjJNT_SLIDE and np.allclose(np.abs(j.axis), axis)]
-        if not along:
-            return None
-        found.append(along[0])
-    return found[0], found[1]
-
-
-def _effects(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """(actuators, nv): generalized force of each actuator at force 1."""
-    effect = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(effect, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    return effect
-
-
-def _direct_motors(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> tuple[int, int] | None:
-    """Actuators that push the base along x and along y with force = control, and do nothing else, however it is turned."""
-    turned = mujoco.MjData(model)
-    mujoco.mj_integratePos(model, turned.qpos, np.full(model.nv, 0.4), 1.0)
-    mujoco.mj_forward(model, turned)
-    effects = _effects(model, data), _effects(model, turned)
-    found = []
-    for axis in range(2):
-        pure = np.zeros(model.nv)
-        pure[model.body_dofadr[body] + axis] = 1.0
-        same = [
-            u for u in range(model.nu) if all(np.allclose(e[u], pure) for e in effects) and model.actuator_gainprm[u, 0] == 1.0
-        ]
-        if not same:
-            return None
-        found.append(same[0])
-    return found[0], found[1]
+def _slides_first(spec: mujoco.MjSpec) -> None:
+    """What a robot from its MJCF alone needs beyond the standard form."""
+    slides_first(spec)
 
 
 def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> dict[str, Any]:
     """Radius seen from above and mass of the moving body and all below it, and what it touches."""
-    own = [g for g in range(model.ngeom) if model.body_rootid[model.geom_bodyid[g]] == root]
+    carried = {root}
+    for b in range(root + 1, model.nbody):
+        carried |= {b} if model.body_parentid[b] in carried else set()
+    own = [g for g in range(model.ngeom) if model.geom_bodyid[g] in carried]
     reach = [np.linalg.norm(data.geom_xpos[g, :2] - data.xpos[root, :2]) + min(model.geom_rbound[g], 10.0) for g in own]
     radius = float(max(reach, default=0.1)) or 0.1
     touches = bool(model.geom_contype[own].any())
@@ -205,15 +182,11 @@ def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> dict[str, An
     return {**size, "contact": touches, "ground": touches and not floor}
 
 
-def _direct(fields: dict[str, Any], joints: Any, motors: tuple[str, str], limit: float) -> Robot:
-    if not limit > 0:
-        raise ConfigurationError(f"{fields['mjcf']}: motors {motors[0]!r} and {motors[1]!r} need a ctrlrange")
+def _direct(fields: dict[str, Any], motors: tuple[str, str], limit: float) -> Robot:
     fast = limit / fields["mass"]
     return Robot(
         **fields,
-        joints=joints,
         motors=motors,
-        description="two motors along x and y",
         force_limit=limit,
         speed_limit=min(2.0, np.sqrt(fast * fields["length"])),
         acceleration_limit=min(2.0, 0.4 * fast),
@@ -221,21 +194,20 @@ def _direct(fields: dict[str, Any], joints: Any, motors: tuple[str, str], limit:
     )
 
 
-def _flying(fields: dict[str, Any], joint: str, path: Path) -> Robot:
+def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
     try:
-        params, state, mass = rotor_numbers(mujoco.MjSpec.from_file(str(path)), fields["body"], FLIGHT)
+        params, state, mass = rotor_numbers(spec, fields["body"], FLIGHT)
     except ConfigurationError as error:
         raise ConfigurationError(f"{_UNDRIVEN.format(path)} ({error})") from error
     return Robot(
         **{**fields, "mass": mass},
-        joints=(joint,),
         drive=rotor_drive,
         reading=rotor_reading,
         params=params,
         state=state,
         report=REPORT,
         description="rotors that lift and turn",
-        force_limit=0.3 * mass * 9.81,
+        force_limit=0.3 * mass * params["gravity"],
         speed_limit=1.0,
         acceleration_limit=1.0,
         gains=(9.0, 6.0),

@@ -1,6 +1,7 @@
 """Scenarios: frozen problem instances, by name."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
@@ -9,7 +10,8 @@ from marlbc_mj.scenarios.families import FAMILIES, held_out
 from marlbc_mj.scenarios.files import SUFFIX, load_scenario
 from marlbc_mj.scenarios.layout import Layout, Motion
 from marlbc_mj.scenarios.robot_gate import robot_gate
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.modules import made, names_attribute
 
 SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "paper": paper,
@@ -21,16 +23,29 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
 
 
 def make_scenario(name: str, **changes: Any) -> Scenario:
-    """A scenario by name or from a ``.toml`` file, with any of its fields changed.
+    """A scenario by name, from a ``.toml`` file, or ``file.py:Name`` of a user's Python file, with any of its fields changed.
 
     Raises:
         ConfigurationError: unknown name, a file that cannot be loaded, or a change that cannot be run.
     """
+    if names_attribute(name):
+        return _from_python(name, changes)
     if name.endswith(SUFFIX):
         return load_scenario(name, **changes)
     if name not in SCENARIOS:
         raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
     return SCENARIOS[name](**changes)
+
+
+def _from_python(name: str, changes: dict[str, Any]) -> Scenario:
+    """A scenario of a user's file, or what a function there returns."""
+    scenario = made(name, Scenario)
+    if not isinstance(scenario, Scenario):
+        raise ConfigurationError(f"{name} is no Scenario, but {type(scenario).__name__}")
+    try:
+        return replace(scenario, **changes)
+    except TypeError as error:
+        raise ConfigurationError(f"{name}: {error}") from error
 
 
 __all__ = [

@@ -11,6 +11,7 @@
 The file loads into the family's own dataclass, so it knows the same keys, checks and defaults as Python does.
 """
 
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,6 +19,8 @@ from pathlib import Path
 from typing import Any, cast
 
 from marlbc_mj.core.disturbances import DISTURBANCES, Disturbance
+from marlbc_mj.robots import make_robot
+from marlbc_mj.robots.user import is_file
 from marlbc_mj.scenarios.base import Obstacle, Point, Scenario, Window
 from marlbc_mj.scenarios.case_study import cruise, paper
 from marlbc_mj.scenarios.families import FAMILIES
@@ -65,7 +68,7 @@ def load_scenario(path: str | Path, **changes: Any) -> Scenario:
         ConfigurationError: no such file, no TOML, an unknown key or a value of another type (named, with the valid ones), or a
             mission that cannot be flown (with the reason).
     """
-    content = _read(Path(path))
+    content = _with_robot(_read(Path(path)), Path(path), changes)
     name = content.pop("family", None)
     kinds = (*FAMILIES, "custom", "paper", "cruise")
     if name not in kinds:
@@ -90,6 +93,22 @@ def _read(path: Path) -> dict[str, Any]:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"{path} is not TOML: {error}") from error
+
+
+def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The content with the robot's file found beside the scenario's, and the robot's scale where the file does not set it.
+
+    Raises:
+        ConfigurationError: a robot that cannot be made.
+    """
+    name = changes.get("robot", content.get("robot"))
+    if not isinstance(name, str):
+        return content
+    beside = path.parent / name
+    if is_file(name) and "robot" not in changes and beside.is_file():
+        name = str(beside)
+    scale = {key: value for key, value in make_robot(name).scale().items() if value != math.inf}
+    return {**scale, **content, "robot": name}
 
 
 def _changes(content: Mapping[str, Any]) -> dict[str, Any]:

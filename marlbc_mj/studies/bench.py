@@ -17,9 +17,10 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.studies.episodes import EpisodeJob, fly, fly_or_fail, name_method, prepare
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
-from marlbc_mj.supervisors import ON_REQUEST, SUPERVISORS
+from marlbc_mj.supervisors import CHECKPOINT_SUFFIX, ON_REQUEST, SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
 from marlbc_mj.util.files import check_folder, write_json
+from marlbc_mj.util.modules import names_attribute
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
@@ -81,7 +82,7 @@ def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None
     if not names:
         raise ConfigurationError(f"name at least one {kind}: {', '.join(known)}")
     for name in names:
-        if name not in known:
+        if name not in known and not names_attribute(name) and not name.endswith(CHECKPOINT_SUFFIX):
             raise unknown(kind, name, known)
     if len(set(names)) != len(names):
         raise ConfigurationError(f"a {kind} is named twice: {', '.join(names)}")

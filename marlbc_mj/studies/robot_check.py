@@ -1,6 +1,6 @@
 """The checklist for a robot: what a mission will ask of it, tried one by one on the robot itself."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -9,10 +9,11 @@ import numpy as np
 
 from marlbc_mj.controllers import PD
 from marlbc_mj.core.disturbances import LinearDrag
+from marlbc_mj.engine.assembly import OPTIONS
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import Robot, make_robot
-from marlbc_mj.robots.user import check_mjcf
 from marlbc_mj.scenarios import Scenario, standard_behaviors
+from marlbc_mj.studies.robot_truth import Truth, compare, try_laws
 from marlbc_mj.util.errors import MarlbcError
 from marlbc_mj.util.text import one_line
 
@@ -37,10 +38,10 @@ def checklist(name: str) -> Iterator[Item]:
         yield Item("file", False, str(error))
         return
     yield Item("file", True, f"{robot.mjcf.name}: {robot.description}")
-    for check in (_mass, _actuators, _limits, _frame, _joint, _attached):
+    for check in (_mass, _actuators, _limits, _options, _frame, _joint, _laws, _attached):
         item = _guarded(check, robot)
         yield item
-        if not item.passed and check in (_joint, _attached):
+        if not item.passed and check in (_joint, _laws, _attached):
             return
     yield from _step_test(robot)
 
@@ -48,7 +49,7 @@ def checklist(name: str) -> Iterator[Item]:
 def _guarded(check: Callable[[Robot], Item], robot: Robot) -> Item:
     try:
         return check(robot)
-    except (MarlbcError, ValueError, KeyError) as error:
+    except (MarlbcError, ValueError, KeyError, TypeError, IndexError) as error:
         return Item(check.__name__.strip("_"), False, one_line(error))
 
 
@@ -70,18 +71,36 @@ def _mass(robot: Robot) -> Item:
 
 
 def _actuators(robot: Robot) -> Item:
-    model = check_mjcf(robot.mjcf)
+    model, _ = _compiled(robot)
     names = ", ".join(model.actuator(u).name or f"#{u}" for u in range(model.nu))
     return Item("actuators", model.nu > 0, f"{model.nu}: {names}")
 
 
 def _limits(robot: Robot) -> Item:
     model, _ = _compiled(robot)
-    open_ = [model.actuator(u).name or f"#{u}" for u in range(model.nu) if not model.actuator_ctrllimited[u]]
+    limited = model.actuator_ctrllimited | model.actuator_forcelimited
+    open_ = [model.actuator(u).name or f"#{u}" for u in range(model.nu) if not limited[u]]
     if open_:
         return Item("limits", False, f"no ctrlrange: {', '.join(open_)}")
     ranges = {tuple(map(float, r)) for r in model.actuator_ctrlrange}
     return Item("limits", True, ", ".join(f"{low:g} to {high:g}" for low, high in sorted(ranges)))
+
+
+def _options(robot: Robot) -> Item:
+    """What of the file's options a team's world takes over, and what it cannot."""
+    given, usual = robot.spec().option, mujoco.MjSpec().option
+    kept = [
+        f"{name} {_shown(getattr(given, name))}"
+        for name in OPTIONS
+        if not np.array_equal(getattr(given, name), getattr(usual, name))
+    ]
+    lost = [f"timestep {given.timestep:g} s (the scenario's substep counts)"] if given.timestep != usual.timestep else []
+    said = "; ".join(f"{word}: {', '.join(names)}" for word, names in (("kept", kept), ("not kept", lost)) if names)
+    return Item("options", True, said or "MuJoCo's own")
+
+
+def _shown(value: Any) -> str:
+    return " ".join(f"{float(x):g}" for x in np.ravel(value))
 
 
 def _frame(robot: Robot) -> Item:
@@ -96,11 +115,24 @@ def _frame(robot: Robot) -> Item:
 
 
 def _joint(robot: Robot) -> Item:
-    model, _ = _compiled(robot)
+    model, data = _compiled(robot)
     kinds = {int(mujoco.mjtJoint.mjJNT_FREE): "free", int(mujoco.mjtJoint.mjJNT_SLIDE): "slide"}
     found = [kinds.get(int(model.joint(name).type[0]), "other") for name in robot.joints]
     good = found in (["free"], ["slide", "slide"])
-    return Item("joint", good, ", ".join(f"{name} ({kind})" for name, kind in zip(robot.joints, found, strict=True)))
+    said = ", ".join(f"{name} ({kind})" for name, kind in zip(robot.joints, found, strict=True))
+    if found == ["slide", "slide"]:
+        directions = [data.xaxis[model.joint(name).id] for name in robot.joints]
+        for axis, (name, direction) in enumerate(zip(robot.joints, directions, strict=True)):
+            if not np.allclose(direction, np.eye(3)[axis], atol=1e-6):
+                return Item("joint", False, f"{name} slides along {np.round(direction, 3).tolist()}, not along {'xy'[axis]}")
+    elif found == ["free"] and model.joint(robot.joints[0]).bodyid[0] != model.body(robot.body).rootid[0]:
+        return Item("joint", False, f"{said} does not move body {robot.body!r}")
+    return Item("joint", good, said)
+
+
+def _laws(robot: Robot) -> Item:
+    wrong = try_laws(robot)
+    return Item("laws", wrong is None, wrong or ("none: motors push along x and y" if robot.direct else "within their arrays"))
 
 
 def _attached(robot: Robot) -> Item:
@@ -130,8 +162,11 @@ def _step_test(robot: Robot) -> Iterator[Item]:
     scenario = step_scenario(robot)
     world = World(scenario, PD(*robot.gains), record=True)
     orders = np.full((1, 2), scenario.orders.index("FM"))
+    records, truths = [], [compare(world)]
     try:
-        records = [world.step(orders).record for _ in range(scenario.mission_steps)]
+        for _ in range(scenario.mission_steps):
+            records.append(world.step(orders).record)
+            truths.append(compare(world))
     except MarlbcError as error:
         yield Item("step", False, f"diverges: {error}")
         return
@@ -140,9 +175,39 @@ def _step_test(robot: Robot) -> Iterator[Item]:
     off = float(np.abs(p[-1] - target[-1]).max()) / robot.length
     beyond = float((p - scenario.formations[0]).max()) / robot.length
     good = off < SETTLED and beyond < OVERSHOOT
-    yield Item("step", good, f"{off:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal")
+    cause = "" if good else _cause(scenario, force, np.concatenate([r.velocity[0] for r in records if r is not None]))
+    yield Item("step", good, f"{off:.3f} length units off after {DURATION:g} s, {max(beyond, 0.0):.3f} beyond the goal{cause}")
+    yield _measured(robot, truths, force)
     yield _saturation(robot, world, force)
-    yield from _flight(robot, world)
+    yield from _flight(robot, world, truths)
+
+
+def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
+    """What may be behind a step that is not followed, from forces and velocities (T, N, 2)."""
+    if float((force * v).sum()) < 0.0:
+        return ": it moves against its force; are axes exchanged or reversed in its drive or its reading?"
+    share = float((np.abs(force) > 0.99 * scenario.force_limit).any(axis=-1).mean())
+    if share > 0.2:
+        return f": its force is at the limit of {scenario.force_limit:g} N for {100 * share:.0f} % of the time; what brakes it?"
+    return ": mass, gains or limits do not fit what it weighs and what brakes it"
+
+
+def _measured(robot: Robot, truths: Sequence[Truth], force: np.ndarray) -> Item:
+    """p stays with the body, v is its velocity there, and the force is what MuJoCo's actuators gave."""
+    offset = np.stack([truth.offset for truth in truths])
+    astray = float(np.linalg.norm(offset - offset[0], axis=-1).max())
+    away = float(np.linalg.norm(offset[0], axis=-1).max())
+    slip = float(max(truth.velocity_error.max() for truth in truths))
+    said = f"p stays within {1e3 * astray:.3g} mm of its place on {robot.body!r}, v within {1e3 * slip:.3g} mm/s of its velocity"
+    good = astray < 1e-3 * robot.length and away < max(robot.radius, robot.length) and slip < 1e-3 * robot.length
+    gaps = [float(truth.force_error.max()) for truth in truths[1:] if truth.force_error is not None]
+    if gaps:
+        most = max(float(np.abs(force).max()), 1e-9)
+        good = good and max(gaps) < 1e-3 * most
+        said += f", force within {max(gaps):.3g} N of MuJoCo's actuators"
+    if away >= max(robot.radius, robot.length):
+        said = f"p is {away:.3g} m from body {robot.body!r}, where MuJoCo has it (xpos): is it read in the world?"
+    return Item("measured", good, said)
 
 
 def _saturation(robot: Robot, world: World, force: np.ndarray) -> Item:
@@ -162,10 +227,16 @@ def _saturation(robot: Robot, world: World, force: np.ndarray) -> Item:
     return Item("saturation", good, f"largest force {most:.3g} N of {world.scenario.force_limit:.3g} N per axis")
 
 
-def _flight(robot: Robot, world: World) -> Iterator[Item]:
+def _flight(robot: Robot, world: World, truths: Sequence[Truth]) -> Iterator[Item]:
+    heights = np.stack([truth.height for truth in truths])
+    moved = float(np.abs(heights - heights[0]).max())
     found = {name: float(np.abs(world.state.robot[0, :, k]).max()) for name, k in robot.diagnostics.items()}
     if "height_error" in found:
-        yield Item("height", found["height_error"] < HEIGHT, f"held within {1e3 * found['height_error']:.1f} mm")
+        error = max(found["height_error"], moved)
+        yield Item("height", error < HEIGHT, f"held within {1e3 * error:.1f} mm")
+    else:
+        why = "" if moved < HEIGHT else ": nothing holds it up; give it ground to stand on, slides, or no gravity"
+        yield Item("height", moved < HEIGHT, f"body {robot.body!r} stays within {1e3 * moved:.3g} mm{why}")
     if "tilt" in found:
         degrees = float(np.degrees(found["tilt"]))
         yield Item("tilt", degrees < TILT, f"at most {degrees:.1f} deg")

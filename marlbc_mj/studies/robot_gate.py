@@ -9,6 +9,7 @@ import numpy as np
 from PIL import Image
 
 from marlbc_mj.controllers import PD, SORLC, Controller
+from marlbc_mj.engine.assembly import agent_prefix
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Frame, Trajectory, run_episode
 from marlbc_mj.recording.log import from_trajectory
@@ -17,6 +18,7 @@ from marlbc_mj.report.table import pipe_table
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import ROBOTS, Robot, make_robot
+from marlbc_mj.robots.planar import posed
 from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, counting, run_study
@@ -61,6 +63,7 @@ class GateRow(NamedTuple):
     returned: float
     height_error: float | None  # [m]
     tilt: float | None  # [deg]
+    failure: str | None = None  # why the row means nothing
 
 
 class GateJob(NamedTuple):
@@ -135,6 +138,7 @@ def touching(world: World) -> bool:
 def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, collisions: int) -> GateRow:
     measured, body, scenario = measure(trajectory), world.plan.robot, trajectory.scenario
     agents = measured["agents"]
+    error = max(a["rms_position_error"] for a in agents)
     found = {name: world.state.robot[0, :, k] for name, k in body.diagnostics.items()}
     saturated = [a["saturation_duty"] for a in agents]
     if "saturated" in found:
@@ -147,13 +151,30 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
         violation=SCORES["violation_time_worst"].read(measured),
         collisions=collisions,
         distance=measured["team"]["agent_distance_min"],
-        error=max(a["rms_position_error"] for a in agents),
+        error=error,
         saturation=max(saturated),
         switches=tuple(a["switches"] for a in agents),
         returned=measured["team"]["return"],
         height_error=float(found["height_error"].max()) if "height_error" in found else None,
         tilt=float(np.degrees(found["tilt"].max())) if "tilt" in found else None,
+        failure=_lost(error, world),
     )
+
+
+LOST = 10.0
+"""Tracking error, in a robot's length units, beyond which it is not on its mission any more; also the fall of a body."""
+
+
+def _lost(error: float, world: World) -> str | None:
+    """Why an episode says nothing about supervisors, or None: the robot does not follow its reference, or has left the ground."""
+    robot, model = world.plan.robot, world.plan.model
+    if not error < LOST * robot.length:
+        return f"lost: {error:.3g} m from its reference (RMS), {error / robot.length:.3g} length units; see `marlbc robot check`"
+    bodies = [model.body(agent_prefix(i) + robot.body).id for i in range(world.scenario.agents)]
+    fallen = float(np.abs(world.data[0].xpos[bodies, 2] - posed(model).xpos[bodies, 2]).max())
+    if not fallen < LOST * robot.length:
+        return f"lost: {fallen:.3g} m above or below where it started; see `marlbc robot check`"
+    return None
 
 
 def gate_table(rows: Sequence[GateRow]) -> str:
@@ -163,6 +184,8 @@ def gate_table(rows: Sequence[GateRow]) -> str:
 
 
 def _gate_cells(r: GateRow) -> tuple[str, ...]:
+    if r.failure is not None:
+        return (r.robot, r.supervisor, f"failed: {r.failure}", *("–",) * 7)
     flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
     return (
         r.robot,

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
@@ -19,7 +20,8 @@ from marlbc_mj.supervisors.orca import ORCA
 from marlbc_mj.supervisors.rollout import Rollout
 from marlbc_mj.supervisors.scripted import Scripted
 from marlbc_mj.supervisors.set_based_rule import SetBasedRule
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.modules import made, names_attribute
 
 SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]] = {
     "scripted": (Scripted, "the scenario's schedule: the fewest switches its geometry allows"),
@@ -70,23 +72,36 @@ oracle itself where nothing is perturbed, the others are no part of the paper's 
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
 """Supervisors that nothing was trained for, without those on request."""
 
+CHECKPOINT_SUFFIX = ".safetensors"
+"""Suffix of checkpoints."""
+
 
 def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
     """A supervisor with its default settings, by name; the oracle's schedule belongs to a ``controller``.
 
-    One that decides for one team is wrapped in :class:`OneTeam`.
+    The name may also be ``file.py:Name`` of a user's Python file, or the path of a checkpoint. A supervisor that decides for one
+    team is wrapped in :class:`OneTeam`.
 
     Raises:
-        ConfigurationError: unknown name.
+        ConfigurationError: unknown name, or a file that gives no supervisor.
     """
+    if names_attribute(name):
+        supervisor = made(name, Supervisor)
+        lacking = [each for each in ("start", "decide") if not callable(getattr(supervisor, each, None))]
+        if lacking:
+            raise ConfigurationError(f"{name} is no supervisor: {type(supervisor).__name__} lacks {', '.join(lacking)}")
+        return batched(supervisor)
+    if name.endswith(CHECKPOINT_SUFFIX):
+        return batched(Learned.load(Path(name)))
     if name not in SUPERVISORS:
-        raise unknown("supervisor", name, SUPERVISORS)
+        raise unknown("supervisor", name, (*SUPERVISORS, "FILE.py:NAME", f"a checkpoint that ends in {CHECKPOINT_SUFFIX}"))
     factory = SUPERVISORS[name][0]
     return batched(factory(controller) if name in ORACLES else factory())
 
 
 __all__ = [
     "CBFQP",
+    "CHECKPOINT_SUFFIX",
     "FMS",
     "FSAMS",
     "LEARNED",

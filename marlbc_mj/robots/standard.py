@@ -1,0 +1,183 @@
+"""A user's MJCF in the form that a team's world takes: one text, complete in itself, in which everything that matters is named.
+
+What plain MuJoCo loads is loaded; what the text means is not changed. Files that it uses become part of it, frames are resolved,
+keyframes and lights are left out, and names get no slash, which dm_control keeps for itself.
+"""
+
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import lru_cache
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from marlbc_mj.robots.assets import embed
+from marlbc_mj.robots.files import check_files
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.text import one_line
+
+_TRIAL_TIME = 60.0  # that compiling a robot may take [s]
+_TRIAL_MEMORY = 8 * 2**30  # address space that it may take [bytes]
+_TRIAL = """
+import resource, sys
+resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}))
+resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+import mujoco
+mujoco.set_mju_user_warning(lambda text: None)
+try:
+    model = mujoco.MjSpec.from_file(sys.argv[1]).compile()
+    data = mujoco.MjData(model)
+except (ValueError, MemoryError, mujoco.FatalError) as error:
+    print(" ".join(str(error).split()) or type(error).__name__)
+    sys.exit(3)
+for _ in range(2):
+    mujoco.mj_step(model, data)
+"""
+
+
+def standard_text(path: Path) -> str:
+    """The MJCF of a user's file in standard form.
+
+    Raises:
+        ConfigurationError: what is wrong with the file, in one line.
+    """
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+    return _standard_text(path, found.st_mtime_ns, found.st_size)
+
+
+@lru_cache(maxsize=32)
+def _standard_text(path: Path, changed: int, size: int) -> str:
+    check_files(path)
+    _try_out(path)
+    with quiet():
+        try:
+            spec = mujoco.MjSpec.from_file(str(path))
+            spec.copy().compile()
+        except (ValueError, FileNotFoundError, mujoco.FatalError) as error:
+            raise ConfigurationError(f"{path} {_blame(error)}: {one_line(error)}") from error
+        for element in [*spec.lights, *spec.keys, *spec.skins]:
+            spec.delete(element)
+        try:
+            embed(spec)
+            spec.compile()
+            return _tidy(spec.to_xml())
+        except (ValueError, mujoco.FatalError) as error:
+            raise ConfigurationError(f"{path} cannot be made one text: {one_line(error)}") from error
+
+
+def _blame(error: Exception) -> str:
+    return "is no MJCF that MuJoCo reads" if "XML" in str(error) or "Schema" in str(error) else "does not compile"
+
+
+def _try_out(path: Path) -> None:
+    """Compile and step the file in a process of its own, which may crash, hang or run out of memory.
+
+    Raises:
+        ConfigurationError: it does.
+    """
+    if not sys.executable:  # Python is embedded in another program
+        return
+    command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY), str(path)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_TIME, cwd=path.resolve().parent)
+    except subprocess.TimeoutExpired as error:
+        raise ConfigurationError(f"{path} takes more than {_TRIAL_TIME:g} s to compile") from error
+    if done.returncode < 0:
+        raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-done.returncode}); simplify the file")
+    if done.returncode not in (0, 3):
+        raise ConfigurationError(f"{path} cannot be tried out: {one_line(done.stderr)[-200:]}")
+    if done.returncode == 3 and "memory" in done.stdout.lower():
+        raise ConfigurationError(f"{path} does not compile: {one_line(done.stdout)}")
+
+
+@contextmanager
+def quiet() -> Iterator[list[str]]:
+    """Keep MuJoCo's warnings while it reads, instead of having them on stderr and in a file of the current folder."""
+    said: list[str] = []
+    mujoco.set_mju_user_warning(said.append)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield said
+    finally:
+        mujoco.set_mju_user_warning(None)
+
+
+def _tidy(text: str) -> str:
+    """Resolve frames, name what has no name, and replace slashes in names."""
+    root = ElementTree.fromstring(text)
+    for parent in [element for element in root.iter() if element.tag != "frame"]:
+        _resolve_frames(parent)
+    for element in root.iter():
+        for key, value in element.attrib.items():
+            if "/" in value:
+                element.set(key, plain_name(value))
+    _name_unnamed(root)
+    return ElementTree.tostring(root, encoding="unicode")
+
+
+def plain_name(name: str) -> str:
+    """A name without the slash that dm_control keeps for itself."""
+    return name.replace("/", "_")
+
+
+def _resolve_frames(parent: ElementTree.Element) -> None:
+    """Put the content of every frame below ``parent`` in its place, posed accordingly."""
+    while any(child.tag == "frame" for child in parent):
+        for frame in [child for child in parent if child.tag == "frame"]:
+            place = list(parent).index(frame)
+            parent.remove(frame)
+            for k, child in enumerate(frame):
+                _pose(frame, child)
+                parent.insert(place + k, child)
+
+
+def _numbers(element: ElementTree.Element, key: str, default: str) -> np.ndarray:
+    return np.array(element.get(key, default).split(), dtype=np.float64)
+
+
+def _written(numbers: np.ndarray) -> str:
+    return " ".join(format(x, ".17g") for x in numbers)
+
+
+def _pose(frame: ElementTree.Element, child: ElementTree.Element) -> None:
+    """Express an element of a frame in what the frame is in: MuJoCo writes positions and quaternions only."""
+    place, turn = _numbers(frame, "pos", "0 0 0"), _numbers(frame, "quat", "1 0 0 0")
+    out3, out4 = np.zeros(3), np.zeros(4)
+    if "childclass" in frame.attrib:
+        child.attrib.setdefault("childclass" if child.tag in ("body", "frame") else "class", frame.attrib["childclass"])
+    if child.tag == "freejoint":
+        return
+    mujoco.mju_rotVecQuat(out3, _numbers(child, "pos", "0 0 0"), turn)
+    child.set("pos", _written(place + out3))
+    for key, default in (("axis", "0 0 1"), ("dir", "0 0 -1")):
+        if key in child.attrib or (child.tag, key) in (("joint", "axis"), ("light", "dir")):
+            mujoco.mju_rotVecQuat(out3, _numbers(child, key, default), turn)
+            child.set(key, _written(out3))
+    if child.tag not in ("joint", "light"):
+        mujoco.mju_mulQuat(out4, turn, _numbers(child, "quat", "1 0 0 0"))
+        child.set("quat", _written(out4))
+
+
+def _name_unnamed(root: ElementTree.Element) -> None:
+    """Names for bodies, joints and actuators that have none."""
+    groups: dict[str, list[ElementTree.Element]] = {"body": [], "joint": [], "motor": []}
+    for world in root.findall("worldbody"):
+        groups["body"] += world.iter("body")
+        groups["joint"] += [element for element in world.iter() if element.tag in ("joint", "freejoint")]
+    for section in root.findall("actuator"):
+        groups["motor"] += list(section)
+    for kind, elements in groups.items():
+        taken = {element.get("name") for element in elements}
+        fresh = (name for k in range(1, len(elements) + len(taken) + 2) if (name := f"{kind}{k}") not in taken)
+        for element in elements:
+            if not element.get("name"):
+                element.set("name", next(fresh))

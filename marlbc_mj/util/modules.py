@@ -1,0 +1,105 @@
+"""A user's Python file as a module: the same one in every process, whatever the current folder is, and anew after an edit."""
+
+import importlib.util
+import sys
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError
+from marlbc_mj.util.text import one_line
+
+_SUFFIX = ".py"
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one."""
+    file, colon, attribute = name.rpartition(":")
+    return (file, attribute) if colon and file.endswith(_SUFFIX) else (name, "")
+
+
+def names_attribute(name: str) -> bool:
+    """Whether a name means something in a user's Python file."""
+    return bool(split_name(name)[1])
+
+
+def load_module(path: Path) -> ModuleType:
+    """Run a user's Python file, whose folder it may import from; a file that has not changed is not run again.
+
+    Raises:
+        ConfigurationError: the file is not there, or what it raised.
+    """
+    try:
+        path = path.resolve()
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+    name, stamp = f"marlbc_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}", zlib.crc32(content)
+    known = sys.modules.get(name)
+    if known is not None and getattr(known, "__marlbc_stamp__", None) == stamp:
+        return known
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ConfigurationError(f"{path} is no Python file")
+    module = importlib.util.module_from_spec(spec)
+    vars(module)["__marlbc_stamp__"] = stamp
+    sys.modules[name] = module
+    try:
+        guarded(lambda: _execute(module, content, path), f"file {path}")
+    except BaseException:
+        sys.modules.pop(name, None)
+        raise
+    return module
+
+
+def _execute(module: ModuleType, content: bytes, path: Path) -> None:
+    """Run the text that was stamped, with its folder in front of the search path for the time being."""
+    before = set(sys.modules)
+    sys.path.insert(0, str(path.parent))
+    try:
+        exec(compile(content, str(path), "exec"), vars(module))
+    finally:
+        sys.path.remove(str(path.parent))
+        for name in set(sys.modules) - before:  # another folder's helper of the same name is another module
+            file = getattr(sys.modules[name], "__file__", None)
+            if file is not None and Path(file).parent == path.parent:
+                del sys.modules[name]
+
+
+def guarded(call: Callable[[], Any], what: str) -> Any:
+    """What a user's code returns.
+
+    Raises:
+        ConfigurationError: it raises anything else than an error of this package, or ends the process.
+    """
+    try:
+        return call()
+    except MarlbcError:
+        raise
+    except SystemExit as error:
+        raise ConfigurationError(f"{what} fails: it calls sys.exit({error.code!r})") from error
+    except Exception as error:
+        raise ConfigurationError(f"{what} fails: {type(error).__name__}: {one_line(error)}") from error
+
+
+def made(name: str, kind: type) -> Any:
+    """The object that ``file.py:Name`` means; a class or function of that name is called without arguments.
+
+    Args:
+        name: file and attribute.
+        kind: what the object must be; one that is an instance is taken as it is.
+
+    Raises:
+        ConfigurationError: the file fails, or has nothing of that name.
+    """
+    file, attribute = split_name(name)
+    module = load_module(Path(file))
+    if not hasattr(module, attribute):
+        there = [key for key in vars(module) if not key.startswith("_")]
+        raise ConfigurationError(f"{file} has nothing named {attribute!r}; it has: {', '.join(there) or 'nothing'}")
+    found = getattr(module, attribute)
+    if isinstance(found, type) or (callable(found) and not isinstance(found, kind)):
+        return guarded(found, f"{name}()")
+    return found
