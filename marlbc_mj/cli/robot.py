@@ -8,6 +8,7 @@ from typing import Annotated
 from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
 from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.util.errors import SimulationError
 
 
 @dataclass(frozen=True)
@@ -47,8 +48,12 @@ class RobotGateCommand:
     """Replace what is in the output folder."""
 
     def run(self) -> None:
-        """Fly, write, and print the table."""
-        from marlbc_mj.studies.robot_gate import SHOWN, run_gates
+        """Fly, write, and print the table.
+
+        Raises:
+            SimulationError: a robot is not where its mission is; the table says so, too.
+        """
+        from marlbc_mj.studies.robot_gate import SHOWN, lost_robots, run_gates
 
         with progress_bars() as progress:
             done = run_gates(
@@ -61,6 +66,9 @@ class RobotGateCommand:
                 progress=progress,
             )
         print(done.report.text)
+        lost = lost_robots(done.results)
+        if lost:
+            raise SimulationError(f"lost on the gate mission: {', '.join(lost)}")
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,8 @@
 """Scenarios: frozen problem instances, by name."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import fields
+from inspect import Parameter, signature
 from typing import Any
 
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
@@ -30,7 +32,18 @@ def make_scenario(name: str, **changes: Any) -> Scenario:
         return load_scenario(name, **changes)
     if name not in SCENARIOS:
         raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
+    if name not in FAMILIES:  # families look at their own
+        check_fields(SCENARIOS[name], changes)
     return SCENARIOS[name](**changes)
+
+
+def check_fields(factory: Callable[..., Scenario], changes: Iterable[str]) -> None:
+    """Raise ConfigurationError for a change that is neither a field of a scenario nor an argument of its factory."""
+    own = [name for name, each in signature(factory).parameters.items() if each.kind is not Parameter.VAR_KEYWORD]
+    valid = dict.fromkeys([*own, *(field.name for field in fields(Scenario))])
+    for name in changes:
+        if name not in valid:
+            raise unknown("field of a scenario", name, valid)
 
 
 __all__ = [

@@ -42,6 +42,8 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
 
 STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
 CLIP = (0.10, 0.66)  # shares of the mission
+LOST = 50.0
+"""Tracking error in a robot's lengths from which on it counts as lost: about half the length of the mission."""
 SHOWN = [name for name in ROBOTS if name != "point_mass"]
 
 
@@ -154,6 +156,11 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
         height_error=float(found["height_error"].max()) if "height_error" in found else None,
         tilt=float(np.degrees(found["tilt"].max())) if "tilt" in found else None,
     )
+
+
+def lost_robots(rows: Sequence[GateRow]) -> list[str]:
+    """Robots that did not fly the mission: their tracking error is larger than the mission, in lengths of the robot."""
+    return [f"{row.robot} under {row.supervisor}" for row in rows if not row.error < LOST * make_robot(row.robot).length]
 
 
 def gate_table(rows: Sequence[GateRow]) -> str:
