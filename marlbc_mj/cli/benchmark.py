@@ -36,6 +36,9 @@ class ScenarioOptions:
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
+    allow_code: bool = False
+    """Run the Python file that a scenario file names as its robot."""
+
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
         from marlbc_mj.core.disturbances import make_disturbance
@@ -48,7 +51,7 @@ class ScenarioOptions:
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        return make_scenario(name, **changes)
+        return make_scenario(name, allow_code=self.allow_code, **changes)
 
 
 @dataclass(frozen=True)

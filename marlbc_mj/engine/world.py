@@ -102,10 +102,8 @@ class World:
 
         World b draws from its own stream, (seed, b), so what it does depends on neither B nor the other worlds.
         """
-        if not isinstance(seed, int | np.integer):
-            raise ConfigurationError(f"seed must be a whole number, got {seed!r}")
-        if seed < 0:
-            raise ConfigurationError(f"seed must not be negative, got {seed}")
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ConfigurationError(f"seed must be a whole number and not negative, got {seed!r}")
         if mask is not None and np.shape(mask) != (self.worlds,):
             raise ConfigurationError(f"mask must have shape ({self.worlds},), got {np.shape(mask)}")
         if mask is not None and np.asarray(mask).dtype != np.bool_:
@@ -233,19 +231,15 @@ class World:
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
-        orders = self.scenario.orders.read(orders)
-        shape, count = (self.worlds, self.scenario.agents), len(self.scenario.orders)
-        if orders.shape != shape:
-            raise ConfigurationError(f"orders must have shape {shape} (worlds, agents), got {orders.shape}")
-        if not loop.valid_orders(orders, count):
-            raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
-        return orders
+        return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)
 
     def _checked_velocity(self, velocity: np.ndarray) -> np.ndarray:
         try:
             velocity = np.asarray(velocity)
         except (TypeError, ValueError, RuntimeError) as error:
-            raise ConfigurationError(f"velocity must be numbers [m/s], got {type(velocity).__name__}: {one_line(error)}") from None
+            raise ConfigurationError(
+                f"velocity must be numbers [m/s], got {type(velocity).__name__}: {one_line(error)}"
+            ) from None
         if velocity.dtype.kind not in "fiu":
             raise ConfigurationError(f"velocity must be numbers [m/s], got {velocity.dtype}")
         shape = (self.worlds, self.scenario.agents, 2)

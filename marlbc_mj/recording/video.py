@@ -190,7 +190,9 @@ def encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[IO[bytes]]:
 
 def _reason(said: Sequence[str]) -> str:
     """The line of the encoder that tells the most."""
-    return next((line for line in said if "No space left" in line or "too large" in line), said[-1] if said else "no reason given")
+    return next(
+        (line for line in said if "No space left" in line or "too large" in line), said[-1] if said else "no reason given"
+    )
 
 
 def _check_size(width: int, height: int) -> None:

@@ -22,14 +22,19 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
 """Factory by name."""
 
 
-def make_scenario(name: str, **changes: Any) -> Scenario:
+def make_scenario(name: str, *, allow_code: bool = False, **changes: Any) -> Scenario:
     """A scenario by name or from a ``.toml`` file, with any of its fields changed.
+
+    Args:
+        name: of a scenario, or a path that ends in ``.toml``.
+        allow_code: whether a file's robot may be a Python file, which is run.
+        **changes: fields and their values.
 
     Raises:
         ConfigurationError: unknown name, a file that cannot be loaded, or a change that cannot be run.
     """
     if name.endswith(SUFFIX):
-        return load_scenario(name, **changes)
+        return load_scenario(name, allow_code=allow_code, **changes)
     if name not in SCENARIOS:
         raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
     if name not in FAMILIES:  # families look at their own

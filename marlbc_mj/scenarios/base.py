@@ -179,10 +179,12 @@ class Scenario:
         return obstacles.copy(), motions, number
 
     def check_windows(self, windows: tuple[Window, ...]) -> None:
-        """Raise ConfigurationError for a window with an unknown agent or times that are not finite."""
+        """Raise ConfigurationError for a window with an unknown agent, or times that are not finite or not in order."""
         for window in windows:
             if not np.isfinite((window.start, window.end)).all():
                 raise ConfigurationError(f"window {tuple(window)}: times must be finite")
+            if window.start > window.end:
+                raise ConfigurationError(f"window {tuple(window)}: it ends before it starts")
             if not -1 <= window.agent < self.agents:
                 raise ConfigurationError(
                     f"window {tuple(window)}: agent must be -1 (all) or 0 to {self.agents - 1}, got {window.agent}"
