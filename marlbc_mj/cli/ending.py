@@ -25,8 +25,8 @@ class Terminated(BaseException):
 def in_one_line(prog: str) -> Iterator[None]:
     """Run a command; whatever stops it is said in one line.
 
-    Exits with 2 for a wrong setting, 3 for a failed run or a full disk, 130 after Ctrl-C, 143 after SIGTERM, and with 141, quietly,
-    if the reader of its output has gone.
+    Exits with 2 for a wrong setting, 3 for a failed run or a full disk, 130 after Ctrl-C, 143 after SIGTERM, and with 141,
+    quietly, if the reader of its output has gone.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):

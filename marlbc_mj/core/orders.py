@@ -49,7 +49,7 @@ class Orders:
         return tuple(SEPARATOR.join(self.behaviors[j] for j in row) for row in self.table)
 
     def read(self, given: Any) -> np.ndarray:
-        """Indices as compiled code takes them, int64 and contiguous, from what a caller hands in; their shape and range are as given.
+        """Indices as compiled code takes them, int64 and contiguous, from what a caller hands in; of any shape and range.
 
         Args:
             given: whole numbers, or names as :meth:`index` takes them: an array, nested lists or a tensor in main memory.

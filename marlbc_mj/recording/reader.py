@@ -39,10 +39,10 @@ _DAMAGE = (
     *(TypeError, AttributeError, IndexError, RecursionError, RuntimeError, EOFError),  # lz4 raises a bare RuntimeError
 )
 """What the mcap package, decompression and decoding raise on bytes that are not what they should be."""
-MOST_UNPACKED = 2 * 2**30
-"""Largest size of a log's decompressed chunks together [bytes]; one of 256 agents over 100 s has a third of it."""
-MOST_RATIO = 200
-"""How many times larger a chunk may be than its compressed form: numbers as JSON come down to a tenth or so."""
+MOST_UNPACKED, MOST_CHUNK = 2**30, 2**26
+"""Largest size of a log's decompressed chunks together, and of one [bytes]: twice what 256 agents leave in 100 s, and 60 times
+what the writer puts into one.
+"""
 
 
 def read_log(path: str | Path) -> EpisodeLog:
@@ -248,8 +248,8 @@ def _check_sizes(stream: BinaryIO) -> None:
 def _unpacked(chunk: Chunk) -> int:
     """Size of a chunk that is no bomb [bytes]; ValueError for one that is, or says another size than its compressed data do."""
     said, packed = chunk.uncompressed_size, len(chunk.data)
-    if said > MOST_RATIO * packed + 2**16:
-        raise ValueError(f"a chunk of {packed} bytes says that it holds {said}")
+    if said > MOST_CHUNK:
+        raise ValueError(f"a chunk of {packed} bytes says that it holds {said}; none has more than {MOST_CHUNK}")
     if chunk.compression == "zstd":
         found = zstandard.frame_content_size(chunk.data)
     elif chunk.compression == "lz4":

@@ -242,7 +242,7 @@ def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             if overwrite:
                 staging.replace(path)
             else:
-                _take(staging, path)
+                take_name(staging, path)
             _sync(path.parent)
     finally:
         staging.unlink(missing_ok=True)
@@ -255,8 +255,12 @@ def _remove_orphan_files(path: Path, prefix: str) -> None:
             other.unlink(missing_ok=True)
 
 
-def _take(staging: Path, path: Path) -> None:
-    """Give ``staging`` the name ``path``, unless it is taken."""
+def take_name(staging: Path, path: Path) -> None:
+    """Give a file the name ``path``, unless it is taken; it may keep its old name, too.
+
+    Raises:
+        ConfigurationError: another process has taken the name.
+    """
     with _refused_when_filled(path):
         try:
             os.link(staging, path)

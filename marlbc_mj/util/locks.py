@@ -10,6 +10,13 @@ if sys.platform != "win32":
     import fcntl
 
 
+def lock(descriptor: int) -> None:
+    """Hold the lock of an open file or folder until it is closed; nothing where the system has none."""
+    if sys.platform != "win32":
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # :func:`is_held` of another process takes it for a moment
+
+
 @contextmanager
 def held(path: Path) -> Iterator[None]:
     """Hold the lock of a file or folder during the block, whatever its name becomes; nothing where the system has none."""
@@ -18,8 +25,7 @@ def held(path: Path) -> Iterator[None]:
         return
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        with suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # :func:`is_held` of another process takes it for a moment
+        lock(descriptor)
         yield
     finally:
         os.close(descriptor)
