@@ -1,6 +1,7 @@
 """Frames of an environment as it runs: one world, drawn off-screen."""
 
 from typing import Any
+from weakref import finalize
 
 import numpy as np
 
@@ -36,6 +37,7 @@ class Picture:
             stage = make_stage(log)
             camera = make_camera("track", stage, self.width / self.height)
             self._drawing = stage, Offscreen(stage, camera, self.width, self.height)
+            self._end = finalize(self, self._drawing[1].close)  # also before the interpreter ends: afterwards OpenGL complains
         first, offscreen = self._drawing
         offscreen.stage = restage(first, log)
         offscreen.camera = make_camera("track", offscreen.stage, self.width / self.height)
@@ -44,5 +46,5 @@ class Picture:
     def close(self) -> None:
         """Give the OpenGL context back."""
         if self._drawing is not None:
-            self._drawing[1].close()
+            self._end()
             self._drawing = None

@@ -234,9 +234,11 @@ def test_a_folder_that_was_being_replaced_comes_back(tmp_path):
 
 
 def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path):
-    with pytest.raises(ConfigurationError, match="meanwhile"), staged_file(tmp_path / "a.json") as staging:
-        staging.write_text("second")
-        (tmp_path / "a.json").write_text("first")
+    second = staged_file(tmp_path / "a.json")
+    second.__enter__().write_text("second")
+    (tmp_path / "a.json").write_text("first")
+    with pytest.raises(ConfigurationError, match="meanwhile"):
+        second.__exit__(None, None, None)
     assert (tmp_path / "a.json").read_text() == "first" and [p.name for p in tmp_path.iterdir()] == ["a.json"]
 
 

@@ -252,7 +252,7 @@ def test_render_mode():
     assert first.shape == later.shape == (480, 640, 3) and first.dtype == np.uint8
     assert first.std() > 10 and (first != later).any()
     twin = copy.deepcopy(env)
-    assert (twin.render() == later).all()
+    assert np.abs(twin.render().astype(int) - later).max() <= 2  # a new OpenGL context may round another way
     env.close(), twin.close()
 
 
