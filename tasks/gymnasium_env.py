@@ -15,7 +15,7 @@ from marlbc_mj.policies.states import State
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
 from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
-from marlbc_mj.tasks.picture import Picture
+from marlbc_mj.tasks.painter import Painter
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -71,7 +71,7 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         self.render_mode = check_render_mode(render_mode)
         made, law = scenario_from(scenario, changes), controller_from(controller)
         self.batch = FormationBatch(made, law, interval=interval, state=state, actions=actions)
-        self.picture = Picture()
+        self.painter = Painter()
         self.action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
         self.observation_space = state_space(self.batch.read)
 
@@ -96,11 +96,11 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
         """
-        return None if self.render_mode is None else self.picture.draw(self.batch.world)
+        return None if self.render_mode is None else self.painter.draw(self.batch.world)
 
     def close(self) -> None:
         """Give the OpenGL context back."""
-        self.picture.close()
+        self.painter.close()
 
 
 class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -133,7 +133,7 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        self.picture = Picture()
+        self.painter = Painter()
         self.render_mode = check_render_mode(render_mode)
         self.batch = FormationBatch(
             scenario_from(scenario, changes),
@@ -196,11 +196,11 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         Raises:
             ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
         """
-        return None if self.render_mode is None else tuple(self.picture.draw(self.batch.world, b) for b in range(self.num_envs))
+        return None if self.render_mode is None else tuple(self.painter.draw(self.batch.world, b) for b in range(self.num_envs))
 
     def close_extras(self) -> None:
         """Give the OpenGL context back."""
-        self.picture.close()
+        self.painter.close()
 
 
 def where(found: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:

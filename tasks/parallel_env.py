@@ -12,7 +12,7 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
-from marlbc_mj.tasks.picture import Picture
+from marlbc_mj.tasks.painter import Painter
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -50,7 +50,7 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
         self.render_mode = check_render_mode(render_mode)
         made, law = scenario_from(scenario, changes), controller_from(controller)
         self.batch = FormationBatch(made, law, interval=interval, state=observation, actions=actions)
-        self.picture = Picture()
+        self.painter = Painter()
         self.possible_agents = [f"agent_{i + 1}" for i in range(self.batch.scenario.agents)]
         self.agents: list[str] = []
         self.state_space = state_space(self.batch.read)
@@ -110,11 +110,11 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
         Raises:
             ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
         """
-        return None if self.render_mode is None else self.picture.draw(self.batch.world)
+        return None if self.render_mode is None else self.painter.draw(self.batch.world)
 
     def close(self) -> None:
         """Give the OpenGL context back."""
-        self.picture.close()
+        self.painter.close()
 
     def state(self) -> np.ndarray:
         """(S,) the team's state."""

@@ -194,7 +194,7 @@ def _open_file(path: str | Path) -> Iterator[BinaryIO]:
     """A file that is an MCAP, whole or torn."""
     try:
         if Path(path).exists() and not Path(path).is_file():
-            raise ConfigurationError(f"{path} is not a file")
+            raise ConfigurationError(f"cannot read {path}: it is not a file")
         with open(path, "rb") as stream:
             if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
                 raise ConfigurationError(f"{path} is not an MCAP file")

@@ -16,7 +16,7 @@ from marlbc_mj.util.provenance import plain_data
 
 PARTIAL = ".partial-"
 """Part of the name of an incomplete file or folder, before the number of the process that writes it and a random token."""
-OLD = ".old-"
+REPLACED = ".old-"
 """Part of the name of a folder that is being replaced, before the same."""
 MANIFEST = ".marlbc-files.json"
 """Names of all files that :func:`staged_folder` wrote into a folder: the only ones that ``overwrite`` removes."""
@@ -117,9 +117,9 @@ def _remove_orphans(target: Path, place: Path) -> None:
     """Remove what killed processes left of ``target`` in ``place``, and bring back a folder that one was about to replace."""
     name = target.name or "out"
     for path in sorted(place.iterdir()):
-        if not path.name.startswith((f"{name}{PARTIAL}", f"{name}{OLD}")) or not path.is_dir() or is_held(path):
+        if not path.name.startswith((f"{name}{PARTIAL}", f"{name}{REPLACED}")) or not path.is_dir() or is_held(path):
             continue
-        if path.name.startswith(f"{name}{OLD}") and not target.exists():
+        if path.name.startswith(f"{name}{REPLACED}") and not target.exists():
             path.rename(target)
         else:
             shutil.rmtree(path, ignore_errors=True)
@@ -177,7 +177,7 @@ def _swap(target: Path, staging: Path, ours: set[str]) -> None:
             _duplicate(target / name, staging / name)
     for folder in (path for path in target.rglob("*") if path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
         (staging / folder.relative_to(target)).mkdir(parents=True, exist_ok=True)
-    old = target.with_name(f"{target.name}{OLD}{_token()}")
+    old = target.with_name(f"{target.name}{REPLACED}{_token()}")
     with held(target):
         target.rename(old)
         staging.rename(target)

@@ -1,7 +1,8 @@
 """Frames of an environment as it runs: one world, drawn off-screen."""
 
+import atexit
 from typing import Any
-from weakref import finalize
+from weakref import WeakSet
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import Stage, make_stage, restage
 
 
-class Picture:
+class Painter:
     """Draws worlds of one scenario. OpenGL starts with the first frame and ends with :meth:`close`; a copy starts its own.
 
     Args:
@@ -24,7 +25,7 @@ class Picture:
         self._drawing: tuple[Stage, Offscreen] | None = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Picture, (self.width, self.height)
+        return Painter, (self.width, self.height)
 
     def draw(self, world: World, b: int = 0) -> np.ndarray:
         """(height, width, 3) uint8: world ``b`` as it is now.
@@ -37,7 +38,9 @@ class Picture:
             stage = make_stage(log)
             camera = make_camera("track", stage, self.width / self.height)
             self._drawing = stage, Offscreen(stage, camera, self.width, self.height)
-            self._end = finalize(self, self._drawing[1].close)  # also before the interpreter ends: afterwards OpenGL complains
+            if not _painting:
+                atexit.register(_close_all)  # after MuJoCo's, which ends OpenGL: what is registered later runs earlier
+            _painting.add(self)
         first, offscreen = self._drawing
         offscreen.stage = restage(first, log)
         offscreen.camera = make_camera("track", offscreen.stage, self.width / self.height)
@@ -46,5 +49,17 @@ class Picture:
     def close(self) -> None:
         """Give the OpenGL context back."""
         if self._drawing is not None:
-            self._end()
+            self._drawing[1].close()
             self._drawing = None
+
+    def __del__(self) -> None:
+        self.close()
+
+
+_painting: WeakSet[Painter] = WeakSet()
+"""All that have drawn; where somebody forgets to close one, its OpenGL context is given back before the interpreter ends."""
+
+
+def _close_all() -> None:
+    for painter in list(_painting):
+        painter.close()
