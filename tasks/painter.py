@@ -38,8 +38,8 @@ class Painter:
             stage = make_stage(log)
             camera = make_camera("track", stage, self.width / self.height)
             self._drawing = stage, Offscreen(stage, camera, self.width, self.height)
-            if not _painting:
-                atexit.register(_close_all)  # after MuJoCo's, which ends OpenGL: what is registered later runs earlier
+            atexit.unregister(_close_all)
+            atexit.register(_close_all)  # after MuJoCo's, which ends OpenGL: what is registered later runs earlier
             _painting.add(self)
         first, offscreen = self._drawing
         offscreen.stage = restage(first, log)
