@@ -88,7 +88,7 @@ def test_other_things_than_files_are_refused(tmp_path):
 
 def test_code_runs_only_where_it_is_allowed(tmp_path, capsys):
     """Neither the file nor its neighbours are touched; `--allow-code` runs it."""
-    (tmp_path / "cart.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\nROBOT = None\n")
+    (tmp_path / "cart.py").write_text(f"import pathlib\npathlib.Path({str(tmp_path / 'ran')!r}).touch()\nROBOT = None\n")
     path = toml(tmp_path, OPEN + 'robot = "cart.py"\n')
     with pytest.raises(SystemExit) as stopped:
         main(["run", str(path), "--out", str(tmp_path / "out")])

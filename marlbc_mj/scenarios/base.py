@@ -17,6 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
+MOST_STEPS = 10_000_000  # mission steps of an episode: what an hour of simulation makes
 MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
 YOUNG = {"young": True}
@@ -258,6 +259,10 @@ class Scenario:
         if self.mission_step / self.substep > MOST_SUBSTEPS:
             raise ConfigurationError(
                 f"substep {self.substep} s makes more than {MOST_SUBSTEPS} of a mission step of {self.mission_step} s"
+            )
+        if self.duration / self.mission_step > MOST_STEPS:
+            raise ConfigurationError(
+                f"duration {self.duration} s has more than {MOST_STEPS} mission steps of {self.mission_step} s"
             )
         for long, short in (("mission_step", "substep"), ("duration", "mission_step")):
             ratio = getattr(self, long) / getattr(self, short)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from marlbc_mj.core.disturbances import DISTURBANCES, Disturbance
-from marlbc_mj.robots import ROBOTS, make_robot
+from marlbc_mj.robots import make_robot
 from marlbc_mj.robots.user import is_file
 from marlbc_mj.scenarios.base import Obstacle, Point, Scenario, Window
 from marlbc_mj.scenarios.case_study import cruise, paper
@@ -74,13 +74,14 @@ def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any)
         ConfigurationError: no such file, no TOML, an unknown key or a value of another type (named, with the valid ones), or a
             mission that cannot be flown (with the reason).
     """
-    content = _with_robot(_read(Path(path)), Path(path), allow_code)
+    content = _read(Path(path))
     name = content.pop("family", None)
     kinds = (*FAMILIES, "custom", "paper", "cruise")
     if name not in kinds:
         missing = f"{path}: a scenario file starts with family = ...; choose from: {', '.join(kinds)}"
         raise ConfigurationError(missing) if name is None else ConfigurationError(f"{path}: {unknown('family', name, kinds)}")
     try:
+        content = _with_robot(content, Path(path), allow_code)
         if name in ("paper", "cruise"):
             return (paper if name == "paper" else cruise)(**{**_changes(content), **changes})
         kind = Custom if name == "custom" else FAMILIES[name]
@@ -98,18 +99,16 @@ def _with_robot(content: dict[str, Any], path: Path, allow_code: bool) -> dict[s
     """The content with its robot's file where it is found, and with the robot's scale where the file names no other.
 
     Raises:
-        ConfigurationError: a robot that is a program, without leave to run it.
+        ConfigurationError: an unknown robot, or one that is a program, without leave to run it.
     """
     robot = content.get("robot")
     if not isinstance(robot, str):
         return content
     if robot.endswith(".py") and not allow_code:
-        raise ConfigurationError(f"{path}: robot {robot!r} is a program; add --allow-code (allow_code=True in Python) to run it")
+        raise ConfigurationError(f"robot {robot!r} is a program; add --allow-code (allow_code=True in Python) to run it")
     beside = path.parent / robot
     if is_file(robot) and beside.is_file():
         robot = str(beside)
-    if robot not in ROBOTS and not is_file(robot):
-        return content  # refused with the names where the scenario is checked
     scale = {key: value for key, value in make_robot(robot).scale().items() if key != "robot"}
     return {**scale, **content, "robot": robot}
 
