@@ -103,7 +103,7 @@ def run_episode(
         began = perf_counter()
         decision, memory = supervisor.decide(observation, memory)
         decision_ms = 1e3 * (perf_counter() - began)
-        controller_state, pose = world.state.controller[0].copy(), _pose(world)
+        controller_state, pose = world.state.controller[0].copy(), body_poses(world)
         step = carry_out(world, decision)
         assert step.record is not None, "run_episode needs World(record=True)"
         record = Record(*(rows[0] for rows in step.record))
@@ -151,8 +151,8 @@ def _shield(frames: list[Frame]) -> ShieldCounts | None:
     return ShieldCounts(*(np.array(rows) for rows in zip(*counts, strict=True))) if counts else None
 
 
-def _pose(world: World) -> np.ndarray:
-    """(N, 7) of the bodies of world 0, (0, 7) where they have no free joint."""
+def body_poses(world: World, b: int = 0) -> np.ndarray:
+    """(N, 7) of the bodies of world ``b``, (0, 7) where they have no free joint."""
     if len(world.plan.robot.joints) > 1:
         return NO_POSE
-    return np.stack([world.data[0].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])
+    return np.stack([world.data[b].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])

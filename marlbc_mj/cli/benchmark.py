@@ -40,6 +40,9 @@ class ScenarioOptions:
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
+    allow_code: bool = False
+    """Run the Python file that a scenario file names as its robot."""
+
     def build(self, name: str, **others: Any) -> "Scenario":
         """The named scenario with these changes, and with ``others`` that are not None."""
         from marlbc_mj.core.disturbances import make_disturbance
@@ -53,7 +56,7 @@ class ScenarioOptions:
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        return make_scenario(name, **self._robot_changes(name), **changes)
+        return make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
 
     def _robot_changes(self, name: str) -> dict[str, Any]:
         """What another robot changes, but for what other options set."""

@@ -44,6 +44,10 @@ class Plan:
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
     shielded: bool = False  # whether plant.shield is used
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is made anew: the addresses of laws and of MuJoCo's model are those of one process."""
+        return make_plan, (self.scenario, self.controller)
+
     @property
     def grid_room(self) -> int:
         """Length of a world's array for grids of obstacles and team; 0 for a team so small that trying all pairs costs less."""

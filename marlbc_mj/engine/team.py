@@ -12,7 +12,7 @@ from marlbc_mj.core.imperfections import sense
 from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.loop import Record, Team, judge
+from marlbc_mj.engine.loop import Record, Team, judge, valid_orders
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.shielding import check_start
@@ -137,6 +137,20 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
         team.history[b] = np.stack([team.position[b], team.velocity[b]])
         count = int(team.steps[b]) * plan.mission.substeps
         sense(plant, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
+
+
+def check_orders(plan: Plan, orders: np.ndarray, worlds: int) -> np.ndarray:
+    """Orders (B, N) int64 as they are.
+
+    Raises:
+        ConfigurationError: another shape, or an index that is no order: the compiled loop would read past its tables.
+    """
+    shape, count = (worlds, plan.scenario.agents), len(plan.scenario.orders)
+    if orders.shape != shape:
+        raise ConfigurationError(f"orders must have shape {shape} (worlds, agents), got {orders.shape}")
+    if not valid_orders(orders, count):
+        raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
+    return orders
 
 
 def lasting(team: Team) -> dict[str, np.ndarray]:

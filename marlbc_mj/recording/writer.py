@@ -29,7 +29,8 @@ from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxg
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import check_target
+from marlbc_mj.util.files import check_target, take_name
+from marlbc_mj.util.locks import is_held, lock
 from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
 from marlbc_mj.util.seeding import stream
 
@@ -100,6 +101,7 @@ class LogWriter:
         self._pending = 0  # since the last flush [bytes]
         self._flushed = monotonic()  # when [s]
         self._stream = _create(self.path, overwrite)
+        lock(self._stream.fileno())
         try:
             self._start(metadata, attachments)
         except OSError as error:
@@ -142,9 +144,11 @@ class LogWriter:
             return
         try:
             self._end()
-            if not self._overwrite:
-                check_target(self.path, overwrite=False)
-            os.replace(self.partial, self.path)
+            if self._overwrite:
+                os.replace(self.partial, self.path)
+            else:
+                take_name(self.partial, self.path)
+                self.partial.unlink(missing_ok=True)
         except OSError as error:
             raise SimulationError(f"cannot write {self.path}: {error.strerror}") from error
 
@@ -225,6 +229,8 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
     try:
         check_target(path, overwrite=overwrite)
         path.parent.mkdir(parents=True, exist_ok=True)
+        if overwrite and partial.exists() and is_held(partial):
+            raise ConfigurationError(f"{partial} is being written by a run in progress; choose another name")
         return open(partial, "wb" if overwrite else "xb")
     except FileExistsError as error:
         if not partial.exists():  # a file where a folder should be

@@ -17,6 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
+MOST_STEPS = 10_000_000  # mission steps of an episode: what an hour of simulation makes
 MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
 COMPOSITIONS = ("null-space", "set-based")
@@ -183,10 +184,12 @@ class Scenario:
         return obstacles.copy(), motions, number
 
     def check_windows(self, windows: tuple[Window, ...]) -> None:
-        """Raise ConfigurationError for a window with an unknown agent or times that are not finite."""
+        """Raise ConfigurationError for a window with an unknown agent, or times that are not finite or not in order."""
         for window in windows:
             if not np.isfinite((window.start, window.end)).all():
                 raise ConfigurationError(f"window {tuple(window)}: times must be finite")
+            if window.start > window.end:
+                raise ConfigurationError(f"window {tuple(window)}: it ends before it starts")
             if not -1 <= window.agent < self.agents:
                 raise ConfigurationError(
                     f"window {tuple(window)}: agent must be -1 (all) or 0 to {self.agents - 1}, got {window.agent}"
@@ -266,6 +269,10 @@ class Scenario:
         if self.mission_step / self.substep > MOST_SUBSTEPS:
             raise ConfigurationError(
                 f"substep {self.substep} s makes more than {MOST_SUBSTEPS} of a mission step of {self.mission_step} s"
+            )
+        if self.duration / self.mission_step > MOST_STEPS:
+            raise ConfigurationError(
+                f"duration {self.duration} s has more than {MOST_STEPS} mission steps of {self.mission_step} s"
             )
         for long, short in (("mission_step", "substep"), ("duration", "mission_step")):
             ratio = getattr(self, long) / getattr(self, short)

@@ -11,6 +11,7 @@ import numba
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
+from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
 from marlbc_mj.engine.composition import Behaviors, compose_team, keep, limit, path_at
@@ -183,11 +184,10 @@ def judge_pairs(
         np.zeros((count, grid_room(scenario))),
     )
     arguments = kinematic, behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
-    if threads == 1 or count == 1:
-        _judge_serial(*arguments)
-    else:
-        numba.set_num_threads(threads)
+    if count > 1 and threads_usable(threads):
         _judge_parallel(*arguments)
+    else:
+        _judge_serial(*arguments)
     return costs, trails
 
 
