@@ -124,7 +124,7 @@ def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any],
     """The content with the robot's file found beside the scenario's, and the robot's scale where the file does not set it.
 
     Raises:
-        ConfigurationError: a robot that cannot be made, or one that the file names and that is a program, without leave to run it.
+        ConfigurationError: a robot that cannot be made, or a program that the file names, without leave to run it.
     """
     name = changes.get("robot", content.get("robot"))
     if not isinstance(name, str):
