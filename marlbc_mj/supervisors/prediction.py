@@ -14,8 +14,9 @@ from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
 from marlbc_mj.engine.composition import Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.inequalities import workspace_rows
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.plan import grid_room, workspace_rows
+from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 
