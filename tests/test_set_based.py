@@ -126,7 +126,7 @@ def test_any_wish_can_be_braked(seed):
     """Hostile wishes, up to 8 m/s and new in every step, four agents, discs, no half-planes at all: braking alone keeps d."""
     rng = np.random.default_rng(seed)
     at = np.array([(-6.0, 0.0), (6.0, 0.0), (0.0, 6.0), (0.0, -6.0)]) + rng.uniform(-1, 1, (4, 2))
-    discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9, 11) * u, 1.0) for u in np.eye(2))])
+    discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9.3, 11) * u, 1.0) for u in np.eye(2))])
     v = np.zeros((4, 2))
     aim = rng.uniform(-12, 12, (4, 2))
     for _ in range(150):
