@@ -33,7 +33,8 @@ benchmark: venv
 	@$(BIN)/marlbc bench paper --out out/paper --overwrite
 
 test: venv
-	@$(BIN)/python -m pytest
+	@$(BIN)/python tests/warm_cache.py
+	@$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: venv
 	@status=0; \

@@ -12,6 +12,7 @@ from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core.laws import Law
+from marlbc_mj.core.shield import Shield
 from marlbc_mj.engine import loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.scenarios import Scenario
@@ -30,11 +31,12 @@ class FormationTask(composer.Task):
     Args:
         scenario: the problem instance; every episode is drawn with the environment's random state.
         controller: the force law; SORLC by default.
+        shield: see :class:`~marlbc_mj.engine.world.World`.
     """
 
-    def __init__(self, scenario: Scenario, controller: Controller | None = None) -> None:
+    def __init__(self, scenario: Scenario, controller: Controller | None = None, shield: Shield | bool | None = None) -> None:
         self.scenario = scenario
-        self.plan: Plan = make_plan(scenario, controller or SORLC())
+        self.plan: Plan = make_plan(scenario, controller or SORLC(), shield)
         self.state = team.make_team(self.plan, worlds=1)
         self._arena = FormationArena(self.plan.xml)
         self._record = team.make_record(self.plan, worlds=1, recording=False)

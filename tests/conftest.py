@@ -1,5 +1,6 @@
 """Shared by all tests: hypothesis settings, and the expensive episodes, each run once per session."""
 
+import os
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -16,6 +17,14 @@ from marlbc_mj.supervisors import make_supervisor
 
 settings.register_profile("marlbc", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("marlbc")
+
+MOST_WORKERS = 8  # of parallel tests: each takes up to 1.2 GB
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """One worker per core that this process may use, up to a bound."""
+    return min(MOST_WORKERS, len(os.sched_getaffinity(0)))
+
 
 Episode = Callable[..., Trajectory]
 

@@ -84,7 +84,7 @@ def test_evaluate_reports_every_supervisor(tmp_path: Path, capsys: pytest.Captur
     for name in ("fsams", "fms", "mpcms", "layered", "motor-schema", "fuzzy-blend"):
         entry = summary["methods"][f"{name}+sorlc"]
         assert 0 <= entry["success_rate_ci"][0] <= entry["success_rate"] <= entry["success_rate_ci"][1] <= 1
-    assert "DecisionOutcome of the mission" in (out / "index.html").read_text()
+    assert "Outcome of the mission" in (out / "index.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,13 @@ import pytest
 from marlbc_mj.controllers import PD
 from marlbc_mj.core.laws import plain
 from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
-from marlbc_mj.supervisors.references import composition
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER = paper()
@@ -45,7 +45,7 @@ def judge(start, step, orders, obstacles, weights, *, threads=1, trails=None):
     now = at(start, step, obstacles)
     every = np.arange(len(orders))
     pairs = Pairs(np.zeros_like(every), every, orders)
-    laws = composition(PAPER, PAPER.behaviors, PAPER.orders.table)
+    laws = make_behaviors(PAPER)
     teams = Teams(now.step, now.position, now.velocity, now.obstacles)
     return judge_pairs(PAPER, laws, weights, teams, pairs, threads=threads, trails=trails)
 

@@ -181,9 +181,10 @@ def test_workers_change_no_number_of_an_ablation() -> None:
 
 
 PARENT = """
-import sys, time
+import signal, sys, time
 from pathlib import Path
 from marlbc_mj.studies.runner import run_jobs
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell starts what runs in the background without it
 sys.path.insert(0, sys.argv[2])
 from orphans import Patient
 run_jobs(Patient(Path(sys.argv[1]), sys.argv[3] == "heeds"), workers=2)

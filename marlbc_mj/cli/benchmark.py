@@ -84,6 +84,8 @@ class BenchCommand:
     """Write an MCAP log of every episode."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -141,6 +143,8 @@ class RunCommand:
     """Draw of the scenario."""
     overwrite: bool = False
     """Replace what is in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -155,6 +159,7 @@ class RunCommand:
                 self.out,
                 seed=self.seed,
                 overwrite=self.overwrite,
+                shield=self.shield,
                 progress=progress,
             )
         print_results([result])
@@ -185,6 +190,8 @@ class EvaluateCommand:
     """Folder of the results."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -200,6 +207,7 @@ class EvaluateCommand:
             seed=self.seed,
             workers=self.workers,
             overwrite=self.overwrite,
+            shield=self.shield,
         )
         with progress_bars() as progress:
             results = run_evaluation(self.options.build(self.scenario), config, self.out, progress=progress)

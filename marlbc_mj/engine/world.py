@@ -9,6 +9,7 @@ import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core import laws
+from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
@@ -27,6 +28,7 @@ class Step(NamedTuple):
     reward: np.ndarray  # (B,) r1 + r2 of (13)
     done: np.ndarray  # (B,) bool: the episode's last mission step has been made
     record: Record | None  # with ``record=True`` only
+    shield: ShieldCounts | None = None  # since the episode began, (B, N) each; with a shield only
 
 
 class World:
@@ -43,6 +45,7 @@ class World:
         threads: worlds are shared out over this many.
         record: keep every substep.
         native: None takes the compiled loop where it can, False forces the Python path.
+        shield: changes forces, as little as possible, so that agents can always stop; True is ``Shield()``.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
@@ -57,13 +60,14 @@ class World:
         threads: int = 1,
         record: bool = False,
         native: bool | None = None,
+        shield: Shield | bool | None = None,
     ) -> None:
         if not isinstance(worlds, int | np.integer) or worlds < 1:
             raise ConfigurationError(f"worlds must be a whole number, at least 1, got {worlds}")
         most = numba.config.NUMBA_NUM_THREADS
         if not 1 <= threads <= most:
             raise ConfigurationError(f"threads must be between 1 and {most} on this machine, got {threads}")
-        self.plan = make_plan(scenario, controller or SORLC())
+        self.plan = make_plan(scenario, controller or SORLC(), shield)
         self.scenario = scenario
         self.worlds = worlds
         self.threads = threads
@@ -167,7 +171,7 @@ class World:
         if self.advance(orders, velocity):
             self.raise_if_diverged()
         done = self.state.steps >= self.scenario.mission_steps
-        return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
+        return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 
     def rollout(self, orders: np.ndarray) -> np.ndarray:
         """Many mission steps with orders known beforehand, in one compiled call: a schedule, or candidates of a search.

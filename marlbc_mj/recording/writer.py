@@ -59,6 +59,7 @@ class LogWriter:
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.
         overwrite: replace a log, finished or partial, of the same name.
+        shielded: the team has a shield, which gets a topic of its own.
         model: the scenario's MJCF, where a world of it has been made already; None: it is assembled for the log.
 
     Raises:
@@ -75,6 +76,7 @@ class LogWriter:
         seed: int,
         config: dict[str, Any],
         overwrite: bool = False,
+        shielded: bool = False,
         model: str | None = None,
     ) -> None:
         self.path = Path(path)
@@ -93,6 +95,7 @@ class LogWriter:
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = laws.interface(controller.law).state == sorlc.STATE
         self._posed = len(make_robot(scenario.robot).joints) == 1
+        self._shielded = shielded
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]
         self._flushed = monotonic()  # when [s]
@@ -173,7 +176,7 @@ class LogWriter:
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
-        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed):
+        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed, *[schemas.SHIELD] * self._shielded):
             if topic is not schemas.WEIGHTS or self._weighted:
                 text = json.dumps(schemas.json_schema(topic)).encode()
                 schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
@@ -194,6 +197,9 @@ class LogWriter:
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
         if self._posed:
             yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)
+        if self._shielded and frame.shield is not None:
+            interventions, change, breaches = frame.shield
+            yield schemas.SHIELD.name, schemas.encode(schemas.SHIELD, np.column_stack([interventions, change, breaches]))
         if self._weighted:
             yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
         verdicts = {"formation": int(seen.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}
