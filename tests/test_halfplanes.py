@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
-from marlbc_mj.core.halfplanes import SLACK, closest
+from marlbc_mj.core.halfplanes import RELAXATION, closest
 from marlbc_mj.core.laws import plain
 
 seeds = st.integers(0, 2**32 - 1)
@@ -148,11 +148,11 @@ def test_two_walls_that_close_in():
     normals = [(1.0, 0.0), (-1.0, 0.0)]
     v, feasible = solve((0.0, 0.5), half_planes(normals, [3.0, 1.0]), 6.0)
     assert not feasible
-    np.testing.assert_allclose(v, (1.0, 0.5), rtol=0, atol=2 * SLACK)
+    np.testing.assert_allclose(v, (1.0, 0.5), rtol=0, atol=2 * RELAXATION)
     for levels, x in (((0, 1), 3.0), ((1, 0), -1.0)):
         order = np.argsort(levels)
         planes = half_planes(normals, [3.0, 1.0], levels)[order]
-        np.testing.assert_allclose(solve((0.0, 0.5), planes, 6.0)[0], (x, 0.5), rtol=0, atol=2 * SLACK)
+        np.testing.assert_allclose(solve((0.0, 0.5), planes, 6.0)[0], (x, 0.5), rtol=0, atol=2 * RELAXATION)
 
 
 def test_without_half_planes_the_wish_is_shortened():

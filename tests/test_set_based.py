@@ -12,7 +12,7 @@ from marlbc_mj.controllers import SORLC
 from marlbc_mj.core.barriers import Barrier, bound_obstacles
 from marlbc_mj.core.braking import brake, least_distance, restrain, stopping_time
 from marlbc_mj.engine.composition import PLANE_ROWS, WORKSPACE, compose_team, keep, limit
-from marlbc_mj.engine.inequalities import MARGIN, RATE, REACH, SPEED, make_barrier, workspace_rows
+from marlbc_mj.engine.inequalities import BARRIER_MARGIN, BARRIER_RATE, BARRIER_REACH, BARRIER_SPEED, make_barrier, workspace_rows
 from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -98,8 +98,8 @@ def test_references_never_use_up_the_margin(seed):
     scenario = crowd(rng)
     places, velocities = references(scenario, random_orders(scenario, rng, 200))
     obstacles, agents = room(scenario, places)
-    assert min(obstacles, agents) >= MARGIN - 1e-9
-    assert np.linalg.norm(velocities, axis=-1).max() <= SPEED * (1 + 1e-12)
+    assert min(obstacles, agents) >= BARRIER_MARGIN - 1e-9
+    assert np.linalg.norm(velocities, axis=-1).max() <= BARRIER_SPEED * (1 + 1e-12)
 
 
 @given(seeds)
@@ -110,7 +110,7 @@ def test_references_of_limited_acceleration_never_use_it_up_either(seed):
     scenario = crowd(rng, **LIMITS)
     places, velocities = references(scenario, random_orders(scenario, rng, 200))
     obstacles, agents = room(scenario, places)
-    assert min(obstacles, agents) >= MARGIN - 1e-9
+    assert min(obstacles, agents) >= BARRIER_MARGIN - 1e-9
     assert np.linalg.norm(velocities, axis=-1).max() <= LIMITS["speed_limit"] * (1 + 1e-12)
     change = np.linalg.norm(np.diff(velocities, axis=0), axis=-1).max()
     assert change <= LIMITS["acceleration_limit"] * scenario.mission_step * (1 + 1e-9)
@@ -126,7 +126,7 @@ def test_any_wish_can_be_braked(seed):
     """Hostile wishes, up to 8 m/s and new in every step, four agents, discs, no half-planes at all: braking alone keeps d."""
     rng = np.random.default_rng(seed)
     at = np.array([(-6.0, 0.0), (6.0, 0.0), (0.0, 6.0), (0.0, -6.0)]) + rng.uniform(-1, 1, (4, 2))
-    discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9, 11) * u, 1.0) for u in np.eye(2))])
+    discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9.3, 11) * u, 1.0) for u in np.eye(2))])
     v = np.zeros((4, 2))
     aim = rng.uniform(-12, 12, (4, 2))
     for _ in range(150):
@@ -186,7 +186,7 @@ def test_least_distance_of_two_ways_is_the_least_over_a_grid(seed):
 
 def test_half_planes_of_one_disc():
     """At 2 m from a disc's middle (radius 0.5, d_OA 1): room 0.4, so n . v >= -1.6; with the disc's (1, 2) m/s, one more."""
-    barrier = Barrier(RATE, MARGIN, REACH, SPEED, np.inf, 0.05, 1.0, 0.0)
+    barrier = Barrier(BARRIER_RATE, BARRIER_MARGIN, BARRIER_REACH, BARRIER_SPEED, np.inf, 0.05, 1.0, 0.0)
     planes, p = np.zeros((2, 4)), np.array([2.0, 0.0])
     far = [10.0, 0.0, 0.5]
     assert bound_obstacles(p, np.array([[0.0, 0.0, 0.5], far]), 1.0, 3, barrier, planes, 0) == 1
@@ -208,7 +208,7 @@ def test_far_from_everything_the_reference_is_the_complete_behavior():
         compose_team(60.0, order, behaviors, at, scenario.obstacle_array(), np.zeros(0), np.zeros((99, 2)), v)
         compose_team(60.0, other, null_space, at, scenario.obstacle_array(), np.zeros(0), np.zeros((9, 2)), expected)
         size = np.linalg.norm(expected, axis=1, keepdims=True)
-        np.testing.assert_allclose(v, expected * np.minimum(1.0, SPEED / size), rtol=1e-15)
+        np.testing.assert_allclose(v, expected * np.minimum(1.0, BARRIER_SPEED / size), rtol=1e-15)
 
 
 def test_of_two_that_contradict_the_first_wins():
@@ -226,8 +226,8 @@ def test_of_two_that_contradict_the_first_wins():
         compose_team(0.0, orders, behaviors, np.array(scenario.starts), obstacles, np.zeros(0), workspace, v)
         return float(v[0, 0])
 
-    assert towards("OA>AA>FM") == pytest.approx(RATE * (1.1 - 0.8), abs=1e-8)
-    assert towards("AA>OA>FM") == pytest.approx(-0.5 * RATE * (1.6 - 1.0), abs=1e-8)
+    assert towards("OA>AA>FM") == pytest.approx(BARRIER_RATE * (1.1 - 0.8), abs=1e-8)
+    assert towards("AA>OA>FM") == pytest.approx(-0.5 * BARRIER_RATE * (1.6 - 1.0), abs=1e-8)
     assert towards("AA>FM") == towards("AA>OA>FM")
     assert towards("FM") == towards("OA>FM") == towards("OA>AA>FM")
 
@@ -319,12 +319,12 @@ def test_the_composition_is_a_setting_of_every_kind_of_scenario(tmp_path):
 def test_barriers_have_the_robots_scale():
     """A robot's unit scales lengths, its limits bound speed and rate; room for half-planes is that of obstacles and team."""
     barrier = make_barrier(make_scenario("field"))
-    assert barrier[:5] == (RATE, MARGIN, REACH, SPEED, np.inf)
+    assert barrier[:5] == (BARRIER_RATE, BARRIER_MARGIN, BARRIER_REACH, BARRIER_SPEED, np.inf)
     assert (barrier.obstacle_distance, barrier.agent_distance) == (1.0, 1.5)
     slow = make_barrier(make_scenario("field", **LIMITS))
     assert (slow.speed, slow.rate, slow.braking) == (1.5, 1.0, 1.5)
     small = make_barrier(make_scenario("robot_gate", robot="crazyflie", **SET_BASED))
-    assert small.margin < MARGIN
+    assert small.margin < BARRIER_MARGIN
     assert workspace_rows(make_scenario("field")) == WORKSPACE
     assert workspace_rows(make_scenario("field", **SET_BASED)) == WORKSPACE + PLANE_ROWS * (12 + 4)
 

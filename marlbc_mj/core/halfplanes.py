@@ -15,9 +15,9 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free
 
 PARALLEL = 1e-12  # sine below which two borders are parallel
-ROUNDING = 1e-12  # violation that is none [m/s]
-TOLERANCE = 1e-10  # by which borders may miss each other and still meet [m/s]
-SLACK = 1e-9  # beyond the least violation, so that rounding leaves something feasible [m/s]
+NEGLIGIBLE = 1e-12  # violation that counts as none [m/s]
+MEETING = 1e-10  # by which borders may miss each other and still meet [m/s]
+RELAXATION = 1e-9  # beyond the least violation, so that rounding leaves something feasible [m/s]
 
 
 @allocation_free
@@ -45,7 +45,7 @@ def closest(wish, speed, planes, count, v):
         violation = _least_violation(planes, first, end, speed, v)
         if violation > 0.0:
             for k in range(first, end):
-                planes[k, 2] -= violation + SLACK
+                planes[k, 2] -= violation + RELAXATION
         first = end
     x, y = v[0], v[1]
     if not _insert(wish, planes, count, 0, -1, speed, v):
@@ -64,7 +64,7 @@ def _least_violation(planes, first, end, speed, v):
     least = 0.0
     for i in range(first, end):
         violation = planes[i, 2] - planes[i, 0] * v[0] - planes[i, 1] * v[1]
-        if violation <= least + ROUNDING:
+        if violation <= least + NEGLIGIBLE:
             continue
         x, y = v[0], v[1]
         if not _insert(planes[i], planes, i, first, i, speed, v):
@@ -86,7 +86,7 @@ def _insert(goal, planes, stop, first, most, speed, v):
         v[0], v[1] = speed * goal[0], speed * goal[1]
     for k in range(stop):
         x, y, bound = _border(planes, k, first, most)
-        if x * v[0] + y * v[1] < bound - ROUNDING and not _on_border(goal, planes, k, first, most, speed, v):
+        if x * v[0] + y * v[1] < bound - NEGLIGIBLE and not _on_border(goal, planes, k, first, most, speed, v):
             return False
     return True
 
@@ -107,7 +107,7 @@ def _border(planes, k, first, most):
 def _on_border(goal, planes, k, first, most, speed, v):
     """Optimum on the border of row ``k``, subject to the rows before it, into ``v``; False where there is none."""
     x, y, bound = _border(planes, k, first, most)
-    if abs(bound) > speed + TOLERANCE:
+    if abs(bound) > speed + MEETING:
         return False
     high = np.sqrt(max(0.0, speed * speed - bound * bound))
     low = -high
@@ -116,13 +116,13 @@ def _on_border(goal, planes, k, first, most, speed, v):
         along = y * other_x - x * other_y  # the border's direction is (y, -x)
         rest = least - bound * (x * other_x + y * other_y)
         if abs(along) < PARALLEL:
-            if rest > TOLERANCE:
+            if rest > MEETING:
                 return False
         elif along > 0.0:
             low = max(low, rest / along)
         else:
             high = min(high, rest / along)
-    if low > high + TOLERANCE:
+    if low > high + MEETING:
         return False
     wanted = y * goal[0] - x * goal[1]
     if most >= 0:

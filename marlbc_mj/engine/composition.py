@@ -37,7 +37,29 @@ class Behaviors(NamedTuple):
     acceleration_limit: float  # of references [m/s^2]
     set_based: bool  # composition: avoidance as inequalities; else (12), all behaviors as equalities
     keeps: np.ndarray  # (M,) distance that an inequality task keeps [m]; 0 for an equality task
-    barrier: Barrier  # how inequality tasks bound references
+    rate: float  # from here on: how inequality tasks bound references, as in Barrier. Flat, for loops over threads
+    margin: float
+    reach: float
+    speed: float
+    braking: float
+    duration: float
+    obstacle_distance: float
+    agent_distance: float
+
+
+@allocation_free
+def barrier_of(behaviors):
+    """The :class:`Barrier` that behaviors have as flat fields."""
+    return Barrier(
+        behaviors.rate,
+        behaviors.margin,
+        behaviors.reach,
+        behaviors.speed,
+        behaviors.braking,
+        behaviors.duration,
+        behaviors.obstacle_distance,
+        behaviors.agent_distance,
+    )
 
 
 class TeamView(NamedTuple):
@@ -113,10 +135,10 @@ def compose(order, i, behaviors, view, v_r):
 
 
 @allocation_free
-def compose_set_based(order, i, behaviors, view, planes, v_r):
+def compose_set_based(order, i, behaviors, barrier, view, planes, v_r):
     """v_r = argmin |v - v_c|^2 over the v that inequality tasks allow, for agent ``i``, into ``v_r`` (2,) [m/s].
 
-    v_c is what the other behaviors make by (12), no longer than ``behaviors.barrier.speed``: FM or FR, whichever is higher. OA
+    v_c is what the other behaviors make by (12), no longer than ``barrier.speed``: FM or FR, whichever is higher. OA
     and AA bound v whatever the order, see :mod:`marlbc_mj.core.barriers`; where they contradict, the one that ``order`` (M,)
     lists first is violated least. ``planes`` (n, 4) is scratch.
     """
@@ -126,15 +148,15 @@ def compose_set_based(order, i, behaviors, view, planes, v_r):
         j = order[place]
         distance = behaviors.keeps[j]
         if distance > 0.0 and behaviors.sees[j] == NEAREST_OBSTACLE:
-            count = bound_obstacles(view.at[i], view.obstacles, distance, place, behaviors.barrier, planes, count)
+            count = bound_obstacles(view.at[i], view.obstacles, distance, place, barrier, planes, count)
         elif distance > 0.0:
-            count = bound_neighbors(view.at, i, distance, place, behaviors.barrier, planes, count)
+            count = bound_neighbors(view.at, i, distance, place, barrier, planes, count)
         elif rank < 2:
             rows = desired_velocity(j, i, behaviors, view)
             rank = add_behavior(view.velocity, view.jacobian, rows, view.basis, rank, v_r)
     wish = view.velocity
     wish[0], wish[1] = v_r[0], v_r[1]
-    closest(wish, behaviors.barrier.speed, planes, count, v_r)
+    closest(wish, barrier.speed, planes, count, v_r)
 
 
 @allocation_free
@@ -152,13 +174,13 @@ def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
         v_r: (N, 2), written in place. A set-based composition of limited acceleration reads the velocities before in it.
     """
     if behaviors.set_based:
-        barrier = behaviors.barrier
+        barrier = barrier_of(behaviors)
         view = make_view(t, behaviors, at, obstacles, grid[:0], workspace)
         planes = workspace[WORKSPACE:].reshape(((workspace.shape[0] - WORKSPACE) // PLANE_ROWS, 2 * PLANE_ROWS))
         for i in range(orders.shape[0]):
             before = view.pair[0]
             before[0], before[1] = v_r[i, 0], v_r[i, 1]
-            compose_set_based(behaviors.table[orders[i]], i, behaviors, view, planes, v_r[i])
+            compose_set_based(behaviors.table[orders[i]], i, behaviors, barrier, view, planes, v_r[i])
             if barrier.braking < np.inf:
                 restrain(i, before, barrier, at, obstacles, v_r)
         return

@@ -10,10 +10,10 @@ from marlbc_mj.engine.composition import PLANE_ROWS, WORKSPACE
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
-RATE = 4.0  # alpha, at most [1/s]
-MARGIN = 0.1  # m, in length units of the robot
-REACH = 3.0  # in length units
-SPEED = 6.0  # of references at most, in length units per second
+BARRIER_RATE = 4.0  # alpha, at most [1/s]
+BARRIER_MARGIN = 0.1  # m, in length units of the robot
+BARRIER_REACH = 3.0  # in length units
+BARRIER_SPEED = 6.0  # of references at most, in length units per second
 _DISTANCES = {NEAREST_OBSTACLE: "safe_distance", NEAREST_NEIGHBOR: "distance"}
 """Attribute of a behavior that has the distance which it keeps as an inequality task, by what it sees."""
 
@@ -25,16 +25,16 @@ def make_barrier(scenario: Scenario) -> Barrier:
     more than the room that is left within a mission step. What two agents do in one step is within reach.
     """
     unit, duration = make_robot(scenario.robot).length, float(scenario.mission_step)
-    speed, braking = min(SPEED * unit, float(scenario.speed_limit)), float(scenario.acceleration_limit)
+    speed, braking = min(BARRIER_SPEED * unit, float(scenario.speed_limit)), float(scenario.acceleration_limit)
     sees, keeps = sees_array(scenario.behaviors), keeps_array(scenario.behaviors)
     obstacle_distance, agent_distance = (
         float(keeps[sees == kind].max(initial=0.0)) for kind in (NEAREST_OBSTACLE, NEAREST_NEIGHBOR)
     )
-    margin = MARGIN * unit
+    margin = BARRIER_MARGIN * unit
     return Barrier(
-        rate=min(RATE, braking / speed, 1.0 / duration),
+        rate=min(BARRIER_RATE, braking / speed, 1.0 / duration),
         margin=margin,
-        reach=max(REACH * unit, max(obstacle_distance, agent_distance) + margin + 2.0 * speed * duration),
+        reach=max(BARRIER_REACH * unit, max(obstacle_distance, agent_distance) + margin + 2.0 * speed * duration),
         speed=speed,
         braking=braking,
         duration=duration,

@@ -159,7 +159,7 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         acceleration_limit=float(scenario.acceleration_limit),
         set_based=set_based,
         keeps=keeps_array(scenario.behaviors),
-        barrier=make_barrier(scenario),
+        **make_barrier(scenario)._asdict(),
     )
 
 
