@@ -69,12 +69,21 @@ class One(NamedTuple):
     team: np.ndarray  # (1,) int64
 
 
+class Tracks(NamedTuple):
+    """What is predicted before every step k = 0 to H, along the last plan of each level; (3, H + 1, N, 2) each."""
+
+    reference: np.ndarray  # p_r [m]
+    position: np.ndarray  # p [m]
+    velocity: np.ndarray  # v [m/s]
+    reference_velocity: np.ndarray  # v_r [m/s]
+
+
 class Room(NamedTuple):
     """Scratch of one prediction."""
 
     rows: np.ndarray  # (1, W, 2), see marlbc_mj.engine.inequalities.workspace_rows
-    states: np.ndarray  # (3, H + 1, 4, N, 2) p_r, p, v and v_r before every step, of the last plan of each level
-    costs: np.ndarray  # (3, H + 1) of the steps before
+    tracks: Tracks
+    costs: np.ndarray  # (3, H + 1) of the steps before each step
     before: np.ndarray  # (N, 2) v_r of the step before [m/s]
     obstacles: np.ndarray  # (1, K, 3 or 5)
     orders: np.ndarray  # (N,) int64
@@ -100,31 +109,33 @@ class Improved(NamedTuple):
 
 
 @allocation_free
-def follow_plan(one, plan, motion, search, fleet, room):
-    """Cost of a plan for one team, whose motion in force is ``motion``; its states and costs go into ``room``."""
+def follow_plan(one, plan, motion, search, present, room):
+    """Cost of a plan for one team, whose motion in force is ``motion``; what is predicted goes into ``room``."""
     level, first = search.plans.level[plan], search.plans.branch[plan]
-    states, costs, changed = room.states[level], room.costs[level], search.plans.changed[plan]
+    tracks, costs, changed = room.tracks, room.costs[level], search.plans.changed[plan]
     if level == 0:
-        _begin(one.team[0], fleet, states[0])
+        _begin(one.team[0], present, tracks)
         costs[0] = 0.0
     else:
-        _copy(room.states[level - 1, first], states[first])
+        _copy(tracks, (level - 1, first), (level, first))
         costs[first] = room.costs[level - 1, first]
     for k in range(first, changed.shape[0]):
-        _copy(states[k], states[k + 1])
-        predict_step(k, one.team[0], motion ^ changed[k], search, fleet, room, states[k + 1])
-        at, behaviors = states[k + 1, 1], search.rule.behaviors
-        costs[k + 1] = add_step_cost(costs[k], k, at, 0, behaviors, search.problem, fleet, one, room)
+        _copy(tracks, (level, k), (level, k + 1))
+        predict_step((level, k), one.team[0], motion ^ changed[k], search, present, room)
+        at, behaviors = tracks.position[level, k + 1], search.rule.behaviors
+        costs[k + 1] = add_step_cost(costs[k], k, at, 0, behaviors, search.problem, present, one, room)
     return costs[changed.shape[0]] + search.w_switch * search.plans.switches[plan]
 
 
 @allocation_free
-def predict_step(k, b, motion, search, fleet, room, state):
-    """Predicted mission step ``k`` of team ``b``, the base policy in the loop: ``state`` (4, N, 2), p_r, p, v, v_r, in place."""
-    rule, behaviors, dt = search.rule, search.rule.behaviors, search.problem.mission_step
-    p_r, p, v, v_r = state[0], state[1], state[2], state[3]
+def predict_step(moment, b, motion, search, present, room):
+    """Predicted mission step ``moment`` = (level, k) of team ``b``, the base policy in the loop; moves what is at k + 1."""
+    level, k = moment
+    rule, behaviors, dt, tracks = search.rule, search.rule.behaviors, search.problem.mission_step, room.tracks
+    p_r, v_r = tracks.reference[level, k + 1], tracks.reference_velocity[level, k + 1]
+    p, v = tracks.position[level, k + 1], tracks.velocity[level, k + 1]
     keep(behaviors, v_r, room.before)
-    seen, t = extrapolate(k * dt, fleet.obstacles[b], room.obstacles[0]), (fleet.first[b] + k) * dt
+    seen, t = extrapolate(k * dt, present.obstacles[b], room.obstacles[0]), (present.first[b] + k) * dt
     at = p_r if behaviors.virtual else p
     avoiding = follow_rule(t, motion, rule, at, seen, room.rows[0], v_r, room.orders)
     if avoiding + _give_way(at, rule.way, room.orders, rule.grid[:0]):
@@ -134,21 +145,24 @@ def predict_step(k, b, motion, search, fleet, room, state):
 
 
 @allocation_free
-def _begin(b, fleet, state):
-    """The state (4, N, 2) of team ``b`` now."""
-    for i in range(state.shape[1]):
+def _begin(b, present, tracks):
+    """Team ``b`` as it is now, before the first step of the first level."""
+    for i in range(present.position.shape[1]):
         for axis in range(2):
-            state[0, i, axis], state[1, i, axis] = fleet.reference[b, i, axis], fleet.position[b, i, axis]
-            state[2, i, axis] = state[3, i, axis] = fleet.moving[b, i, axis]
+            tracks.reference[0, 0, i, axis] = present.reference[b, i, axis]
+            tracks.position[0, 0, i, axis] = present.position[b, i, axis]
+            tracks.velocity[0, 0, i, axis] = tracks.reference_velocity[0, 0, i, axis] = present.moving[b, i, axis]
 
 
 @allocation_free
-def _copy(source, out):
-    """A state (4, N, 2)."""
-    for row in range(out.shape[0]):
-        for i in range(out.shape[1]):
-            for axis in range(2):
-                out[row, i, axis] = source[row, i, axis]
+def _copy(tracks, source, target):
+    """Copy what is predicted at one moment (level, k) to another."""
+    for i in range(tracks.position.shape[2]):
+        for axis in range(2):
+            tracks.reference[target][i, axis] = tracks.reference[source][i, axis]
+            tracks.position[target][i, axis] = tracks.position[source][i, axis]
+            tracks.velocity[target][i, axis] = tracks.velocity[source][i, axis]
+            tracks.reference_velocity[target][i, axis] = tracks.reference_velocity[source][i, axis]
 
 
 @allocation_free
@@ -184,13 +198,13 @@ def follow_reference(dt, lag, p_r, p, v, v_r):
 
 
 @compiled
-def _search(due, motion, search, fleet, room, costs):
+def _search(due, motion, search, present, room, costs):
     """Costs (D, P) of all plans for the teams ``due`` (D,), whose motions in force are ``motion`` (B,)."""
     one = One(np.zeros(1, dtype=np.int64))
     for d in range(due.shape[0]):
         one.team[0] = due[d]
         for plan in range(costs.shape[1]):
-            costs[d, plan] = follow_plan(one, plan, motion[due[d]], search, fleet, room)
+            costs[d, plan] = follow_plan(one, plan, motion[due[d]], search, present, room)
 
 
 @dataclass(frozen=True)
@@ -251,7 +265,7 @@ class Rollout:
         columns = 5 if scenario.moving else 3
         room = Room(
             rows=np.zeros((1, workspace_rows(scenario), 2)),
-            states=np.zeros((3, plans.changed.shape[1] + 1, 4, scenario.agents, 2)),
+            tracks=Tracks(*(np.zeros((3, plans.changed.shape[1] + 1, scenario.agents, 2)) for _ in Tracks._fields)),
             costs=np.zeros((3, plans.changed.shape[1] + 1)),
             before=np.zeros((scenario.agents, 2)),
             obstacles=np.zeros((1, len(scenario.obstacles), columns)),
