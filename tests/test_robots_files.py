@@ -140,7 +140,7 @@ def test_the_recorded_force_is_what_moves_the_body(case, write):
 
 
 @pytest.mark.parametrize(
-    "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "no names", "buoyant"]
+    "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "turned body", "no names", "buoyant"]
 )
 def test_the_checklist_passes_what_is_driven(case, write):
     """All of it, the comparison with MuJoCo included."""
