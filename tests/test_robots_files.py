@@ -140,7 +140,7 @@ def test_the_recorded_force_is_what_moves_the_body(case, write):
 
 
 @pytest.mark.parametrize(
-    "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "no names", "buoyant"]
+    "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "turned body", "no names", "buoyant"]
 )
 def test_the_checklist_passes_what_is_driven(case, write):
     """All of it, the comparison with MuJoCo included."""
@@ -268,6 +268,7 @@ PARTS = {
              '<geom size="0.01" pos="0 0 1" mass="1" contype="0" conaffinity="0"/></body></frame></frame>'), {}),
     "replicate": (
         cart(shape=SHAPE + '<replicate count="3" euler="0 0 120"><geom name="g" size="0.02" pos="0.12 0 0"/></replicate>'), {}),
+    "lax XML": (cart(head='<!-- -- wheels -- <include file="gone.xml"/> --><custom><text name="a" data="a & b"/></custom>'), {}),
     "equality and defaults": (
         cart(head='<default><default class="w"><geom size="0.03" mass="0.1" contype="0" conaffinity="0"/></default></default>',
              shape=SHAPE + '<body childclass="w"><joint name="a" axis="0 1 0"/><geom/></body><body><joint name="b" axis="0 1 0"/>'
@@ -343,6 +344,19 @@ def test_files_outside_the_folder_are_not_opened(kind, way, tmp_path):
 
 NESTED_COPIES = '<worldbody><replicate count="1000"><replicate count="1000"><site/></replicate></replicate></worldbody>'
 ITSELF = '<asset><model name="me" file="cart.xml"/></asset><worldbody><attach model="me" body="cart" prefix="x"/></worldbody>'
+HIDDEN = (
+    '<custom><text name="a" data="<!--"/></custom><include file="../secret.xml"/><custom><text name="b" data="-->"/></custom>'
+)
+
+
+def test_an_include_cannot_be_hidden_from_the_check(write):
+    """Not between what looks like a comment, and not in what only MuJoCo would read."""
+    with pytest.raises(ConfigurationError, match="outside its folder: ../secret.xml"):
+        make_robot(write(cart(head=HIDDEN)))
+    with pytest.raises(ConfigurationError, match="is no MJCF that MuJoCo reads"):
+        make_robot(write(cart(head='<![CDATA[<!--]]><include file="../secret.xml"/>')))
+
+
 BOMBS = {
     "replicate": ('<worldbody><replicate count="10000000"><site/></replicate></worldbody>', "makes 1e\\+07 copies"),
     "nested replicates": (NESTED_COPIES, "makes 1e\\+06 copies"),

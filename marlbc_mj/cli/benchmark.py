@@ -152,9 +152,9 @@ class RunCommand:
     scenario: Positional[str] = "paper"
     """Scenario, see `marlbc list`, or a .toml file."""
     supervisor: str = "scripted"
-    """Mission supervisor."""
+    """Mission supervisor, FILE.py:NAME, or the path of a checkpoint."""
     controller: str = "sorlc"
-    """Controller."""
+    """Controller, or FILE.py:NAME."""
     out: Path = Path("out/run")
     """Folder of the log, the metrics and the configuration."""
     seed: int = 0

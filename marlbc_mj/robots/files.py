@@ -3,6 +3,7 @@
 MuJoCo opens includes, models and assets while it parses, so the text is read here first, without opening any of them blindly.
 """
 
+import re
 from collections.abc import Iterator
 from math import prod
 from pathlib import Path
@@ -90,14 +91,34 @@ def _parse(path: Path, here: Path) -> ElementTree.Element:
         size = here.stat().st_size
         if size > _MOST_BYTES:
             raise ConfigurationError(f"{path}: {here.name} has {size} bytes; at most {_MOST_BYTES} are read")
-        text = here.read_bytes()
-        if b"<!ENTITY" in text:
-            raise ConfigurationError(f"{path}: {here.name} declares XML entities, which MuJoCo does not read")
-        return ElementTree.fromstring(text)
+        return ElementTree.fromstring(_strict(here.read_bytes().decode("utf-8-sig", errors="replace")))
     except (OSError, ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
         if isinstance(error, ConfigurationError):
             raise
         raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {here.name}: {one_line(error)}") from error
+
+
+_TOKEN = re.compile(r"""<!--.*?-->|<\?.*?\?>|<!|<(?:[^>"']|"[^"]*"|'[^']*')*>|[^<]+""", re.DOTALL)
+
+
+def _strict(text: str) -> str:
+    """XML as MuJoCo's parser takes it in words that Python's takes: comments may hold ``--``, values ``<`` and ``&``.
+
+    Raises:
+        ValueError: a part that is neither a tag, a comment nor text between them.
+    """
+    out, at = [], 0
+    for token in _TOKEN.finditer(text):
+        part = token.group()
+        if token.start() != at or part == "<!":
+            break
+        at = token.end()
+        if part.startswith("<!--") or part.startswith("<?") or not part.startswith("<"):
+            continue  # nothing of an MJCF is in texts between tags
+        out.append("<" + re.sub("&(?!#?\\w+;)", "&amp;", part[1:].replace("<", "&lt;")))
+    if at != len(text):
+        raise ValueError(f"no tag, comment or text from character {at} on")
+    return "".join(out)
 
 
 def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:

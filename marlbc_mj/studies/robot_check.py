@@ -109,7 +109,8 @@ def _frame(robot: Robot) -> Item:
     upright = float(data.xmat[body][8])
     offset = data.subtree_com[body][:2] - data.xpos[body][:2]
     heading = float(np.degrees(np.arctan2(data.xmat[body][3], data.xmat[body][0])))
-    good = upright > 0.999 and abs(heading) < 1.0 and float(np.hypot(*offset)) < robot.radius
+    ahead = robot.direct or abs(heading) < 1.0  # motors push along the world's axes, however the body is turned
+    good = upright > 0.999 and ahead and float(np.hypot(*offset)) < robot.radius
     said = f"z up: {upright:.3f}, x along the world's: {heading:.1f} deg off, centre of mass {1e3 * np.hypot(*offset):.1f} mm off"
     return Item("frame", good, said)
 
