@@ -30,7 +30,9 @@ def entities(path: Path) -> dict[str, dict[str, Any]]:
     found: dict[str, dict[str, Any]] = {}
     for each in chunk.RrdReader(str(path)).stream():
         batch = each.to_record_batch()
-        found.setdefault(each.entity_path, {}).update({name: batch.column(name).to_pylist() for name in batch.schema.names})
+        for name in batch.schema.names:
+            column = batch.column(name)
+            found.setdefault(each.entity_path, {})[name] = column.to_numpy() if name == "mission" else column.to_pylist()
     return found
 
 
@@ -50,7 +52,7 @@ def test_state_force_priorities_and_scene(tmp_path, name, changes):
             (f"/force/agent{i + 1}/force", log.force),
         ):
             assert (np.array(seen[entity]["Scalars:scalars"]) == values[:, i]).all()
-            assert [time.total_seconds() for time in seen[entity]["mission"]] == pytest.approx(log.time.tolist())
+            assert np.allclose(seen[entity]["mission"] / np.timedelta64(1, "s"), log.time, atol=1e-8)
             assert seen[entity]["SeriesLines:names"] == [["x", "y"]]
         texts = [text for (text,) in seen[f"/priorities/agent{i + 1}/command"]["TextLog:text"]]
         commands = [log.commands[k] for k in log.command[:, i]]
