@@ -282,3 +282,32 @@ def test_switched_off_rendering_says_so(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True, cwd=tmp_path)
     assert "switches rendering off" in done.stdout
     assert list(Path(tmp_path).iterdir()) == []
+
+
+def played(env: PaperFormation, steps: int) -> np.ndarray:
+    """States of an environment that joblib has sent to a worker."""
+    return np.array([env.step(JOINT)[0] for _ in range(steps)])
+
+
+def test_joblib_plays_copies_in_its_workers():
+    joblib = pytest.importorskip("joblib")
+    env = PaperFormation(duration=2.0)
+    env.reset(seed=0)
+    one, two = joblib.Parallel(n_jobs=2)(joblib.delayed(played)(env, 5) for _ in range(2))
+    assert (one == two).all() and (one == played(env, 5)).all()
+
+
+@pytest.mark.filterwarnings("ignore")  # of these libraries
+def test_stable_baselines_learns_on_the_pettingzoo_view():
+    """SuperSuit copies the environment with cloudpickle; PPO then steps the copies."""
+    supersuit, sb3 = pytest.importorskip("supersuit"), pytest.importorskip("stable_baselines3")
+    vector = supersuit.pettingzoo_env_to_vec_env_v1(PaperFormationParallel(duration=0.5))
+    vector = supersuit.concat_vec_envs_v1(vector, 2, num_cpus=1, base_class="stable_baselines3")
+    model = sb3.PPO("MlpPolicy", vector, n_steps=16, batch_size=32, n_epochs=1, device="cpu")
+    assert model.learn(64).num_timesteps >= 64
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_stable_baselines_takes_the_gymnasium_view():
+    checker = pytest.importorskip("stable_baselines3.common.env_checker")
+    checker.check_env(PaperFormation(duration=0.5), skip_render_check=True)

@@ -27,6 +27,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.rerun_file import write_rerun
 from marlbc_mj.recording.writer import METADATA, MODEL
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
@@ -175,12 +176,13 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
 
 
 def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> None:
-    """Write a log as a table (``.csv``: one row a mission step and agent) or as arrays (``.npz``: the fields of EpisodeLog).
+    """Write a log as a table (``.csv``: one row a mission step and agent), as arrays (``.npz``: the fields of EpisodeLog), or for
+    Rerun (``.rrd``).
 
     Raises:
         ConfigurationError: an unknown suffix, a log that cannot be read, or an output that cannot or must not be written.
     """
-    writers = {".csv": _write_csv, ".npz": _write_npz}
+    writers = {".csv": _write_csv, ".npz": _write_npz, ".rrd": write_rerun}
     suffix = Path(out).suffix
     if suffix not in writers:
         raise unknown("export format", suffix or str(out), writers)
