@@ -170,7 +170,8 @@ class WindGusts(_Scaled):
 
     def force_bound(self) -> ForceBound:
         """|f_i| <= scale (|w_i| + sum_k a_k) on each axis: the sines all at their peaks."""
-        peaks = np.abs(self.steady) + np.sum(np.asarray(self.params()["amplitude"]), axis=1)
+        gains = laws.as_gains(self.law, self.params())
+        peaks = np.abs(gains.steady) + np.sum(gains.amplitude, axis=1)
         return ForceBound(abs(self.scale) * float(np.hypot(*peaks)))
 
 

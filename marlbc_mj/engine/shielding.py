@@ -64,7 +64,7 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
 
 def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
     """Raise ConfigurationError for a plant that the stopping ball does not describe."""
-    if robot.force_error is None:
+    if robot.force_error is None and shield.force_error is None:
         raise ConfigurationError(
             f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
             "it within one substep, in every direction, besides the planar force and the disturbance"
@@ -85,7 +85,8 @@ def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
 
 def _force_bound(shield: Shield, scenario: Scenario, robot: Robot) -> ForceBound:
     """Bound of all that is not u: the disturbance at the greatest scale that is drawn, and the robot's own error."""
-    assert robot.force_error is not None
+    error = robot.force_error if shield.force_error is None else shield.force_error
+    assert error is not None
     bound = shield.disturbance
     if bound is None:
         offered = getattr(scenario.disturbance, "force_bound", None)
@@ -96,7 +97,7 @@ def _force_bound(shield: Shield, scenario: Scenario, robot: Robot) -> ForceBound
             )
         scale = max(map(abs, scenario.perturbation.drag_scale))
         bound = ForceBound(*(scale * number for number in offered()))
-    return bound._replace(constant=bound.constant + robot.force_error)
+    return bound._replace(constant=bound.constant + error)
 
 
 def _check_bound(bound: ForceBound, force: float, scenario: Scenario) -> None:
