@@ -11,6 +11,7 @@ GREATEST_SHARE = 0.25
 """Of the force limit, that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating keep S."""
 CREEP = 2.0
 """Retreats at rest, each with its :func:`drift`, that the margin has room for where several things press at once."""
+FASTEST = 1e3  # speed cap where f does not grow with the speed [m/s]
 LEAST_CREEP = 1e-5  # more, for the drift of a slow motion that ends [m]
 
 
@@ -111,12 +112,12 @@ def _check_bound(bound: ForceBound, force: float, scenario: Scenario) -> None:
 
 
 def _speed_cap(bound: ForceBound, force: float) -> float:
-    """The speed at which f takes half of what it leaves of the force limit at rest [m/s]; infinite where it does not grow."""
+    """The speed at which f takes half of what it leaves of the force limit at rest, at most FASTEST [m/s]."""
     half = 0.5 * (force - bound.constant)
     if bound.quadratic > 0.0:
         root = np.sqrt(bound.linear**2 + 4.0 * bound.quadratic * half)
-        return float(2.0 * half / (bound.linear + root))
-    return half / bound.linear if bound.linear > 0.0 else np.inf
+        return min(float(2.0 * half / (bound.linear + root)), FASTEST)
+    return min(half / bound.linear, FASTEST) if bound.linear > 0.0 else FASTEST
 
 
 def check_start(numbers: ShieldNumbers, starts: np.ndarray, obstacles: np.ndarray) -> None:
