@@ -15,7 +15,7 @@ from marlbc_mj.core.disturbances import DISTURBANCES, ConstantWind, LinearDrag, 
 from marlbc_mj.core.imperfections import Imperfections
 from marlbc_mj.core.shield import (
     ASSUMPTIONS,
-    FORCE,
+    FORCE_BROKEN,
     ForceBound,
     Shield,
     ShieldNumbers,
@@ -252,8 +252,8 @@ def test_a_world_outside_the_assumptions_is_counted(changes, shield):
     """Apart, by the assumption that does not hold; inside them nothing is counted."""
     world = World(corridor(**changes), PD(), record=True, shield=shield)
     harass(world, steps=60, speed=4.0)
-    assert ASSUMPTIONS[FORCE] == "force"
-    assert world.state.breaches[..., FORCE].sum() > 10
+    assert ASSUMPTIONS[FORCE_BROKEN] == "force"
+    assert world.state.breaches[..., FORCE_BROKEN].sum() > 10
     inside = World(corridor(), PD(), record=True, shield=True)
     harass(inside, steps=60)
     assert inside.state.breaches.sum() == 0

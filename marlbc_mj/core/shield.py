@@ -32,7 +32,7 @@ from marlbc_mj.util.errors import ConfigurationError
 FAR = 1e9  # stopping distance of a speed from which nothing brakes [m]
 TINY = 1e-9  # rounding of a speed [m/s] or distance [m]
 ROUNDS = 8  # of projections, where several things are near
-SPEED, FORCE, STATE = 0, 1, 2
+SPEED_BROKEN, FORCE_BROKEN, STATE_BROKEN = 0, 1, 2
 """Assumptions that are watched: the speed cap, the bound of all that is not u, and that the state is in S."""
 ASSUMPTIONS = ("speed", "force", "state")
 """Their names, in the order of their indices."""
@@ -330,12 +330,12 @@ def watch_assumptions(numbers, view, i, last, breaches):
     """
     x, y = view.moving[i, 0], view.moving[i, 1]
     if x * x + y * y > (numbers.speed_cap + TINY) ** 2:
-        breaches[SPEED] += 1.0
+        breaches[SPEED_BROKEN] += 1.0
     per = numbers.mass / view.h
     other_x, other_y = per * (x - last[0, 0]) - last[1, 0], per * (y - last[0, 1]) - last[1, 1]
     speed = np.sqrt(last[0, 0] ** 2 + last[0, 1] ** 2)
     if other_x**2 + other_y**2 > (force_bound(numbers, speed) + 1e-6 * numbers.force_limit) ** 2:
-        breaches[FORCE] += 1.0
+        breaches[FORCE_BROKEN] += 1.0
 
 
 @allocation_free
@@ -348,7 +348,7 @@ def shield_agent(numbers, view, i, force, counts):
     need = max(worst * (0.5 * worst / a + view.h) if a > 0.0 else FAR, view.stopping[i])
     k = most_pressing(numbers, view, i, need)
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
-        counts.breaches[i, STATE] += 1.0
+        counts.breaches[i, STATE_BROKEN] += 1.0
     if (k < 0 and worst <= numbers.speed_cap) or stays_safe(numbers, view, i, x, y):
         return
     x, y = safe_velocity(numbers, view, i, k, x, y)
