@@ -259,6 +259,17 @@ def test_a_world_outside_the_assumptions_is_counted(changes, shield):
     assert inside.state.breaches.sum() == 0
 
 
+@pytest.mark.parametrize(("robot", "error"), [("omni", 1.5), ("disc", 5.9)])
+def test_robots_on_the_ground_keep_clear_of_obstacles_too(robot, error):
+    """Tested, not proved: their contact moves them by more than is assumed in some substeps, which are counted."""
+    scenario = make_scenario("robot_gate", robot=robot)
+    world = World(scenario, SORLC(), record=True, shield=Shield(force_error=error))
+    trajectory = run_episode(world, make_supervisor("fsams"))
+    assert trajectory.clearances().min() > scenario.safe_distance
+    assert spacing(trajectory.position).min() > 2.0 * world.plan.robot.radius
+    assert trajectory.shield.breaches[-1, :, FORCE_BROKEN].sum() > 0
+
+
 def refusal(scenario, shield=True):
     """What a world says that cannot have this shield."""
     with pytest.raises(ConfigurationError) as refused:
