@@ -32,7 +32,7 @@ from marlbc_mj.util.errors import ConfigurationError
 FAR = 1e9  # stopping distance of a speed from which nothing brakes [m]
 TINY = 1e-9  # rounding of a speed [m/s] or distance [m]
 ROUNDS = 8  # of projections, where several things are near
-SPEED, FORCE, STATE = 0, 1, 2
+SPEED_BROKEN, FORCE_BROKEN, STATE_BROKEN = 0, 1, 2
 """Assumptions that are watched: the speed cap, the bound of all that is not u, and that the state is in S."""
 ASSUMPTIONS = ("speed", "force", "state")
 """Their names, in the order of their indices."""
@@ -63,6 +63,7 @@ class Shield:
     force_limit: float | None = None  # U, available in every direction within a substep; None: the scenario's, per axis [N]
     disturbance: ForceBound | None = None  # of |f|; None: the scenario's disturbance at the greatest scale that it draws
     speed_cap: float | None = None  # v_s; None: where f takes half of what it leaves of U at rest [m/s]
+    force_error: float | None = None  # of the robot within a substep, see Robot; None: the robot's own, if it is known [N]
     clearance: float | None = None  # from obstacles; None: the scenario's safe distance [m]
     agent_distance: float | None = None  # between middles; None: two radii of the robot [m]
     margin: float = 1e-3  # that both distances are exceeded by [m]
@@ -70,7 +71,16 @@ class Shield:
     velocity_error: float = 0.0  # of v [m/s]
 
     def __post_init__(self) -> None:
-        for name in ("force_limit", "speed_cap", "clearance", "agent_distance", "margin", "position_error", "velocity_error"):
+        for name in (
+            "force_limit",
+            "speed_cap",
+            "force_error",
+            "clearance",
+            "agent_distance",
+            "margin",
+            "position_error",
+            "velocity_error",
+        ):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise ConfigurationError(f"Shield.{name} must be non-negative and finite, got {value}")
@@ -144,20 +154,20 @@ def retreat_drift(numbers, h, speed):
     return h * fastest + stopping_distance(numbers, fastest)
 
 
-@allocation_free
+@inlined
 def speed_of(numbers, view, i):
     """Greatest speed that agent ``i`` may have [m/s]."""
     x, y = view.v[i, 0], view.v[i, 1]
     return np.sqrt(x * x + y * y) + numbers.velocity_error
 
 
-@allocation_free
+@inlined
 def spread_of(numbers, view, i):
     """Radius h B / m of the ball that v+ lies in [m/s]; the error of what is known of v adds to it."""
     return view.h * force_bound(numbers, speed_of(numbers, view, i)) / numbers.mass + numbers.velocity_error
 
 
-@allocation_free
+@inlined
 def near(numbers, view, i, k, need):
     """Whether thing ``k``, an obstacle or (from K on) an agent, leaves agent ``i`` less room than ``need`` [m]. No roots."""
     count = view.obstacles.shape[0]
@@ -319,13 +329,13 @@ def watch_assumptions(numbers, view, i, last, breaches):
     All that is not u shows in m (v+ - v) / h - u: disturbance, contact, lag and loss of actuators.
     """
     x, y = view.moving[i, 0], view.moving[i, 1]
-    if np.sqrt(x * x + y * y) > numbers.speed_cap + TINY:
-        breaches[SPEED] += 1.0
+    if x * x + y * y > (numbers.speed_cap + TINY) ** 2:
+        breaches[SPEED_BROKEN] += 1.0
     per = numbers.mass / view.h
     other_x, other_y = per * (x - last[0, 0]) - last[1, 0], per * (y - last[0, 1]) - last[1, 1]
     speed = np.sqrt(last[0, 0] ** 2 + last[0, 1] ** 2)
-    if np.sqrt(other_x**2 + other_y**2) > force_bound(numbers, speed) + 1e-6 * numbers.force_limit:
-        breaches[FORCE] += 1.0
+    if other_x**2 + other_y**2 > (force_bound(numbers, speed) + 1e-6 * numbers.force_limit) ** 2:
+        breaches[FORCE_BROKEN] += 1.0
 
 
 @allocation_free
@@ -338,8 +348,8 @@ def shield_agent(numbers, view, i, force, counts):
     need = max(worst * (0.5 * worst / a + view.h) if a > 0.0 else FAR, view.stopping[i])
     k = most_pressing(numbers, view, i, need)
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
-        counts.breaches[i, STATE] += 1.0
-    if stays_safe(numbers, view, i, x, y):
+        counts.breaches[i, STATE_BROKEN] += 1.0
+    if (k < 0 and worst <= numbers.speed_cap) or stays_safe(numbers, view, i, x, y):
         return
     x, y = safe_velocity(numbers, view, i, k, x, y)
     safe_x, safe_y = (x - view.v[i, 0]) / per, (y - view.v[i, 1]) / per

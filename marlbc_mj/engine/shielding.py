@@ -11,6 +11,7 @@ GREATEST_SHARE = 0.25
 """Of the force limit, that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating keep S."""
 CREEP = 2.0
 """Retreats at rest, each with its :func:`drift`, that the margin has room for where several things press at once."""
+FASTEST = 1e3  # speed cap where f does not grow with the speed [m/s]
 LEAST_CREEP = 1e-5  # more, for the drift of a slow motion that ends [m]
 
 
@@ -64,7 +65,7 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
 
 def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
     """Raise ConfigurationError for a plant that the stopping ball does not describe."""
-    if robot.force_error is None:
+    if robot.force_error is None and shield.force_error is None:
         raise ConfigurationError(
             f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
             "it within one substep, in every direction, besides the planar force and the disturbance"
@@ -85,7 +86,8 @@ def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
 
 def _force_bound(shield: Shield, scenario: Scenario, robot: Robot) -> ForceBound:
     """Bound of all that is not u: the disturbance at the greatest scale that is drawn, and the robot's own error."""
-    assert robot.force_error is not None
+    error = robot.force_error if shield.force_error is None else shield.force_error
+    assert error is not None
     bound = shield.disturbance
     if bound is None:
         offered = getattr(scenario.disturbance, "force_bound", None)
@@ -96,7 +98,7 @@ def _force_bound(shield: Shield, scenario: Scenario, robot: Robot) -> ForceBound
             )
         scale = max(map(abs, scenario.perturbation.drag_scale))
         bound = ForceBound(*(scale * number for number in offered()))
-    return bound._replace(constant=bound.constant + robot.force_error)
+    return bound._replace(constant=bound.constant + error)
 
 
 def _check_bound(bound: ForceBound, force: float, scenario: Scenario) -> None:
@@ -110,12 +112,12 @@ def _check_bound(bound: ForceBound, force: float, scenario: Scenario) -> None:
 
 
 def _speed_cap(bound: ForceBound, force: float) -> float:
-    """The speed at which f takes half of what it leaves of the force limit at rest [m/s]; infinite where it does not grow."""
+    """The speed at which f takes half of what it leaves of the force limit at rest, at most FASTEST [m/s]."""
     half = 0.5 * (force - bound.constant)
     if bound.quadratic > 0.0:
         root = np.sqrt(bound.linear**2 + 4.0 * bound.quadratic * half)
-        return float(2.0 * half / (bound.linear + root))
-    return half / bound.linear if bound.linear > 0.0 else np.inf
+        return min(float(2.0 * half / (bound.linear + root)), FASTEST)
+    return min(half / bound.linear, FASTEST) if bound.linear > 0.0 else FASTEST
 
 
 def check_start(numbers: ShieldNumbers, starts: np.ndarray, obstacles: np.ndarray) -> None:

@@ -161,7 +161,7 @@ def _is_outside(numbers, view, allowed):
     return False
 
 
-def main() -> None:
+def report_states() -> None:
     """Print how many states were left, for the shield and for two wrong ones."""
     states = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10_000_000
     drag = ForceBound(linear=5.0 * float(np.sqrt(2.0)))
@@ -178,4 +178,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    report_states()
