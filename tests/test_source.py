@@ -22,7 +22,8 @@ def crowded(path: Path) -> list[str]:
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             own = node.args
-            count = len(own.posonlyargs) + len(own.args) + len(own.kwonlyargs)
+            names = [each.arg for each in (*own.posonlyargs, *own.args, *own.kwonlyargs)]
+            count = len([name for name in names if name not in ("self", "cls")])
             body = node.body[1:] if ast.get_docstring(node) and len(node.body) > 1 else node.body
             if count > MOST_PARAMETERS or (node.end_lineno or 0) - body[0].lineno + 1 > MOST_BODY:
                 found.append(f"{path.name}: {node.name}")

@@ -19,7 +19,7 @@ from marlbc_mj.util.text import one_line
 
 DURATION = 8.0  # of the step test [s]
 SETTLED, OVERSHOOT = 0.1, 0.35  # of the robot's length unit: error at the end, excursion beyond the reference
-HEIGHT, TILT = 0.05, 35.0  # that a flying robot keeps [m], [deg]
+_HEIGHT, TILT = 0.05, 35.0  # that a flying robot keeps [m], [deg]
 
 
 class Item(NamedTuple):
@@ -234,10 +234,10 @@ def _flight(robot: Robot, world: World, truths: Sequence[Truth]) -> Iterator[Ite
     found = {name: float(np.abs(world.state.robot[0, :, k]).max()) for name, k in robot.diagnostics.items()}
     if "height_error" in found:
         error = max(found["height_error"], moved)
-        yield Item("height", error < HEIGHT, f"held within {1e3 * error:.1f} mm")
+        yield Item("height", error < _HEIGHT, f"held within {1e3 * error:.1f} mm")
     else:
-        why = "" if moved < HEIGHT else ": nothing holds it up; give it ground to stand on, slides, or no gravity"
-        yield Item("height", moved < HEIGHT, f"body {robot.body!r} stays within {1e3 * moved:.3g} mm{why}")
+        why = "" if moved < _HEIGHT else ": nothing holds it up; give it ground to stand on, slides, or no gravity"
+        yield Item("height", moved < _HEIGHT, f"body {robot.body!r} stays within {1e3 * moved:.3g} mm{why}")
     if "tilt" in found:
         degrees = float(np.degrees(found["tilt"]))
         yield Item("tilt", degrees < TILT, f"at most {degrees:.1f} deg")
