@@ -9,6 +9,7 @@ import numpy as np
 
 from marlbc_mj.core.behaviors import clearances, clearances_among
 from marlbc_mj.core.motion import NUMBERS, moved
+from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
@@ -30,6 +31,7 @@ class Frame(NamedTuple):
     controller_state: np.ndarray  # (N, S) at the start of the mission step
     decision_ms: float  # what the supervisor took [ms]
     pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
+    shield: ShieldCounts | None = None  # (N,) each, since the episode began, at the end of the mission step; with a shield only
 
     @property
     def first(self) -> Record:
@@ -59,6 +61,7 @@ class Trajectory:
     decision_ms: np.ndarray  # (M,) [ms]
     motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as motion.move has them; (0, 6): at rest
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
+    shield: ShieldCounts | None = None  # (M, N) each, at the end of each mission step, see Frame
 
     def clearances(self) -> np.ndarray:
         """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
@@ -100,12 +103,13 @@ def run_episode(
         began = perf_counter()
         decision, memory = supervisor.decide(observation, memory)
         decision_ms = 1e3 * (perf_counter() - began)
-        controller_state, pose = world.state.controller[0].copy(), _pose(world)
+        controller_state, pose = world.state.controller[0].copy(), body_poses(world)
         step = carry_out(world, decision)
         assert step.record is not None, "run_episode needs World(record=True)"
         record = Record(*(rows[0] for rows in step.record))
         command, reward = step.observation.command[0], float(step.reward[0])
-        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose))
+        shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
+        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose, shield))
         if on_frame is not None:
             on_frame(frames[-1])
         observation, done = step.observation, bool(step.done[0])
@@ -137,11 +141,18 @@ def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int,
         decision_ms=np.array([f.decision_ms for f in frames]),
         motions=state.motions[0].copy(),
         pose=np.array([f.pose for f in frames]),
+        shield=_shield(frames),
     )
 
 
-def _pose(world: World) -> np.ndarray:
-    """(N, 7) of the bodies of world 0, (0, 7) where they have no free joint."""
+def _shield(frames: list[Frame]) -> ShieldCounts | None:
+    """What a shield did by the end of each mission step; None without a shield."""
+    counts = [f.shield for f in frames if f.shield is not None]
+    return ShieldCounts(*(np.array(rows) for rows in zip(*counts, strict=True))) if counts else None
+
+
+def body_poses(world: World, b: int = 0) -> np.ndarray:
+    """(N, 7) of the bodies of world ``b``, (0, 7) where they have no free joint."""
     if len(world.plan.robot.joints) > 1:
         return NO_POSE
-    return np.stack([world.data[0].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])
+    return np.stack([world.data[b].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])

@@ -7,7 +7,8 @@ import gymnasium
 import numpy as np
 
 from marlbc_mj.controllers import Controller
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.tasks.given import controller_from, scenario_from
 from marlbc_mj.util.errors import unknown
 
 DOMAINS = ("formation",)
@@ -21,9 +22,9 @@ gymnasium.register(
 
 def load(
     domain: str,
-    task: str,
+    task: str | Scenario,
     *,
-    controller: Controller | None = None,
+    controller: Controller | str | None = None,
     random_state: int | np.random.RandomState | None = None,
     **changes: Any,
 ) -> dm_env.Environment:
@@ -31,8 +32,8 @@ def load(
 
     Args:
         domain: ``"formation"``.
-        task: a scenario's name.
-        controller: the force law; SORLC by default.
+        task: a scenario, or the name of one.
+        controller: the force law, or its name; SORLC by default.
         random_state: seed of the episodes' draws.
         **changes: any field of the scenario, ``substep=0.001`` for example.
 
@@ -43,4 +44,4 @@ def load(
         raise unknown("domain", domain, DOMAINS)
     from marlbc_mj.tasks.formation import make_environment
 
-    return make_environment(make_scenario(task, **changes), controller, random_state)
+    return make_environment(scenario_from(task, changes), controller_from(controller), random_state)

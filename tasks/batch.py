@@ -11,6 +11,7 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.states import make_state
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.tasks.given import array_from
 from marlbc_mj.tasks.starts import Route, Starts, happens
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.seeding import stream
@@ -71,7 +72,7 @@ class FormationBatch:
         actions: str = "commands",
         starts: Starts | None = None,
     ) -> None:
-        if interval < 1 or scenario.mission_steps % interval:
+        if not isinstance(interval, int | np.integer) or interval < 1 or scenario.mission_steps % interval:
             raise ConfigurationError(
                 f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
             )
@@ -124,8 +125,8 @@ class FormationBatch:
             ConfigurationError: a negative seed, another number of seeds than worlds, or a mask that is not (B,) bool.
         """
         worlds = self.world.worlds
-        seeds = [seed] * worlds if isinstance(seed, int | np.integer) else list(seed)
-        if len(seeds) != worlds or any(s is not None and s < 0 for s in seeds):
+        seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed] * worlds
+        if len(seeds) != worlds or any(s is not None and (not isinstance(s, int | np.integer) or s < 0) for s in seeds):
             raise ConfigurationError(f"a seed must not be negative, and a list of them must have {worlds}, got {seed}")
         chosen = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask)
         if chosen.shape != (worlds,) or chosen.dtype != np.bool_:
@@ -198,8 +199,8 @@ class FormationBatch:
         """A copy of ``actions`` as (B, N) int64, because the compiled loop trusts what it is given."""
         shape, most = self.last.shape, self.actions - 1
         try:
-            given = np.asarray(actions)
-        except ValueError:
+            given = array_from(actions)
+        except ConfigurationError:
             raise ConfigurationError(f"actions must have shape {shape} (worlds, agents), got {actions}") from None
         if given.dtype.kind not in "iu":
             raise ConfigurationError(f"actions must be whole numbers from 0 to {most}, got {given.dtype}: {given.tolist()}")

@@ -4,6 +4,8 @@ The arena is made from the very MJCF that the engine compiles, and composer's ho
 the compiled loop runs, so a composer episode equals a :class:`~marlbc_mj.engine.world.World` episode.
 """
 
+from typing import Any, NoReturn
+
 import dm_env
 import numpy as np
 from dm_control import composer, mjcf
@@ -12,9 +14,11 @@ from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core.laws import Law
+from marlbc_mj.core.shield import Shield
 from marlbc_mj.engine import loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class FormationArena(composer.Arena):
@@ -24,17 +28,34 @@ class FormationArena(composer.Arena):
         self._mjcf_root = mjcf.from_xml_string(xml)
 
 
+NO_COPY = (
+    "a dm_control environment holds MuJoCo's physics by address and cannot be copied or sent to another process; make another "
+    "one with the same random_state there, or copy the Gymnasium view, which goes on from the same state"
+)
+
+
+class FormationEnvironment(composer.Environment):
+    """A composer environment that refuses to be copied; ConfigurationError says what to do instead."""
+
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise ConfigurationError(NO_COPY)
+
+
 class FormationTask(composer.Task):
     """A team under a mission supervisor that the agent (in dm_control's sense) plays.
 
     Args:
         scenario: the problem instance; every episode is drawn with the environment's random state.
         controller: the force law; SORLC by default.
+        shield: see :class:`~marlbc_mj.engine.world.World`.
     """
 
-    def __init__(self, scenario: Scenario, controller: Controller | None = None) -> None:
+    def __reduce_ex__(self, protocol: Any) -> NoReturn:
+        raise ConfigurationError(NO_COPY)
+
+    def __init__(self, scenario: Scenario, controller: Controller | None = None, shield: Shield | bool | None = None) -> None:
         self.scenario = scenario
-        self.plan: Plan = make_plan(scenario, controller or SORLC())
+        self.plan: Plan = make_plan(scenario, controller or SORLC(), shield)
         self.state = team.make_team(self.plan, worlds=1)
         self._arena = FormationArena(self.plan.xml)
         self._record = team.make_record(self.plan, worlds=1, recording=False)
@@ -85,8 +106,12 @@ class FormationTask(composer.Task):
         team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
 
     def before_step(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Orders become reference velocities for this mission step."""
-        orders = np.ascontiguousarray(action, dtype=np.int64)[None]
+        """Orders become reference velocities for this mission step.
+
+        Raises:
+            ConfigurationError: another shape, no whole numbers, or an index that is no order.
+        """
+        orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
         loop.begin(0, orders, self._orders_alone, self.plan.mission, self.plan.behaviors, self.state)
         self._substep = 0
 
@@ -123,4 +148,4 @@ def make_environment(
 ) -> dm_env.Environment:
     """A dm_control environment of a scenario; one step is one mission step."""
     task = FormationTask(scenario, controller)
-    return composer.Environment(task, random_state=random_state, strip_singleton_obs_buffer_dim=True)
+    return FormationEnvironment(task, random_state=random_state, strip_singleton_obs_buffer_dim=True)

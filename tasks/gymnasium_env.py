@@ -3,6 +3,7 @@
 ``gymnasium.make`` and ``gymnasium.make_vec`` know them once :mod:`marlbc_mj.tasks` is imported.
 """
 
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -11,8 +12,10 @@ from gymnasium.vector.utils import batch_space
 
 from marlbc_mj.controllers import Controller
 from marlbc_mj.policies.states import State
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
+from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
+from marlbc_mj.tasks.painter import Painter
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -40,32 +43,35 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
     An episode is the whole mission and ends by termination. ``info`` has the reward's terms, switches and clearance.
 
     Args:
-        scenario: a scenario's name.
-        controller: the force law; SORLC by default.
+        scenario: a scenario, or the name of one.
+        controller: the force law, or its name; SORLC by default.
         state: ``"extended"`` or ``"printed"``.
         actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
         interval: mission steps that a decision holds for.
+        render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.
         **changes: any field of the scenario, ``duration=20.0`` for example.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012  # declared so by Gymnasium
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012  # declared so by Gymnasium
 
     def __init__(
         self,
-        scenario: str = "paper",
-        controller: Controller | None = None,
+        scenario: str | Scenario = "paper",
+        controller: Controller | str | None = None,
         *,
         state: str = "extended",
         actions: str = "commands",
         interval: int = 1,
+        render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        self.batch = FormationBatch(
-            make_scenario(scenario, **changes), controller, interval=interval, state=state, actions=actions
-        )
+        self.render_mode = check_render_mode(render_mode)
+        made, law = scenario_from(scenario, changes), controller_from(controller)
+        self.batch = FormationBatch(made, law, interval=interval, state=state, actions=actions)
+        self.painter = Painter()
         self.action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
         self.observation_space = state_space(self.batch.read)
 
@@ -80,9 +86,21 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises:
             ConfigurationError: another shape, no whole numbers, or an index that is no action.
         """
-        outcome = self.batch.step(np.asarray(action)[None])
+        outcome = self.batch.step(array_from(action)[None])
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
         return outcome.final_state[0], float(outcome.reward[0]), bool(outcome.terminal[0]), False, info
+
+    def render(self) -> np.ndarray | None:
+        """(height, width, 3) uint8: the team as it is now; None without a render mode.
+
+        Raises:
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+        """
+        return None if self.render_mode is None else self.painter.draw(self.batch.world)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self.painter.close()
 
 
 class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -95,7 +113,7 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         num_envs: B.
         threads: the worlds are shared out over this many.
         starts: where episodes begin; at the start of the mission by default.
-        scenario, controller, state, actions, interval, **changes: as for :class:`PaperFormation`.
+        scenario, controller, state, actions, interval, render_mode, **changes: as for :class:`PaperFormation`.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
@@ -104,19 +122,22 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
     def __init__(
         self,
         num_envs: int = 1,
-        scenario: str = "paper",
-        controller: Controller | None = None,
+        scenario: str | Scenario = "paper",
+        controller: Controller | str | None = None,
         *,
         threads: int = 1,
         starts: Starts | None = None,
         state: str = "extended",
         actions: str = "commands",
         interval: int = 1,
+        render_mode: str | None = None,
         **changes: Any,
     ) -> None:
+        self.painter = Painter()
+        self.render_mode = check_render_mode(render_mode)
         self.batch = FormationBatch(
-            make_scenario(scenario, **changes),
-            controller,
+            scenario_from(scenario, changes),
+            controller_from(controller),
             worlds=num_envs,
             threads=threads,
             interval=interval,
@@ -125,7 +146,7 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
             starts=starts,
         )
         self.num_envs = num_envs
-        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP, "render_modes": []}
+        self.metadata = {"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP, **PaperFormation.metadata}
         self.single_action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
         self.single_observation_space = state_space(self.batch.read)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -143,6 +164,8 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         Raises:
             ConfigurationError: a list or a mask of another length than B, or a mask without a world.
         """
+        if not isinstance(options, Mapping | None):
+            raise ConfigurationError(f"options must be a dictionary, got {options!r}")
         mask = (options or {}).get("reset_mask")
         if mask is not None and not np.any(mask):
             raise ConfigurationError("options['reset_mask'] must be true for at least one world")
@@ -166,6 +189,18 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
                 final[b] = outcome.final_state[b]
             infos |= {"final_obs": final, "_final_obs": ended, "final_info": where(found, ended), "_final_info": ended}
         return outcome.state, outcome.reward, outcome.terminal, outcome.truncated, infos
+
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """(height, width, 3) uint8 of every team as it is now; None without a render mode.
+
+        Raises:
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+        """
+        return None if self.render_mode is None else tuple(self.painter.draw(self.batch.world, b) for b in range(self.num_envs))
+
+    def close_extras(self) -> None:
+        """Give the OpenGL context back."""
+        self.painter.close()
 
 
 def where(found: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """PettingZoo view of the missions: every agent chooses its own order and shares the team's reward."""
 
+from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -7,9 +8,11 @@ from gymnasium.spaces import Discrete, Space
 from pettingzoo import ParallelEnv
 
 from marlbc_mj.controllers import Controller
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
+from marlbc_mj.tasks.painter import Painter
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -19,35 +22,37 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
     Everybody observes the team's state; ``state()`` returns it too.
 
     Args:
-        scenario: a scenario's name.
-        controller: the force law; SORLC by default.
+        scenario: a scenario, or the name of one.
+        controller: the force law, or its name; SORLC by default.
         observation: ``"extended"`` or ``"printed"``.
         actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
         interval: mission steps that a decision holds for.
+        render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.
         **changes: any field of the scenario, ``duration=20.0`` for example.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"name": "paper_formation_v0", "render_modes": []}
+    metadata: ClassVar[dict[str, Any]] = {"name": "paper_formation_v0", "render_modes": list(RENDER_MODES), "render_fps": 20}
 
     def __init__(
         self,
-        scenario: str = "paper",
-        controller: Controller | None = None,
+        scenario: str | Scenario = "paper",
+        controller: Controller | str | None = None,
         *,
         observation: str = "extended",
         actions: str = "commands",
         interval: int = 1,
+        render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        self.batch = FormationBatch(
-            make_scenario(scenario, **changes), controller, interval=interval, state=observation, actions=actions
-        )
+        self.render_mode = check_render_mode(render_mode)
+        made, law = scenario_from(scenario, changes), controller_from(controller)
+        self.batch = FormationBatch(made, law, interval=interval, state=observation, actions=actions)
+        self.painter = Painter()
         self.possible_agents = [f"agent_{i + 1}" for i in range(self.batch.scenario.agents)]
         self.agents: list[str] = []
-        self.render_mode = None
         self.state_space = state_space(self.batch.read)
         self.observation_spaces = {agent: state_space(self.batch.read) for agent in self.possible_agents}
         self.action_spaces = {agent: Discrete(self.batch.actions) for agent in self.possible_agents}
@@ -80,10 +85,12 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
         Raises:
             ConfigurationError: an agent without an action, no whole number, or an index that is no action.
         """
+        if not isinstance(actions, Mapping):
+            raise ConfigurationError(f"actions must be a dictionary with one per agent, got {type(actions).__name__}")
         missing = [agent for agent in self.possible_agents if agent not in actions]
         if missing:
             raise ConfigurationError(f"every agent needs an action, there is none for {', '.join(missing)}")
-        outcome = self.batch.step(np.array([[actions[agent] for agent in self.possible_agents]]))
+        outcome = self.batch.step(array_from([[actions[agent] for agent in self.possible_agents]]))
         self._state = outcome.final_state[0]
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
         agents, over = self.agents, bool(outcome.terminal[0])
@@ -96,6 +103,18 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
             dict.fromkeys(agents, False),
             {agent: dict(info) for agent in agents},
         )
+
+    def render(self) -> np.ndarray | None:
+        """(height, width, 3) uint8: the team as it is now; None without a render mode.
+
+        Raises:
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+        """
+        return None if self.render_mode is None else self.painter.draw(self.batch.world)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self.painter.close()
 
     def state(self) -> np.ndarray:
         """(S,) the team's state."""

@@ -53,23 +53,23 @@ def test_a_policy_is_read_as_it_was_written(tmp_path):
 
 @given(st.data())
 @settings(max_examples=40)
-def test_a_changed_byte_is_refused_or_leaves_the_networks_alone(tmp_path_factory, data):
-    """Of the arrays none may change; the header is text that people may edit, so there a change may pass."""
+def test_a_changed_byte_is_refused_or_changes_nothing(tmp_path_factory, data):
+    """Neither arrays nor what the header says of them may change; only a byte that means the same may, a space for example."""
     path = tmp_path_factory.mktemp("flip") / "p.safetensors"
     write_policy(path, policy_of(), signed())
     content = bytearray(path.read_bytes())
     (header,) = struct.unpack("<Q", content[:8])
-    before = digest(read_arrays(path)[0])
+    before = digest(*read_arrays(path))
     place = data.draw(st.one_of(st.integers(0, len(content) - 1), st.integers(8 + header, len(content) - 1)))
     content[place] ^= 1 << data.draw(st.integers(0, 7))
     path.write_bytes(content)
     said = ""
     try:
-        arrays, _ = read_arrays(path)
+        after = digest(*read_arrays(path))
     except ConfigurationError as error:
         said = str(error)
     assert "\n" not in said
-    assert said or (place < 8 + header and digest(arrays) == before)
+    assert said or (place < 8 + header and after == before)
 
 
 def arrays_of(policy):

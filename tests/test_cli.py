@@ -21,6 +21,7 @@ from marlbc_mj.studies.episodes import Stopwatch
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import PRESETS
 from marlbc_mj.training.methods import METHODS
+from marlbc_mj.util.files import MANIFEST
 
 SHORT = ("--duration", "1.0")
 
@@ -47,7 +48,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_bench_leaves_what_it_promises(results: Path) -> None:
     """Every file of the run directory is there, and nothing else beside it."""
     names = {p.name for p in results.iterdir()}
-    files = {"config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"}
+    files = {MANIFEST, "config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"}
     assert names == files | {"figures", "logs", "video"}
     methods = {f"{s}+{c}" for s in ("scripted", "fsams") for c in ("sorlc", "pd")}
     assert {p.stem for p in (results / "logs").iterdir()} == methods

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.core.behaviors import clearances
+from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.results.metrics import convergence_time, measure
@@ -201,11 +202,23 @@ def test_scores_by_hand():
             "effort_integral_sum": 5.0 + 12.0,
             "cost_integral_sum": 25.0 + 144.0 + 1.0,
             "saturation_duty_worst": 0.0,
+            "intervention_share_mean": 0.0,
             "rms_position_error_rms": np.sqrt(0.5),
             "rms_velocity_error_rms": 0.0,
         },
         abs=1e-9,
     )
+
+
+def test_what_a_shield_did_by_hand():
+    """Counts are of the whole episode, the last of their rows: 20 of 200 substeps of one agent are 10 %, of two agents 5 %."""
+    counts = ShieldCounts(np.zeros((STEPS, 2)), np.zeros((STEPS, 2)), np.zeros((STEPS, 2, 3)))
+    counts.interventions[-1], counts.change[-1], counts.breaches[-1, 1] = (0.1 * T, 0.0), (4.0, 0.0), (1.0, 2.0, 0.0)
+    metrics = measure(replace(straight(pair()), shield=counts))
+    first, second = metrics["agents"]
+    assert (first["intervention_share"], first["force_change_integral"], first["assumption_breaches"]) == (0.1, 4.0, 0)
+    assert (second["intervention_share"], second["force_change_integral"], second["assumption_breaches"]) == (0.0, 0.0, 3)
+    assert team_scores(metrics)["intervention_share_mean"] == pytest.approx(0.05)
 
 
 def test_sum_and_worst_differ_where_two_agents_violate():

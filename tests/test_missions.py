@@ -11,7 +11,8 @@ from marlbc_mj.cli import main
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
-from marlbc_mj.results.outcomes import FAILED_MISSION, outcome
+from marlbc_mj.results.outcomes import FAILED_MISSION, outcome, outcome_rates
+from marlbc_mj.results.statistics import rate
 from marlbc_mj.scenarios import held_out, make_scenario
 from marlbc_mj.scenarios.families import Gates
 from marlbc_mj.studies import scale
@@ -138,3 +139,34 @@ def test_256_agents_run_under_every_supervisor_that_decides_per_agent():
         assert np.isfinite(run_episode(world, make_supervisor(name)).position).all()
     with pytest.raises(ConfigurationError, match="256 agents"):
         make_supervisor("mpcms").start(scenario, 1)
+
+
+def test_the_outcome_in_summary_json(tmp_path: Path):
+    """Runs, and six shares in [0, 1] with their intervals, for every method; a shield that was not there never intervened."""
+    out, parts = tmp_path / "evaluation", ("success", "reached", "violation", "struck", "collided", "intervention")
+    quick = ["--seeds", "3", "--seed", "7", "--duration", "1", "--agents", "3", "--formation", "line", "--out", str(out)]
+    main(["evaluate", "field", "--supervisors", "fixed", "set-based-rule", "scripted", *quick])
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["seeds"] == [7, 8, 9]
+    for method, entry in summary["methods"].items():
+        found = entry["outcome"]
+        assert set(found) == {"runs", *parts, *(f"{part}_ci" for part in parts)} and found["runs"] == 3, method
+        for part in parts:
+            low, high = found[f"{part}_ci"]
+            assert 0.0 <= low <= found[part] <= high <= 1.0
+        assert found["success"] == entry["success_rate"] and found["intervention"] == 0.0
+    failed = summary["methods"]["scripted+sorlc"]["outcome"]
+    assert [failed[part] for part in parts] == [0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    config = json.loads((out / "config.json").read_text())
+    assert len(config["scenario"]["starts"]) == 3
+
+
+def test_outcome_rates_by_hand(flown):
+    """One success, one run that came too late, one that failed; in the second a shield acted."""
+    scenario, metrics = flown
+    late = {**metrics, "team": {**metrics["team"], "end_error": 0.51, "intervention_share": 0.1}}
+    rates = outcome_rates([metrics, late, None], scenario)
+    values = {name: estimate.value for name, estimate in rates.items()}
+    third = pytest.approx(1 / 3)
+    assert values == {**dict.fromkeys(("success", "violation", "struck", "collided", "intervention"), third), "reached": third}
+    assert rates["success"] == rate([True, False, False])

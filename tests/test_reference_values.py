@@ -1,4 +1,4 @@
-"""Reference values of spec.md section 8, from an independent NumPy prototype: agreement in every printed digit."""
+"""Reference values from an independent NumPy prototype of the same equations: agreement in every digit that is given."""
 
 import os
 import subprocess

@@ -25,6 +25,7 @@ from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.files import MANIFEST
 from marlbc_mj.util.progress import silent
 
 WORKERS = pytest.mark.parametrize("workers", [1, 2])
@@ -92,7 +93,7 @@ def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
     """Large files of the jobs beside the report, or nothing at all."""
     done = run_study(Squares(), tmp_path / "out", workers=workers)
     assert done.results == [0, 1, 4, 9] and done.report == Report("sum 14", ("no picture",))
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"sum.txt", *(f"{k}.txt" for k in range(4))}
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4))}
     with pytest.raises(SimulationError, match="it fell"):
         run_study(Squares(trouble="it fell"), tmp_path / "other", workers=workers)
     with pytest.raises(ConfigurationError, match="is not empty"):

@@ -1,11 +1,11 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
-import sys
 from typing import Annotated
 
 from tyro.conf import subcommand
 
 from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand
+from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand
 from marlbc_mj.cli.listing import ListCommand
@@ -16,7 +16,6 @@ from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
 from marlbc_mj.cli.terminal import prepare_gl
 from marlbc_mj.cli.training import TrainCommand
-from marlbc_mj.util.errors import MarlbcError
 
 Command = (
     Annotated[BenchCommand, subcommand("bench")]
@@ -42,14 +41,8 @@ DESCRIPTION = "Benchmark of mission supervisors and controllers for robot teams 
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point; exits with 2 for a wrong setting, 3 for a failed run."""
-    command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
-    try:
+    """Entry point; exits with 2 for a wrong setting, 3 for a failed run, see :func:`~marlbc_mj.cli.ending.in_one_line`."""
+    with in_one_line("marlbc"):
+        command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
         prepare_gl(strict=isinstance(command, VideoCommand))
         command.run()
-    except MarlbcError as error:
-        print(f"marlbc: {error}", file=sys.stderr)
-        sys.exit(error.exit_status)
-    except KeyboardInterrupt:
-        print("marlbc: interrupted", file=sys.stderr)
-        sys.exit(130)

@@ -23,6 +23,8 @@ class ScenarioOptions:
     """Physics and control step [s]; must divide the mission step of 0.05 s."""
     reference: str | None = None
     """Where behaviors are evaluated: virtual (at the reference) or actual (at the measured position)."""
+    composition: str | None = None
+    """How an order becomes a reference: null-space (avoidance as an equality task) or set-based (as an inequality)."""
     two_sided: bool = False
     """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
     disturbance: str | None = None
@@ -38,19 +40,23 @@ class ScenarioOptions:
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
 
-    def build(self, name: str) -> "Scenario":
-        """The named scenario with these changes."""
+    allow_code: bool = False
+    """Run the Python file that a scenario file names as its robot."""
+
+    def build(self, name: str, **others: Any) -> "Scenario":
+        """The named scenario with these changes, and with ``others`` that are not None."""
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
 
-        keys = ("substep", "reference", "force_limit", "duration", "split")
+        keys = ("substep", "reference", "composition", "force_limit", "duration", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        changes.update({key: value for key, value in others.items() if value is not None})
         if self.two_sided:
             changes["two_sided"] = True
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        return make_scenario(name, **self._robot_changes(name), **changes)
+        return make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
 
     def _robot_changes(self, name: str) -> dict[str, Any]:
         """What another robot changes, but for what other options set."""
@@ -68,7 +74,8 @@ class ScenarioOptions:
 class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
-    By default every supervisor but two (mpcms-mujoco, oracle-schedule) runs with sorlc, and scripted with every controller.
+    By default scripted runs with every controller, and every supervisor with sorlc but those that are to be named: mpcms-mujoco,
+    oracle-schedule, fixed, set-based-rule, lookahead, rollout, orca and cbf-qp.
     """
 
     scenario: Positional[str] = "paper"
@@ -95,6 +102,8 @@ class BenchCommand:
     """Write an MCAP log of every episode."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -152,6 +161,8 @@ class RunCommand:
     """Draw of the scenario."""
     overwrite: bool = False
     """Replace what is in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -166,6 +177,7 @@ class RunCommand:
                 self.out,
                 seed=self.seed,
                 overwrite=self.overwrite,
+                shield=self.shield,
                 progress=progress,
             )
         print_results([result])
@@ -186,6 +198,10 @@ class EvaluateCommand:
     """Supervisors to run."""
     controller: str = "sorlc"
     """Controller they run with."""
+    agents: int | None = None
+    """Size of the team, 4 in most families."""
+    formation: str | None = None
+    """Formation of the team: line, wedge, circle or grid."""
     seeds: int = 200
     """Number of held-out layouts."""
     seed: int = 0
@@ -196,6 +212,8 @@ class EvaluateCommand:
     """Folder of the results."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
     options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
 
     def run(self) -> None:
@@ -211,8 +229,13 @@ class EvaluateCommand:
             seed=self.seed,
             workers=self.workers,
             overwrite=self.overwrite,
+            shield=self.shield,
         )
         with progress_bars() as progress:
-            results = run_evaluation(self.options.build(self.scenario), config, self.out, progress=progress)
+            results = run_evaluation(self.scenario_flown(), config, self.out, progress=progress)
         print(to_markdown(outcome_table(results)))
         print(f"{self.out / 'index.html'} shows it all")
+
+    def scenario_flown(self) -> "Scenario":
+        """The scenario with the team and the changes of the command line."""
+        return self.options.build(self.scenario, agents=self.agents, formation=self.formation)

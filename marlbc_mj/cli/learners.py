@@ -9,6 +9,9 @@ from typing import Annotated
 import tyro
 
 from marlbc_mj.cli.terminal import progress_lines
+from marlbc_mj.util.errors import SimulationError
+
+DEFAULT_OUT = Path("runs/study")
 
 
 @dataclass(frozen=True)
@@ -23,29 +26,36 @@ class StudyCommand:
     """Mission steps per run; by default those of the preset `fast`."""
     workers: int = 2
     """Processes that share the runs, one thread each."""
-    out: Path = Path("runs/study")
-    """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG."""
+    out: Path | None = None
+    """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
-    """Only make table and figure again, from study.csv and curves.csv in this folder."""
+    """Only make table and figure again, from study.csv and curves.csv in this folder, there or in --out."""
     set: tuple[str, ...] = ()
     """Any setting of all runs, name=value, as for `marlbc train`."""
 
     def run(self) -> None:
-        """Train what is missing, then write and print the comparison; a stopped study compares what there is."""
+        """Train what is missing, then write and print the comparison; a stopped study compares what there is.
+
+        Raises:
+            SimulationError: a run failed; the comparison says so, too.
+        """
         from marlbc_mj.studies.learners.records import read_study
-        from marlbc_mj.studies.learners.trainings import LearnerStudy, compare_learners, train_learners
+        from marlbc_mj.studies.learners.trainings import LearnerStudy, compare_learners, failed_runs, train_learners
 
         if self.source is not None:
-            print(compare_learners(*read_study(self.source), self.source).text)
+            print(compare_learners(*read_study(self.source), self.out or self.source).text)
             return
         from marlbc_mj.training.config import with_settings
 
         adjust = partial(with_settings, settings=self.set)
-        study = LearnerStudy(self.out, self.variants, self.seeds, self.budget, adjust)
+        study = LearnerStudy(self.out or DEFAULT_OUT, self.variants, self.seeds, self.budget, adjust)
         stopped = train_learners(study, self.workers, progress_lines())
-        text = study.report((), self.out).text
+        text = study.report((), study.out).text
         if text:
             print(text)
         if stopped:
             print("marlbc: stopped, and every run saved; the same command goes on", file=sys.stderr)
             sys.exit(128 + stopped)
+        failed = failed_runs(study)
+        if failed:
+            raise SimulationError(f"{len(failed)} of {len(study.jobs())} runs failed: {', '.join(failed)}")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 _BASES = ("inputs as in the paper", "inputs relative to the reference", "no networks")
+_COMPOSITIONS = ("avoidance as an equality task, projected (12)", "avoidance as an inequality: a bound on the velocity")
 _REFERENCES = ("behaviors at the reference's own position", "behaviors at the measured position")
 
 
@@ -13,7 +14,7 @@ def selectable() -> dict[str, dict[str, str]]:
     from marlbc_mj.core.disturbances import DISTURBANCES
     from marlbc_mj.robots import ROBOTS
     from marlbc_mj.scenarios import SCENARIOS
-    from marlbc_mj.scenarios.base import REFERENCE_MODES
+    from marlbc_mj.scenarios.base import COMPOSITIONS, REFERENCE_MODES
     from marlbc_mj.scenarios.formations import FORMATIONS
     from marlbc_mj.supervisors import SUPERVISORS
     from marlbc_mj.training.config import PRESETS
@@ -25,6 +26,7 @@ def selectable() -> dict[str, dict[str, str]]:
         "supervisors": {name: line for name, (_, line) in SUPERVISORS.items()},
         "controllers": {name: line for name, (_, line) in CONTROLLERS.items()},
         "SORLC bases": dict(zip(BASES, _BASES, strict=True)),
+        "compositions": dict(zip(COMPOSITIONS, _COMPOSITIONS, strict=True)),
         "reference modes": dict(zip(REFERENCE_MODES, _REFERENCES, strict=True)),
         "disturbances": {name: line for name, (_, line) in DISTURBANCES.items()},
         "training methods": {name: line for name, (_, line) in METHODS.items()},

@@ -14,11 +14,17 @@ class PerfCommand:
     """File for the figures."""
     rounds: int = 9
     """Rounds, each running every variant once; medians are reported."""
+    overwrite: bool = False
+    """Replace an existing file."""
 
     def run(self) -> None:
         """Measure, print, and write if asked."""
         from marlbc_mj.studies.perf import PerfStudy
         from marlbc_mj.studies.runner import run_jobs
+        from marlbc_mj.util.files import check_target
+
+        if self.json is not None:
+            check_target(self.json, overwrite=self.overwrite)
 
         study = PerfStudy(self.rounds)
         results = run_jobs(study, progress=progress_lines("measuring "))

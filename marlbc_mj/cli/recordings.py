@@ -110,7 +110,7 @@ class LogRecoverCommand:
 
 @dataclass(frozen=True)
 class LogExportCommand:
-    """Write a log as .csv (a row per mission step and agent) or .npz (arrays)."""
+    """Write a log as .csv (a row per mission step and agent), .npz (arrays) or .rrd (for Rerun)."""
 
     log: Positional[Path]
     """MCAP log."""

@@ -47,7 +47,11 @@ class RobotGateCommand:
     """Replace what is in the output folder."""
 
     def run(self) -> None:
-        """Fly, write, and print the table."""
+        """Fly, write, and print the table.
+
+        Raises:
+            SimulationError: a robot is not where its mission is; the table says so, too.
+        """
         from marlbc_mj.studies.robot_gate import SHOWN, run_gates
 
         with progress_bars() as progress:

@@ -23,15 +23,16 @@ def prepare_gl(strict: bool) -> None:
     """
     if not strict and "MUJOCO_GL" not in os.environ:
         return
-    from marlbc_mj.recording.gl import choose_gl
+    from marlbc_mj.recording.gl import SWITCHED_OFF, choose_gl, switched_off
 
     try:
         choose_gl()
     except ConfigurationError as error:
         if strict:
             raise
-        del os.environ["MUJOCO_GL"]  # with it, MuJoCo itself could not be imported
-        print(f"marlbc: {error}; going on without it", file=sys.stderr)
+        if not switched_off():
+            print(f"marlbc: {error}; going on without it", file=sys.stderr)
+        os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with another, MuJoCo itself could not be imported
 
 
 @contextmanager

@@ -30,6 +30,23 @@ def sources_stamp(package: Path) -> int:
     return zlib.crc32(b"".join(text for text in texts if any(mark in text for mark in COMPILED_MARKS)))
 
 
+def threads_usable(threads: int) -> bool:
+    """Have numba share loops out over ``threads`` threads; False: the loop is to run in series, with the same results.
+
+    A process that was forked from one whose threads ran has none, and GNU OpenMP would end it: it works in series. Processes that
+    are started with ``spawn`` have threads of their own.
+    """
+    global _threads_of
+    if threads == 1 or _threads_of not in (0, os.getpid()):
+        return False
+    _threads_of = os.getpid()
+    numba.set_num_threads(threads)
+    return True
+
+
+_threads_of = 0
+"""The process whose threads numba has started; 0: none has."""
+
 COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
 """What is found in files that hold compiled code."""
 _PACKAGE = Path(__file__).parents[1]

@@ -7,6 +7,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from marlbc_mj.core import laws
+from marlbc_mj.core.shield import ForceBound
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 HARMONICS = 12
@@ -62,7 +63,10 @@ def wind_gusts(gains, t, p, v, force_out):
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """What the engine asks of a disturbance. Its first gain is ``scale``, which a perturbation draw multiplies."""
+    """What the engine asks of a disturbance. Its first gain is ``scale``, which a perturbation draw multiplies.
+
+    One that offers ``force_bound() -> ForceBound`` can be shielded against without further ado.
+    """
 
     @property
     def law(self) -> laws.Law: ...
@@ -91,6 +95,10 @@ class PaperDrag(_Scaled):
 
     law = staticmethod(paper_drag)
 
+    def force_bound(self) -> ForceBound:
+        """|f| <= sqrt(2) scale |v|: f = scale [[s, k], [s, -k]] v with orthogonal columns, s and k from 0 to 1."""
+        return ForceBound(linear=float(np.sqrt(2.0)) * abs(self.scale))
+
 
 @dataclass(frozen=True)
 class LinearDrag(_Scaled):
@@ -98,6 +106,10 @@ class LinearDrag(_Scaled):
 
     coefficient: float = 1.0  # c [N s/m]
     law = staticmethod(linear_drag)
+
+    def force_bound(self) -> ForceBound:
+        """|f| = scale c |v|."""
+        return ForceBound(linear=abs(self.scale * self.coefficient))
 
 
 @dataclass(frozen=True)
@@ -107,6 +119,10 @@ class QuadraticDrag(_Scaled):
     coefficient: float = 0.1  # c [N s^2/m^2]
     law = staticmethod(quadratic_drag)
 
+    def force_bound(self) -> ForceBound:
+        """|f| = scale c |v|^2."""
+        return ForceBound(quadratic=abs(self.scale * self.coefficient))
+
 
 @dataclass(frozen=True)
 class ConstantWind(_Scaled):
@@ -114,6 +130,10 @@ class ConstantWind(_Scaled):
 
     force: tuple[float, float] = (5.0, 0.0)  # w [N]
     law = staticmethod(constant_wind)
+
+    def force_bound(self) -> ForceBound:
+        """|f| = scale |w|."""
+        return ForceBound(abs(self.scale) * float(np.hypot(*self.force)))
 
 
 @dataclass(frozen=True)
@@ -140,13 +160,22 @@ class WindGusts(_Scaled):
         super().__post_init__()
 
     def params(self) -> laws.Numbers:
+        return laws.gains_of(self, **self._harmonics())
+
+    def _harmonics(self) -> dict[str, np.ndarray]:
+        """Amplitude [N], frequency [rad/s] and phase of every sine, (2, HARMONICS) each."""
         rng = np.random.default_rng(self.seed)
         place = (np.arange(HARMONICS) + rng.uniform(0.0, 1.0, (2, HARMONICS))) / HARMONICS  # one frequency in each band
         ratio = np.exp(np.log(0.2) + np.log(50.0) * place)  # w_k T, from 0.2 to 10
         amplitude = 1.0 / np.sqrt(1.0 + ratio**2)
         amplitude *= self.strength * np.sqrt(2.0 / (amplitude**2).sum(axis=1, keepdims=True))
         phase = rng.uniform(0.0, 2.0 * np.pi, (2, HARMONICS))
-        return laws.gains_of(self, amplitude=amplitude, frequency=ratio / self.time, phase=phase)
+        return {"amplitude": amplitude, "frequency": ratio / self.time, "phase": phase}
+
+    def force_bound(self) -> ForceBound:
+        """|f_i| <= scale (|w_i| + sum_k a_k) on each axis: the sines all at their peaks."""
+        peaks = np.abs(self.steady) + np.sum(self._harmonics()["amplitude"], axis=1)
+        return ForceBound(abs(self.scale) * float(np.hypot(*peaks)))
 
 
 DISTURBANCES: dict[str, tuple[Callable[..., Disturbance], str]] = {

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.text import one_line
 
 SEPARATOR = ">"
 
@@ -45,6 +47,25 @@ class Orders:
     def names(self) -> tuple[str, ...]:
         """Every order's full name, ``"OA>FM>FR"`` for example, by index."""
         return tuple(SEPARATOR.join(self.behaviors[j] for j in row) for row in self.table)
+
+    def read(self, given: Any) -> np.ndarray:
+        """Indices as compiled code takes them, int64 and contiguous, from what a caller hands in; of any shape and range.
+
+        Args:
+            given: whole numbers, or names as :meth:`index` takes them: an array, nested lists or a tensor in main memory.
+
+        Raises:
+            ConfigurationError: anything else, or a name that is no order's.
+        """
+        try:
+            array = np.asarray(given)
+        except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; a tensor on a GPU, or one that wants gradients
+            raise ConfigurationError(f"orders must be integers, got {type(given).__name__}: {one_line(error)}") from None
+        if array.dtype.kind == "U":
+            array = np.array([self.index(str(name)) for name in array.ravel()], dtype=np.int64).reshape(array.shape)
+        if array.dtype.kind not in "iu":
+            raise ConfigurationError(f"orders must be integers, got {array.dtype}")
+        return np.ascontiguousarray(array, dtype=np.int64)
 
     def index(self, name: str) -> int:
         """Index of an order from its full name or from the command it gives (``"OA>FM>FR"`` or ``"OA>FM"``).

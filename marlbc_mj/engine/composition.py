@@ -1,20 +1,26 @@
-"""How a priority order becomes a reference velocity: behaviors evaluated in turn, composed in the null space (12), limited.
+"""How a priority order becomes a reference velocity: behaviors evaluated in turn, composed, limited.
 
-Errata 5 and 6 apply. The engine, predictions of supervisors and older frameworks all compose through :func:`compose`.
+Two compositions: in the null space (12), :func:`compose`, where errata 5 and 6 apply; and set-based, :func:`compose_set_based`,
+where avoidance is an inequality. The engine, predictions of supervisors and older frameworks all go through :func:`compose_team`.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.barriers import Barrier, bound_neighbors, bound_obstacles
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE
+from marlbc_mj.core.braking import restrain
 from marlbc_mj.core.cells import fill, nearest, room
+from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.native import as_behavior
 
 WORKSPACE = 9
 """Rows of two numbers that a :class:`TeamView` is made from."""
+PLANE_ROWS = 2
+"""Rows more for every half-plane of a set-based composition."""
 
 
 class Behaviors(NamedTuple):
@@ -29,10 +35,35 @@ class Behaviors(NamedTuple):
     virtual: bool  # behaviors are evaluated at p_r; else at the measured p
     speed_limit: float  # of references [m/s]
     acceleration_limit: float  # of references [m/s^2]
+    set_based: bool  # composition: avoidance as inequalities; else (12), all behaviors as equalities
+    keeps: np.ndarray  # (M,) distance that an inequality task keeps [m]; 0 for an equality task
+    rate: float  # from here on: how inequality tasks bound references, as in Barrier. Flat, for loops over threads
+    margin: float
+    reach: float
+    speed: float
+    braking: float
+    duration: float
+    obstacle_distance: float
+    agent_distance: float
+
+
+@allocation_free
+def barrier_of(behaviors):
+    """The :class:`Barrier` that behaviors have as flat fields."""
+    return Barrier(
+        behaviors.rate,
+        behaviors.margin,
+        behaviors.reach,
+        behaviors.speed,
+        behaviors.braking,
+        behaviors.duration,
+        behaviors.obstacle_distance,
+        behaviors.agent_distance,
+    )
 
 
 class TeamView(NamedTuple):
-    """What behaviors look at in one team, and room to desired_velocity them in."""
+    """What behaviors look at in one team, and room to evaluate them in."""
 
     at: np.ndarray  # (N, 2) positions at which they are evaluated [m]
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move
@@ -104,8 +135,33 @@ def compose(order, i, behaviors, view, v_r):
 
 
 @allocation_free
+def compose_set_based(order, i, behaviors, barrier, view, planes, v_r):
+    """v_r = argmin |v - v_c|^2 over the v that inequality tasks allow, for agent ``i``, into ``v_r`` (2,) [m/s].
+
+    v_c is what the other behaviors make by (12), no longer than ``barrier.speed``: FM or FR, whichever is higher. OA
+    and AA bound v whatever the order, see :mod:`marlbc_mj.core.barriers`; where they contradict, the one that ``order`` (M,)
+    lists first is violated least. ``planes`` (n, 4) is scratch.
+    """
+    v_r[0] = v_r[1] = 0.0
+    rank, count = 0, 0
+    for place in range(order.shape[0]):
+        j = order[place]
+        distance = behaviors.keeps[j]
+        if distance > 0.0 and behaviors.sees[j] == NEAREST_OBSTACLE:
+            count = bound_obstacles(view.at[i], view.obstacles, distance, place, barrier, planes, count)
+        elif distance > 0.0:
+            count = bound_neighbors(view.at, i, distance, place, barrier, planes, count)
+        elif rank < 2:
+            rows = desired_velocity(j, i, behaviors, view)
+            rank = add_behavior(view.velocity, view.jacobian, rows, view.basis, rank, v_r)
+    wish = view.velocity
+    wish[0], wish[1] = v_r[0], v_r[1]
+    closest(wish, barrier.speed, planes, count, v_r)
+
+
+@allocation_free
 def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
-    """:func:`compose` for every agent of a team at ``t`` [s]: reference velocities ``v_r`` (N, 2) [m/s].
+    """Reference velocities ``v_r`` (N, 2) [m/s] of a team at ``t`` [s], by the composition of its scenario.
 
     Args:
         t: mission time [s].
@@ -114,9 +170,20 @@ def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
         at: (N, 2) positions at which they are evaluated [m].
         obstacles: (K, 3 or 5), see :class:`TeamView`.
         grid: room for a grid of the obstacles and one of the team, or empty, which has every law try all of them.
-        workspace: (WORKSPACE, 2) scratch.
-        v_r: (N, 2), written in place.
+        workspace: (WORKSPACE, 2) scratch; a set-based composition has PLANE_ROWS more for every half-plane.
+        v_r: (N, 2), written in place. A set-based composition of limited acceleration reads the velocities before in it.
     """
+    if behaviors.set_based:
+        barrier = barrier_of(behaviors)
+        view = make_view(t, behaviors, at, obstacles, grid[:0], workspace)
+        planes = workspace[WORKSPACE:].reshape(((workspace.shape[0] - WORKSPACE) // PLANE_ROWS, 2 * PLANE_ROWS))
+        for i in range(orders.shape[0]):
+            before = view.pair[0]
+            before[0], before[1] = v_r[i, 0], v_r[i, 1]
+            compose_set_based(behaviors.table[orders[i]], i, behaviors, barrier, view, planes, v_r[i])
+            if barrier.braking < np.inf:
+                restrain(i, before, barrier, at, obstacles, v_r)
+        return
     view = make_view(t, behaviors, at, obstacles, grid, workspace)
     for i in range(orders.shape[0]):
         compose(behaviors.table[orders[i]], i, behaviors, view, v_r[i])

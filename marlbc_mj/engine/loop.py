@@ -21,6 +21,7 @@ from marlbc_mj.core.imperfections import sense, weaken
 from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
+from marlbc_mj.core.shield import ShieldCounts, ShieldNumbers, ShieldView, shield_team
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
@@ -59,6 +60,7 @@ class Plant(NamedTuple):
     loss: float  # share of the force that is lost
     loss_agent: float  # whose; negative: everybody's
     loss_start: float  # from then on [s]
+    shield: ShieldNumbers  # what it assumes and keeps, where the team has one
 
 
 class Native(NamedTuple):
@@ -103,8 +105,13 @@ class Team(NamedTuple):
     status: np.ndarray  # (B,) int64, 0, or 1 + agent + N * substep that diverged in the last mission step
     drag: np.ndarray  # (B, N, 2) of the last substep [N]; before the first one, v_r of the last mission step
     force: np.ndarray  # (B, N, 2) of the last substep: the law's, then what the actuators gave [N]
-    workspace: np.ndarray  # (B, WORKSPACE, 2) scratch
+    workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.plan.workspace_rows
     grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 where none pays
+    interventions: np.ndarray  # (B, N) substeps of the episode in which the shield changed the force; (B, 0) without a shield
+    force_change: np.ndarray  # (B, N) integral of what it changed [N s]
+    breaches: np.ndarray  # (B, N, 3) substeps in which its assumptions did not hold, see ShieldCounts
+    last_substep: np.ndarray  # (B, N, 2, 2) v and u of the substep before [m/s], [N]
+    stopping: np.ndarray  # (B, N) scratch: stopping distances [m]
 
 
 class Record(NamedTuple):
@@ -227,8 +234,20 @@ def set_forces(b, t, h, native, plant, team):
 
 
 @inlined
+def shield_forces(b, h, plant, team):
+    """Replace the forces of world ``b`` by the nearest that keep the team able to stop, if it has a shield."""
+    if team.interventions.shape[1] > 0:
+        known = team.sensed.shape[1] > 0
+        p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
+        view = ShieldView(h, p, v, team.velocity[b], team.obstacles[b], team.stopping[b])
+        counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
+        shield_team(plant.shield, view, team.last_substep[b], team.force[b], counts)
+
+
+@inlined
 def apply(b, k, mission, native, plant, team):
-    """Substep ``k`` of world ``b`` before MuJoCo's step: force law, drag and robot of every agent, into ctrl and qfrc_applied.
+    """Substep ``k`` of world ``b`` before MuJoCo's step: force law, shield, drag and robot of every agent, into ctrl and
+    qfrc_applied.
 
     Returns 0, or 1 + agent + N k where a number left the physical range.
     """
@@ -237,6 +256,7 @@ def apply(b, k, mission, native, plant, team):
     failed = set_forces(b, t, h, native, plant, team)
     if not failed:
         force = team.force[b]
+        shield_forces(b, h, plant, team)
         if plant.loss > 0.0:
             weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)

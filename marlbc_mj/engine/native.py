@@ -25,6 +25,32 @@ def step_address() -> int:
     return int(ctypes.cast(library.mj_step, ctypes.c_void_p).value or 0)
 
 
+class _LogConfig(ctypes.Structure):
+    """MuJoCo's mjLogConfig."""
+
+    _fields_ = (
+        ("to_console", ctypes.c_bool),
+        ("to_file", ctypes.c_bool),
+        ("file", ctypes.c_char * 1024),
+        ("topics", ctypes.c_int),
+    )
+
+
+def keep_mujoco_quiet() -> None:
+    """Have ``mj_step`` called by address neither print nor write MUJOCO_LOG.TXT into the current folder.
+
+    A world that diverges is an error of ours, with agent and time. Calls through MuJoCo's Python package warn as they always do.
+    """
+    library = ctypes.CDLL(mujoco._functions.__file__)
+    if hasattr(library, "mju_setLogConfig"):
+        library.mju_setLogConfig.argtypes = (_LogConfig,)
+        library.mju_setLogConfig.restype = None
+        library.mju_setLogConfig(_LogConfig(False, False, b"", 0))
+
+
+keep_mujoco_quiet()
+
+
 def call_step(step, model, data):
     """``step(model, data)``; for ``mj_step``."""
     step(model, data)

@@ -10,12 +10,15 @@ import numpy as np
 
 from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.core import laws
-from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, Behavior
+from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
+from marlbc_mj.core.shield import NO_SHIELD, Shield, ShieldNumbers
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.composition import Behaviors
+from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
 from marlbc_mj.engine.loop import MissionRules, Native, Plant
 from marlbc_mj.engine.native import step_address
+from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -39,11 +42,21 @@ class Plan:
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     disturbance_params: np.ndarray  # (P,)
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
+    shielded: bool = False  # whether plant.shield is used
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy is made anew: the addresses of laws and of MuJoCo's model are those of one process."""
+        return make_plan, (self.scenario, self.controller)
 
     @property
     def grid_room(self) -> int:
         """Length of a world's array for grids of obstacles and team; 0 for a team so small that trying all pairs costs less."""
         return grid_room(self.scenario)
+
+    @property
+    def workspace_rows(self) -> int:
+        """Rows of two of a world's scratch, see :func:`workspace_rows`."""
+        return workspace_rows(self.scenario)
 
     @property
     def native(self) -> bool:
@@ -79,11 +92,12 @@ def _arrays(data: Any) -> tuple[np.ndarray, ...]:
     return data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force
 
 
-def make_plan(scenario: Scenario, controller: Controller) -> Plan:
-    """Check a scenario with a controller and assemble its model.
+def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool | None = None) -> Plan:
+    """Check a scenario with a controller and assemble its model; ``shield=True`` is ``Shield()``.
 
     Raises:
-        ConfigurationError: unknown robot, a substep beyond the controller's stability limit, or a law of the wrong kind.
+        ConfigurationError: unknown robot, a substep beyond the controller's stability limit, a law of the wrong kind, or a shield
+            whose assumptions do not hold.
     """
     _check_substep(scenario, controller)
     robot = make_robot(scenario.robot)
@@ -94,6 +108,7 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
             "through only; choose a robot without contact"
         )
     limit = scenario.force_limit if controller.limited else np.inf
+    numbers = resolve(Shield() if shield is True else shield, scenario, limit) if shield else NO_SHIELD
     xml = assemble(scenario, limit)
     model = mujoco.MjModel.from_xml_string(xml)
     return Plan(
@@ -104,10 +119,11 @@ def make_plan(scenario: Scenario, controller: Controller) -> Plan:
         model=model,
         mission=make_mission(scenario),
         behaviors=make_behaviors(scenario),
-        plant=_make_plant(scenario, controller, limit, model),
+        plant=_make_plant(scenario, controller, limit, model, numbers),
         initial_state=np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in range(scenario.agents)]),
         disturbance_params=laws.pack_gains(scenario.disturbance.law, scenario.disturbance.params(), laws.DISTURBANCE),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
+        shielded=bool(shield),
     )
 
 
@@ -130,20 +146,24 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         ConfigurationError: a law that is not compiled, or not a behavior's.
     """
     addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
+    set_based = scenario.composition == "set-based"
     return Behaviors(
         laws=addresses,
         params=params,
         sees=sees_array(scenario.behaviors),
-        table=scenario.orders.table,
+        table=inequalities_first(scenario) if set_based else scenario.orders.table,
         command_of=scenario.orders.command_of,
         path=np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64),
         virtual=scenario.reference == "virtual",
         speed_limit=float(scenario.speed_limit),
         acceleration_limit=float(scenario.acceleration_limit),
+        set_based=set_based,
+        keeps=keeps_array(scenario.behaviors),
+        **make_barrier(scenario)._asdict(),
     )
 
 
-def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel) -> Plant:
+def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:
     gains = [controller.params(i, limit / scenario.unit_force) for i in range(scenario.agents)]
     params = [laws.pack_gains(controller.law, one, laws.CONTROLLER) for one in gains]
     qpos_index, qvel_index, ctrl_index = find_indices(model, scenario)
@@ -158,6 +178,7 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
         robot_params=np.tile(make_robot(scenario.robot).params_row(), (scenario.agents, 1)),
         controller_params=_padded([params])[0],
         unit_force=float(scenario.unit_force),
+        shield=shield,
         **{name: float(value) for name, value in scenario.imperfections.params()._asdict().items()},
     )
 
@@ -222,11 +243,6 @@ def grid_room(scenario: Scenario) -> int:
     return int(room(obstacles) + room(agents)) if agents * max(obstacles, neighbors) > WORTH else 0
 
 
-def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
-    """(M,) what each behavior's law looks at; everything, where it does not say."""
-    return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)
-
-
 def _padded(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
     """(M, N, P) float64 from ragged numbers, zeros at the end of the shorter ones."""
     width = max(len(numbers) for row in rows for numbers in row)
@@ -248,9 +264,10 @@ def _check_substep(scenario: Scenario, controller: Controller) -> None:
     if gains is None:
         return
     per_mass = scenario.unit_force / scenario.mass
-    limit = largest_stable_substep(gains[0] * per_mass, gains[1] * per_mass)
+    position_gain, velocity_gain = gains
+    limit = largest_stable_substep(position_gain * per_mass, velocity_gain * per_mass)
     if scenario.substep >= limit:
         raise ConfigurationError(
             f"substep {scenario.substep * 1e3:g} ms is beyond the stability limit {limit * 1e3:.1f} ms "
-            f"of gains {gains[0]:g} and {gains[1]:g}"
+            f"of gains {position_gain:g} and {velocity_gain:g}"
         )

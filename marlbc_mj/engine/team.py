@@ -10,14 +10,15 @@ import numpy as np
 from marlbc_mj.core import laws
 from marlbc_mj.core.imperfections import sense
 from marlbc_mj.core.motion import MOVING, NUMBERS
+from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.composition import WORKSPACE
-from marlbc_mj.engine.loop import Record, Team, judge
+from marlbc_mj.engine.loop import Record, Team, judge, valid_orders
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.shielding import check_start
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-SCRATCH = ("status", "drag", "force", "workspace", "grid")
+SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping")
 """Fields of a team that carry nothing from one mission step to the next."""
 
 
@@ -26,6 +27,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
     scenario, imperfections = plan.scenario, plan.scenario.imperfections
     agents, count, moving = scenario.agents, len(scenario.obstacles), scenario.moving
     each, pairs, tracks = (worlds, agents), (worlds, agents, 2), (worlds, count if moving else 0)
+    shielded = (worlds, agents if plan.shielded else 0)
     return Team(
         steps=np.zeros(worlds, dtype=np.int64),
         position=np.zeros(pairs),
@@ -49,8 +51,13 @@ def make_team(plan: Plan, worlds: int) -> Team:
         status=np.zeros(worlds, dtype=np.int64),
         drag=np.zeros(pairs),
         force=np.zeros(pairs),
-        workspace=np.zeros((worlds, WORKSPACE, 2)),
+        workspace=np.zeros((worlds, plan.workspace_rows, 2)),
         grid=np.zeros((worlds, plan.grid_room)),
+        interventions=np.zeros(shielded),
+        force_change=np.zeros(shielded),
+        breaches=np.zeros((*shielded, len(ASSUMPTIONS))),
+        last_substep=np.full((*shielded, 2, 2), np.nan),
+        stopping=np.zeros(shielded),
     )
 
 
@@ -64,10 +71,13 @@ def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarra
     """Put row ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m], for :func:`put`.
 
     Raises:
-        ConfigurationError: no layout for this draw, or obstacles of a size that the model does not have.
+        ConfigurationError: no layout for this draw, obstacles of a size that the model does not have, or a start that a shield
+            does not allow.
     """
     draw = plan.scenario.draw(rng)
     _check_solid(plan, draw.obstacles)
+    if plan.shielded:
+        check_start(plan.plant.shield, draw.starts, draw.obstacles)
     team.obstacles[b, :, :3] = draw.obstacles
     if team.motions.shape[1]:
         team.anchors[b], team.motions[b] = draw.obstacles, draw.motions
@@ -100,6 +110,7 @@ def place(
     team.controller[b] = plan.initial_state
     team.robot[b] = plan.robot.state_row()
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
+    team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
     judge(b, plan.mission, team)
 
 
@@ -110,6 +121,7 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     velocity is what its joints allow. Obstacles that are solid go where this episode has them.
     """
     plant, reading = plan.plant, plan.robot.reading
+    team.last_substep[b] = np.nan
     base = plant.qpos_index.ravel()
     data.qpos[base] = np.ravel(position)
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)
@@ -125,6 +137,20 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
         team.history[b] = np.stack([team.position[b], team.velocity[b]])
         count = int(team.steps[b]) * plan.mission.substeps
         sense(plant, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
+
+
+def check_orders(plan: Plan, orders: np.ndarray, worlds: int) -> np.ndarray:
+    """Orders (B, N) int64 as they are.
+
+    Raises:
+        ConfigurationError: another shape, or an index that is no order: the compiled loop would read past its tables.
+    """
+    shape, count = (worlds, plan.scenario.agents), len(plan.scenario.orders)
+    if orders.shape != shape:
+        raise ConfigurationError(f"orders must have shape {shape} (worlds, agents), got {orders.shape}")
+    if not valid_orders(orders, count):
+        raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
+    return orders
 
 
 def lasting(team: Team) -> dict[str, np.ndarray]:
@@ -154,6 +180,13 @@ def observe(plan: Plan, team: Team) -> Observation:
         reference=team.reference.copy(),
         obstacles=team.obstacles.copy(),
     )
+
+
+def shield_counts(team: Team) -> ShieldCounts | None:
+    """What the shield of every team did and saw since the episode began, as copies; None without a shield."""
+    if team.interventions.shape[1] == 0:
+        return None
+    return ShieldCounts(team.interventions.copy(), team.force_change.copy(), team.breaches.copy())
 
 
 def diverged(plan: Plan, team: Team, b: int, status: int, steps: int) -> SimulationError:

@@ -9,12 +9,15 @@ import numpy as np
 
 from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core import laws
+from marlbc_mj.core.compiling import threads_usable
+from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.text import one_line
 
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
 """What of MuJoCo's data is a world's state."""
@@ -27,6 +30,7 @@ class Step(NamedTuple):
     reward: np.ndarray  # (B,) r1 + r2 of (13)
     done: np.ndarray  # (B,) bool: the episode's last mission step has been made
     record: Record | None  # with ``record=True`` only
+    shield: ShieldCounts | None = None  # since the episode began, (B, N) each; with a shield only
 
 
 class World:
@@ -43,6 +47,7 @@ class World:
         threads: worlds are shared out over this many.
         record: keep every substep.
         native: None takes the compiled loop where it can, False forces the Python path.
+        shield: changes forces, as little as possible, so that agents can always stop; True is ``Shield()``.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
@@ -57,13 +62,14 @@ class World:
         threads: int = 1,
         record: bool = False,
         native: bool | None = None,
+        shield: Shield | bool | None = None,
     ) -> None:
         if not isinstance(worlds, int | np.integer) or worlds < 1:
             raise ConfigurationError(f"worlds must be a whole number, at least 1, got {worlds}")
         most = numba.config.NUMBA_NUM_THREADS
-        if not 1 <= threads <= most:
+        if not isinstance(threads, int | np.integer) or not 1 <= threads <= most:
             raise ConfigurationError(f"threads must be between 1 and {most} on this machine, got {threads}")
-        self.plan = make_plan(scenario, controller or SORLC())
+        self.plan = make_plan(scenario, controller or SORLC(), shield)
         self.scenario = scenario
         self.worlds = worlds
         self.threads = threads
@@ -77,6 +83,17 @@ class World:
         self._arguments = self._make_arguments()
         self.reset()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """What a copy or a pickle holds: the settings, and the state of all worlds. Addresses are nobody else's business."""
+        options = {"worlds": self.worlds, "threads": self.threads, "record": self._recording, "native": self.native}
+        settings = {"scenario": self.scenario, "controller": self.plan.controller, **options}
+        return {"settings": settings, "snapshot": self.snapshot()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Make the worlds anew, and go on where the original was, bit for bit."""
+        World.__init__(self, **state["settings"])
+        self.restore(state["snapshot"])
+
     def _make_arguments(self) -> Any:
         """What the loop takes besides orders and velocities: bundled for the compiled one, a tuple for the Python path."""
         plan = self.plan
@@ -89,10 +106,12 @@ class World:
 
         World b draws from its own stream, (seed, b), so what it does depends on neither B nor the other worlds.
         """
-        if seed < 0:
-            raise ConfigurationError(f"seed must not be negative, got {seed}")
+        if not isinstance(seed, int | np.integer) or seed < 0:
+            raise ConfigurationError(f"seed must be a whole number and not negative, got {seed!r}")
         if mask is not None and np.shape(mask) != (self.worlds,):
             raise ConfigurationError(f"mask must have shape ({self.worlds},), got {np.shape(mask)}")
+        if mask is not None and np.asarray(mask).dtype != np.bool_:
+            raise ConfigurationError(f"mask must be bool, got {np.asarray(mask).dtype}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
             rng = np.random.default_rng(np.random.SeedSequence([seed, int(b)]))
             starts = team.reset(self.plan, self.state, int(b), rng)
@@ -153,7 +172,7 @@ class World:
         """One mission step of every world.
 
         Args:
-            orders: (B, N) integers, indices into ``scenario.orders``.
+            orders: (B, N) integers, indices into ``scenario.orders``, or names of orders.
             velocity: (B, N, 2) reference velocities v_r [m/s] in the place of the composed ones (12); the orders then are only
                 the label under which the step is counted, priced by r2 and recorded.
 
@@ -167,7 +186,7 @@ class World:
         if self.advance(orders, velocity):
             self.raise_if_diverged()
         done = self.state.steps >= self.scenario.mission_steps
-        return Step(self.observe(), self.state.reward.copy(), done, self._read_record())
+        return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 
     def rollout(self, orders: np.ndarray) -> np.ndarray:
         """Many mission steps with orders known beforehand, in one compiled call: a schedule, or candidates of a search.
@@ -184,7 +203,10 @@ class World:
         """
         if not self.native:
             raise ConfigurationError("rollout needs compiled laws; use step")
-        sequence = np.stack([self._checked(row) for row in np.asarray(orders)])
+        sequence = self.scenario.orders.read(orders)
+        if sequence.ndim != 3 or not len(sequence):
+            raise ConfigurationError(f"orders must have shape (steps, worlds, agents), got {sequence.shape}")
+        sequence = np.stack([self._checked(row) for row in sequence])
         returns = np.zeros(self.worlds)
         run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
         run(returns, sequence, self._orders_alone, self._arguments)
@@ -192,11 +214,8 @@ class World:
         return returns
 
     def _serial(self) -> bool:
-        """Whether one thread does it all; otherwise numba is told how many there are."""
-        if self.threads == 1 or self.worlds == 1:
-            return True
-        numba.set_num_threads(self.threads)
-        return False
+        """Whether one thread does it all; otherwise numba has been told how many there are."""
+        return self.worlds == 1 or not bool(threads_usable(self.threads))
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
@@ -216,18 +235,15 @@ class World:
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
-        if getattr(orders, "dtype", np.dtype(np.int64)).kind not in "iu":
-            raise ConfigurationError(f"orders must be integers, got {orders.dtype}")
-        orders = np.ascontiguousarray(orders, dtype=np.int64)
-        shape, count = (self.worlds, self.scenario.agents), len(self.scenario.orders)
-        if orders.shape != shape:
-            raise ConfigurationError(f"orders must have shape {shape} (worlds, agents), got {orders.shape}")
-        if not loop.valid_orders(orders, count):
-            raise ConfigurationError(f"orders must be indices from 0 to {count - 1}, got {orders.tolist()}")
-        return orders
+        return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)
 
     def _checked_velocity(self, velocity: np.ndarray) -> np.ndarray:
-        velocity = np.asarray(velocity)
+        try:
+            velocity = np.asarray(velocity)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ConfigurationError(
+                f"velocity must be numbers [m/s], got {type(velocity).__name__}: {one_line(error)}"
+            ) from None
         if velocity.dtype.kind not in "fiu":
             raise ConfigurationError(f"velocity must be numbers [m/s], got {velocity.dtype}")
         shape = (self.worlds, self.scenario.agents, 2)
@@ -241,5 +257,8 @@ class World:
         return velocity
 
     def _read_record(self) -> Record | None:
-        recording = self._record.force.shape[1] > 0
-        return Record(*(array.copy() for array in self._record)) if recording else None
+        return Record(*(array.copy() for array in self._record)) if self._recording else None
+
+    @property
+    def _recording(self) -> bool:
+        return bool(self._record.force.shape[1] > 0)

@@ -20,8 +20,10 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
-FORMAT = 2
-"""Version of the format, for files that this version can read. 2: a digest of the arrays, a signature of what a policy needs."""
+FORMAT = 3
+"""Version of the format. 2: a digest of the arrays, a signature of what a policy needs; 3: the digest covers the description."""
+READABLE = (2, FORMAT)
+"""Formats of files that this version can read."""
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]) -> None:
@@ -36,7 +38,8 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[st
         ConfigurationError: the file cannot be written, no space left for example.
     """
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
-    said = {**plain_data(description), "format": FORMAT, "sha256": digest(arrays)}
+    said = {**plain_data(description), "format": FORMAT}
+    said["sha256"] = digest(arrays, said)
     try:
         with staged_file(path, overwrite=True) as staging:
             staging.write_bytes(serialise(arrays, {"marlbc_mj": json.dumps(said, allow_nan=False)}))
@@ -44,9 +47,15 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[st
         raise ConfigurationError(f"cannot write {path}: {error}") from error
 
 
-def digest(arrays: Mapping[str, np.ndarray]) -> str:
-    """SHA-256 of contiguous arrays with their names, types and shapes."""
+def digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
+    """SHA-256 of contiguous arrays with their names, types and shapes, and of what is said about them, JSON data.
+
+    What ``description`` says about the digest itself is left out; format 2 left out all of it.
+    """
     sha = hashlib.sha256()
+    if description.get("format") != 2:
+        said = {name: value for name, value in description.items() if name != "sha256"}
+        sha.update(json.dumps(said, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]
         sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
@@ -71,11 +80,11 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         description = json.loads(header or "")
     except (ValueError, RecursionError):
         raise ConfigurationError(f"{path} is no checkpoint of marlbc_mj: its header does not describe one") from None
-    if not isinstance(description, dict) or description.get("format") != FORMAT:
+    if not isinstance(description, dict) or description.get("format") not in READABLE:
         found = description.get("format") if isinstance(description, dict) else description
         raise ConfigurationError(f"checkpoint {path} has format {found!r}; this version reads {FORMAT}")
-    if description.get("sha256") != digest(arrays):
-        raise ConfigurationError(f"checkpoint {path} is damaged: its arrays are not those that its header was written with")
+    if description.get("sha256") != digest(arrays, description):
+        raise ConfigurationError(f"checkpoint {path} is damaged: its arrays or its header are not those that were written")
     return arrays, description
 
 

@@ -10,6 +10,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 ENABLED = ("", "enable", "enabled", "on", "true", "1")
 DISABLED = ("disable", "disabled", "off", "false", "0")
+SWITCHED_OFF = DISABLED[0]  # the one name that MuJoCo and dm_control both know
 WINDOW = ("glx", "wgl")  # MuJoCo's other names for glfw
 BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw"), "Windows": ("glfw",)}
 """By operating system, in the order in which they are tried; the names are those of mujoco's submodules."""
@@ -26,6 +27,11 @@ context.make_current()
 mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 100).free()
 context.free()
 """
+
+
+def switched_off() -> bool:
+    """Whether MUJOCO_GL forbids all rendering."""
+    return os.environ.get("MUJOCO_GL", "").lower().strip() in DISABLED
 
 
 def choose_gl() -> str:

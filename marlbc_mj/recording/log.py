@@ -8,7 +8,8 @@ from marlbc_mj.controllers import Controller
 from marlbc_mj.core.motion import nearest_places, obstacles_at
 from marlbc_mj.engine.loop import fill_clearance, verdict
 from marlbc_mj.engine.plan import make_mission, make_plan
-from marlbc_mj.episode import NO_POSE, Trajectory
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import NO_POSE, Trajectory, body_poses
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,36 @@ class EpisodeLog:
         places = nearest_places(self.time, self.position, self.obstacles, self.motions)
         reach = places[:, 2:] + self.safe_distance
         return places[:, :2] - reach, places[:, :2] + reach
+
+
+def from_world(world: World, b: int = 0) -> EpisodeLog:
+    """A log of one mission step: world ``b`` as it is now."""
+    scenario, state = world.scenario, world.state
+    return EpisodeLog(
+        scenario=scenario.name,
+        supervisor="",
+        controller="",
+        seed=0,
+        mission_step=scenario.mission_step,
+        safe_distance=scenario.safe_distance,
+        force_limit=scenario.force_limit if world.plan.controller.limited else np.inf,
+        commands=scenario.orders.commands,
+        obstacles=(state.anchors if scenario.moving else state.obstacles)[b, :, :3].copy(),
+        motions=state.motions[b].copy(),
+        mjcf=world.plan.xml,
+        time=state.steps[b : b + 1] * scenario.mission_step,
+        position=state.position[b : b + 1].copy(),
+        velocity=state.velocity[b : b + 1].copy(),
+        reference=state.reference[b : b + 1].copy(),
+        reference_velocity=state.reference_velocity[b : b + 1].copy(),
+        force=state.force[b : b + 1].copy(),
+        clearance=state.clearance[b : b + 1].copy(),
+        formation=state.formation[b : b + 1].copy(),
+        command=state.command[b : b + 1].copy(),
+        reward=state.reward[b : b + 1].copy(),
+        decision_ms=np.zeros(1),
+        pose=body_poses(world, b)[None],
+    )
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:

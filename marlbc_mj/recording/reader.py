@@ -12,6 +12,7 @@ from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import lz4.frame
 import numpy as np
 import zstandard
 from mcap.data_stream import RecordBuilder
@@ -26,6 +27,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.rerun_file import write_rerun
 from marlbc_mj.recording.writer import METADATA, MODEL
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
@@ -33,8 +35,15 @@ from marlbc_mj.util.files import staged_file
 _END = struct.Struct("<BQQQI8s")
 """How an MCAP ends: footer record (opcode, length, start of the summary, of its offsets, checksum of the summary), magic."""
 _DATA_END_SIZE = 1 + 8 + 4  # the record before the summary: opcode, length, checksum of everything before it [bytes]
-_DAMAGE = (McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, MemoryError)
-"""What the mcap package raises on bytes that are not what they should be."""
+_DAMAGE = (
+    *(McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, MemoryError),
+    *(TypeError, AttributeError, IndexError, RecursionError, RuntimeError, EOFError),  # lz4 raises a bare RuntimeError
+)
+"""What the mcap package, decompression and decoding raise on bytes that are not what they should be."""
+MOST_UNPACKED, MOST_CHUNK = 2**30, 2**26
+"""Largest size of a log's decompressed chunks together, and of one [bytes]: twice what 256 agents leave in 100 s, and 60 times
+what the writer puts into one.
+"""
 
 
 def read_log(path: str | Path) -> EpisodeLog:
@@ -49,7 +58,7 @@ def read_log(path: str | Path) -> EpisodeLog:
         if model is None:
             raise ConfigurationError(f"{path} has no attachment {MODEL}; it was damaged, or not written by marlbc")
         columns = _columns(_messages(path, reader))
-        return EpisodeLog(
+        log = EpisodeLog(
             scenario=metadata["scenario"],
             supervisor=metadata["supervisor"],
             controller=metadata["controller"],
@@ -63,6 +72,38 @@ def read_log(path: str | Path) -> EpisodeLog:
             mjcf=model,
             **columns,
         )
+        _check_log(log)
+        return log
+
+
+def _check_log(log: EpisodeLog) -> None:
+    """Raise ValueError for arrays that do not fit each other, or numbers that no episode leaves."""
+    steps, agents = log.position.shape[:2]
+    shapes = {
+        **dict.fromkeys(("position", "velocity", "reference", "reference_velocity", "force"), (steps, agents, 2)),
+        **dict.fromkeys(("time", "formation", "reward", "decision_ms"), (steps,)),
+        **dict.fromkeys(("clearance", "command"), (steps, agents)),
+    }
+    for name, shape in shapes.items():
+        array = getattr(log, name)
+        if array.shape != shape or array.dtype.kind not in "if":
+            raise ValueError(f"{name} is {array.dtype} with shape {array.shape}, not numbers with shape {shape}")
+        if not np.isfinite(array).all() and name != "clearance":
+            raise ValueError(f"{name} is not finite")
+    if log.pose.shape[:2] not in ((steps, 0), (steps, agents)) or log.pose.shape[2:] != (7,) or not np.isfinite(log.pose).all():
+        raise ValueError(f"pose has shape {log.pose.shape}, or is not finite")
+    if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
+        raise ValueError(f"a command is none of the {len(log.commands)} that there are")
+    if not all(isinstance(name, str) for name in log.commands):
+        raise ValueError("the names of commands are no texts")
+    if not (np.diff(log.time) > 0).all() or not (0 < log.mission_step < np.inf and 0 < log.safe_distance < np.inf):
+        raise ValueError("times do not grow, or mission_step or safe_distance is not positive")
+    if (
+        not np.isfinite(log.obstacles).all()
+        or not np.isfinite(log.motions).all()
+        or len(log.motions) not in (0, len(log.obstacles))
+    ):
+        raise ValueError("obstacles are not finite, or their motions do not fit them")
 
 
 def log_info(path: str | Path) -> dict[str, Any]:
@@ -135,12 +176,13 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
 
 
 def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> None:
-    """Write a log as a table (``.csv``: one row a mission step and agent) or as arrays (``.npz``: the fields of EpisodeLog).
+    """Write a log as a table (``.csv``: one row a mission step and agent), as arrays (``.npz``: the fields of EpisodeLog), or for
+    Rerun (``.rrd``).
 
     Raises:
         ConfigurationError: an unknown suffix, a log that cannot be read, or an output that cannot or must not be written.
     """
-    writers = {".csv": _write_csv, ".npz": _write_npz}
+    writers = {".csv": _write_csv, ".npz": _write_npz, ".rrd": write_rerun}
     suffix = Path(out).suffix
     if suffix not in writers:
         raise unknown("export format", suffix or str(out), writers)
@@ -153,6 +195,8 @@ def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> No
 def _open_file(path: str | Path) -> Iterator[BinaryIO]:
     """A file that is an MCAP, whole or torn."""
     try:
+        if Path(path).exists() and not Path(path).is_file():
+            raise ConfigurationError(f"cannot read {path}: it is not a file")
         with open(path, "rb") as stream:
             if not MCAP0_MAGIC.startswith(stream.read(len(MCAP0_MAGIC))):
                 raise ConfigurationError(f"{path} is not an MCAP file")
@@ -168,6 +212,7 @@ def _open_log(path: str | Path) -> Iterator[McapReader]:
     with _open_file(path) as stream:
         try:
             _check_whole(path, stream)
+            _check_sizes(stream)
             yield make_reader(stream, validate_crcs=True)
         except ConfigurationError:
             raise
@@ -189,6 +234,33 @@ def _check_whole(path: str | Path, stream: BinaryIO) -> None:
         data_crc = int.from_bytes(data[summary_start - 4 : summary_start], "little")
         if data_crc and zlib.crc32(data[: summary_start - _DATA_END_SIZE]) != data_crc:
             raise ValueError("wrong checksum of its data")
+
+
+def _check_sizes(stream: BinaryIO) -> None:
+    """Raise ValueError for chunks that are larger than any log's once they are decompressed, before one of them is."""
+    total = 0
+    for record in StreamReader(stream, emit_chunks=True).records:
+        if isinstance(record, Chunk):
+            total += _unpacked(record)
+            if total > MOST_UNPACKED:
+                raise ValueError(f"its chunks are larger than {MOST_UNPACKED} bytes together")
+    stream.seek(0)
+
+
+def _unpacked(chunk: Chunk) -> int:
+    """Size of a chunk that is no bomb [bytes]; ValueError for one that is, or says another size than its compressed data do."""
+    said, packed = chunk.uncompressed_size, len(chunk.data)
+    if said > MOST_CHUNK:
+        raise ValueError(f"a chunk of {packed} bytes says that it holds {said}; none has more than {MOST_CHUNK}")
+    if chunk.compression == "zstd":
+        found = zstandard.frame_content_size(chunk.data)
+    elif chunk.compression == "lz4":
+        found = lz4.frame.get_frame_info(chunk.data)["content_size"] or -1
+    else:
+        found = packed
+    if found not in (-1, said) or (found == -1 and chunk.compression == "lz4"):
+        raise ValueError(f"a chunk that should hold {said} bytes holds {found if found >= 0 else 'an unknown number'}")
+    return int(said)
 
 
 def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
@@ -256,7 +328,8 @@ def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
         if record is None or isinstance(record, DataEnd):
             return
         if isinstance(record, Chunk):
-            with suppress(*_DAMAGE):  # a damaged chunk between whole ones costs only itself
+            with suppress(*_DAMAGE):  # a bomb, or a damaged chunk between whole ones costs only itself
+                _unpacked(record)
                 yield from breakup_chunk(record, validate_crc=True)
         elif not isinstance(record, Attachment) or _is_whole(record, source):
             yield record

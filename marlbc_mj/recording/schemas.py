@@ -104,11 +104,23 @@ POSE = Topic(
         **{f"q{part}": MessageField("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
     },
 )
+SHIELD = Topic(
+    "/shield",
+    "marlbc.Shield",
+    "what the shield did and saw since the episode began, at the end of a mission step",
+    {
+        "interventions": MessageField("number", "substeps in which it changed the force"),
+        "change": MessageField("number", "integral of |u - wish| dt [N s]"),
+        "speed": MessageField("number", "substeps beyond the speed cap that it assumes"),
+        "force": MessageField("number", "substeps with a disturbance beyond the bound that it assumes"),
+        "state": MessageField("number", "substeps outside the set of states from which agents can stop in time"),
+    },
+)
 TOPICS = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-Robots with a free joint have ``POSE`` too.
+Robots with a free joint have ``POSE`` too, and teams with a shield ``SHIELD``.
 """
 
 

@@ -3,7 +3,8 @@
 Marks are flat shapes on the ground, added to a scene when it is drawn, so physics never pays for them.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
@@ -13,12 +14,17 @@ from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, flat_disc, make_trail, ribbon
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
+from marlbc_mj.util.text import one_line
 
 BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
 BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
 RIM = 0.14  # width of the white rim around it, in drawn radii
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
+
+
+OUTSIDE = ("include", "plugin", "extension", "replicate", "composite", "flexcomp")
+"""Elements of MJCF that read files, load programs or multiply what stands in them; an assembled model has none of them."""
 
 
 @dataclass(frozen=True)
@@ -110,6 +116,7 @@ def make_stage(log: EpisodeLog) -> Stage:
         raise ConfigurationError("the log holds no mission step, so there is nothing to show")
     agents = range(log.position.shape[1])
     try:
+        _check_self_contained(log.mjcf)
         model = mujoco.MjModel.from_xml_string(log.mjcf)
         unit, radius = _size(model)
         free = _free_joints(model, agents)
@@ -117,8 +124,10 @@ def make_stage(log: EpisodeLog) -> Stage:
         data = mujoco.MjData(model)
         discs = [model.geom(f"obstacle{k + 1}").id for k in range(len(log.obstacles))]
         _place_obstacles(model, data, discs, log.obstacles, unit)
-    except (KeyError, ValueError) as error:
-        raise ConfigurationError(f"the log's model cannot be shown: {str(error).strip()}") from error
+        if not (np.isfinite(unit) and unit > 0 and np.isfinite(radius) and radius >= 0):
+            raise ValueError(f"it says a length unit of {unit} m and a radius of {radius} m")
+    except (KeyError, ValueError, ElementTree.ParseError) as error:
+        raise ConfigurationError(f"the log's model cannot be shown: {one_line(error)}") from error
     return Stage(
         log=log,
         model=model,
@@ -131,6 +140,24 @@ def make_stage(log: EpisodeLog) -> Stage:
         scale=unit,
         free=tuple(free) if log.pose.shape[1] else (),
     )
+
+
+def _check_self_contained(mjcf: str) -> None:
+    """Raise ValueError for a model that reads other files, which logs of this package never do, or is larger than theirs."""
+    if "<!DOCTYPE" in mjcf or "<!ENTITY" in mjcf:
+        raise ValueError("it defines entities")
+    for element in ElementTree.fromstring(mjcf).iter():
+        files = [name for name in element.attrib if name.lower().startswith("file")]
+        if files or element.tag in OUTSIDE:
+            named = f"{files[0]} {element.attrib[files[0]]!r}" if files else "a part of another program"
+            raise ValueError(f"its element {element.tag!r} reads {named}; a log holds all that it needs")
+
+
+def restage(stage: Stage, log: EpisodeLog) -> Stage:
+    """The same model and what is drawn with it, showing another log of the same scenario."""
+    _place_obstacles(stage.model, stage.data, stage.discs.tolist(), log.obstacles, stage.scale)
+    trails = [make_trail(i, log.time, log.position[:, i], stage.scale) for i in range(log.position.shape[1])]
+    return replace(stage, log=log, rings=_rings(log, 0.0, stage.scale), trails=trails)
 
 
 def _free_joints(model: mujoco.MjModel, agents: range) -> list[int]:

@@ -1,10 +1,14 @@
 """Videos and stills of an episode, drawn from its log after the run."""
 
-from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+import subprocess
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
+from fractions import Fraction
 from itertools import chain
 from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO
 
 import imageio_ffmpeg
 import numpy as np
@@ -16,6 +20,7 @@ from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import staged_file
+from marlbc_mj.util.text import one_line
 
 LEAST_PIXELS, MOST_PIXELS = 64, 4096  # pixels, either side
 MOST_SAMPLES = 16  # per pixel
@@ -73,8 +78,8 @@ def render_video(
     with staged_file(path, overwrite=overwrite) as partial, closing(pictures):
         try:
             _encode(pictures, partial, size, style.fps, len(times), progress)
-        except OSError as error:
-            raise SimulationError(f"cannot write video {path}: {str(error).splitlines()[0]}") from error
+        except (OSError, SimulationError) as error:
+            raise SimulationError(f"cannot write video {path}: {one_line(error)}") from error
     return len(times)
 
 
@@ -134,23 +139,60 @@ def _encode(
     count: int,
     progress: Callable[[int, int], None] | None,
 ) -> None:
+    """Hand all pictures to the encoder, and see that it has written them.
+
+    Raises:
+        SimulationError: the encoder failed, for want of room on the disk for example.
+    """
     first = next(pictures)  # before the encoder starts: what cannot be drawn fails here
-    writer = imageio_ffmpeg.write_frames(
-        str(path),
-        size,
-        fps=fps,
-        codec="libx264",
-        quality=None,  # ENCODING says it
-        macro_block_size=2,
-        ffmpeg_log_level="error",
-        output_params=ENCODING.copy(),
-    )
-    with closing(writer):
-        writer.send(None)
+    with encoder(path, size, fps) as stream:
         for done, picture in enumerate(chain([first], pictures), 1):
-            writer.send(np.ascontiguousarray(picture))
+            stream.write(np.ascontiguousarray(picture).data)
             if progress is not None:
                 progress(done, count)
+
+
+@contextmanager
+def encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[IO[bytes]]:
+    """A stream that takes pictures of ``size``, width and height, as RGB bytes; the video is whole when the block has ended.
+
+    Raises:
+        SimulationError: the encoder said that it failed, whatever the file looks like.
+    """
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(Fraction(fps).limit_denominator())]
+    target = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-v", "error", *ENCODING, str(path)]
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *source, "-i", "-", *target]
+    with TemporaryFile() as errors:
+        # A group of its own: Ctrl-C is for the program, which then ends the encoder.
+        process = subprocess.Popen(
+            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True
+        )
+        assert process.stdin is not None
+        whole = False
+        try:
+            with suppress(BrokenPipeError):  # the encoder has ended, and says why
+                yield process.stdin
+                process.stdin.close()
+                whole = True
+            status = process.wait()
+        except BaseException:
+            process.kill()
+            process.wait()
+            raise
+        finally:
+            with suppress(OSError):
+                process.stdin.close()
+        if status or not whole:
+            errors.seek(0)
+            said = errors.read().decode(errors="replace").strip().splitlines()
+            raise SimulationError(f"the encoder failed with status {status}: {_reason(said)}")
+
+
+def _reason(said: Sequence[str]) -> str:
+    """The line of the encoder that tells the most."""
+    return next(
+        (line for line in said if "No space left" in line or "too large" in line), said[-1] if said else "no reason given"
+    )
 
 
 def _check_size(width: int, height: int) -> None:

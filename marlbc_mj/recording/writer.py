@@ -29,7 +29,8 @@ from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxg
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import check_target
+from marlbc_mj.util.files import check_target, take_name
+from marlbc_mj.util.locks import is_held, lock
 from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
 from marlbc_mj.util.seeding import stream
 
@@ -59,6 +60,7 @@ class LogWriter:
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.
         overwrite: replace a log, finished or partial, of the same name.
+        shielded: the team has a shield, which gets a topic of its own.
         model: the scenario's MJCF, where a world of it has been made already; None: it is assembled for the log.
 
     Raises:
@@ -75,6 +77,7 @@ class LogWriter:
         seed: int,
         config: dict[str, Any],
         overwrite: bool = False,
+        shielded: bool = False,
         model: str | None = None,
     ) -> None:
         self.path = Path(path)
@@ -93,10 +96,12 @@ class LogWriter:
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = laws.interface(controller.law).state == sorlc.STATE
         self._posed = len(make_robot(scenario.robot).joints) == 1
+        self._shielded = shielded
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]
         self._flushed = monotonic()  # when [s]
         self._stream = _create(self.path, overwrite)
+        lock(self._stream.fileno())
         try:
             self._start(metadata, attachments)
         except OSError as error:
@@ -139,9 +144,11 @@ class LogWriter:
             return
         try:
             self._end()
-            if not self._overwrite:
-                check_target(self.path, overwrite=False)
-            os.replace(self.partial, self.path)
+            if self._overwrite:
+                os.replace(self.partial, self.path)
+            else:
+                take_name(self.partial, self.path)
+                self.partial.unlink(missing_ok=True)
         except OSError as error:
             raise SimulationError(f"cannot write {self.path}: {error.strerror}") from error
 
@@ -173,7 +180,7 @@ class LogWriter:
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
-        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed):
+        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed, *[schemas.SHIELD] * self._shielded):
             if topic is not schemas.WEIGHTS or self._weighted:
                 text = json.dumps(schemas.json_schema(topic)).encode()
                 schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
@@ -194,6 +201,9 @@ class LogWriter:
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
         if self._posed:
             yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)
+        if self._shielded and frame.shield is not None:
+            interventions, change, breaches = frame.shield
+            yield schemas.SHIELD.name, schemas.encode(schemas.SHIELD, np.column_stack([interventions, change, breaches]))
         if self._weighted:
             yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
         verdicts = {"formation": int(seen.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}
@@ -219,6 +229,8 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
     try:
         check_target(path, overwrite=overwrite)
         path.parent.mkdir(parents=True, exist_ok=True)
+        if overwrite and partial.exists() and is_held(partial):
+            raise ConfigurationError(f"{partial} is being written by a run in progress; choose another name")
         return open(partial, "wb" if overwrite else "xb")
     except FileExistsError as error:
         if not partial.exists():  # a file where a folder should be
@@ -235,6 +247,7 @@ def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[st
     """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
+        "composition": scenario.composition,
         "mission_step": repr(float(scenario.mission_step)),
         "safe_distance": repr(float(scenario.safe_distance)),
         "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",

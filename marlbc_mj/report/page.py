@@ -126,6 +126,7 @@ def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
     """What a page says about a scenario, by name."""
     return [
         ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
+        ("Composition", scenario.composition),
         ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
     ]
 

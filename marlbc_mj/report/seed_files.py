@@ -5,11 +5,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.results.outcomes import outcome
+from marlbc_mj.results.outcomes import outcome_rates
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seed_statistics import GroupStatistics, MethodStatistics, controller_of, group, supervisor_of
 from marlbc_mj.results.seeds import SeedResults, SeedRun
-from marlbc_mj.results.statistics import Estimate, rate
+from marlbc_mj.results.statistics import Estimate
 from marlbc_mj.results.summary import AGENT_KEYS, SCHEMA, TEAM_KEYS, json_numbers
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.text import one_line
@@ -51,10 +51,14 @@ def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
 
 
 def _outcome_entry(statistics: MethodStatistics, scenario: Scenario) -> dict[str, Any]:
-    """The rate of every part of an outcome, with Wilson's interval."""
-    outcomes = [outcome(run.metrics, scenario) for run in statistics.runs.runs]
-    parts = ("success", "reached", "struck", "collided")
-    return {k: v for part in parts for k, v in _with_ci(f"{part}_rate", rate([getattr(o, part) for o in outcomes])).items()}
+    """``outcome``: how many runs there were, and the share of each way to end; beside it the rates by their older names.
+
+    A run that failed counts against its method in every respect.
+    """
+    runs = statistics.runs.runs
+    rates = outcome_rates([run.metrics for run in runs], scenario)
+    older = {f"{part}_rate": rates[part] for part in ("success", "reached", "struck", "collided")}
+    return {**_all_with_ci(older), "outcome": {"runs": len(runs), **_all_with_ci(rates)}}
 
 
 def _group_entry(statistics: GroupStatistics) -> dict[str, Any]:

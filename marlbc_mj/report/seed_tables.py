@@ -5,10 +5,9 @@ from dataclasses import replace
 
 from marlbc_mj.report.formats import DASH, FAILED, interval, percent, score_column, score_interval, spans
 from marlbc_mj.report.table import Column, Table
-from marlbc_mj.results.outcomes import outcome
+from marlbc_mj.results.outcomes import outcome_rates
 from marlbc_mj.results.seed_statistics import GroupStatistics, MethodStatistics, controller_of, group, supervisor_of
 from marlbc_mj.results.seeds import MethodRuns, SeedResults
-from marlbc_mj.results.statistics import rate
 from marlbc_mj.robots import make_robot
 from marlbc_mj.util.text import one_line
 
@@ -88,9 +87,9 @@ def outcome_table(results: SeedResults) -> Table:
         if len(method.failed) == len(method.runs):
             rows.append((method.key, FAILED, *[DASH] * 4))
             continue
-        outcomes = [outcome(run.metrics, results.scenario) for run in method.runs]
-        shares = ([getattr(one, name) for one in outcomes] for name in ("success", "reached", "violated", "struck", "collided"))
-        rows.append((method.key, *(interval(percent(rate(share)), 0) for share in shares)))
+        rates = outcome_rates([run.metrics for run in method.runs], results.scenario)
+        parts = ("success", "reached", "violation", "struck", "collided")
+        rows.append((method.key, *(interval(percent(rates[part]), 0) for part in parts)))
     scenario, radius = results.scenario, make_robot(results.scenario.robot).radius
     notes = (
         f"Success: at the end every agent is within {scenario.formation_tolerance:g} m of its slot around the desired centroid, "

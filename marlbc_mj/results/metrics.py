@@ -26,6 +26,9 @@ class AgentMetrics(TypedDict):
     saturation_duty: float  # share of time with an axis at the force limit
     rms_position_error: float  # [m]
     rms_velocity_error: float  # [m/s]
+    intervention_share: float  # share of substeps in which the shield changed the force; 0 without a shield
+    force_change_integral: float  # integral of |u - wish| dt [N s]
+    assumption_breaches: int  # substeps in which an assumption of the shield did not hold, one for each that did not
 
 
 TeamMetrics = TypedDict(
@@ -68,6 +71,7 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
     square_p, square_v = (position_error**2).sum(-1), (velocity_error**2).sum(-1)
     size = np.linalg.norm(force, axis=-1)
     cost = square_p + square_v + size**2
+    interventions, change, breaches = _shield_totals(trajectory, agent)
     return {
         "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
         "clearance_min": float(clearance.min()),
@@ -82,7 +86,19 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
         "saturation_duty": float((np.abs(force) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).mean()),
         "rms_position_error": float(np.sqrt(square_p.mean())),
         "rms_velocity_error": float(np.sqrt(square_v.mean())),
+        "intervention_share": interventions / len(force),
+        "force_change_integral": change,
+        "assumption_breaches": breaches,
     }
+
+
+def _shield_totals(trajectory: Trajectory, agent: int) -> tuple[float, float, int]:
+    """Interventions [substeps], change of the force [N s] and breaches [substeps] over the episode; nothing without a shield."""
+    counts = trajectory.shield
+    if counts is None:
+        return 0.0, 0.0, 0
+    last = -1, agent
+    return float(counts.interventions[last]), float(counts.change[last]), int(counts.breaches[last].sum())
 
 
 def _team(trajectory: Trajectory) -> TeamMetrics:

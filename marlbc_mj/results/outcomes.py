@@ -1,9 +1,11 @@
 """The outcome of a mission: whether the team ended in formation, and what it came too close to on the way."""
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
+from marlbc_mj.results.statistics import Estimate, rate
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
@@ -37,3 +39,29 @@ def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
         struck=SCORES["clearance_min_worst"].read(metrics) <= radius,
         collided=team["agent_distance_min"] <= 2.0 * radius,
     )
+
+
+INTERVENTION = "intervention_share"
+"""Metric of a team that flies under a shield: the share of substeps in which the shield acted."""
+
+
+def intervened(metrics: Metrics | None) -> bool:
+    """Whether a shield changed what the team would have done; never where there was none, or where the run failed."""
+    shares: Mapping[str, Any] = {} if metrics is None else metrics["team"]
+    return bool(shares.get(INTERVENTION, 0.0) > 0.0)
+
+
+def outcome_rates(runs: Sequence[Metrics | None], scenario: Scenario) -> dict[str, Estimate]:
+    """Share of ``runs`` that ended in each way, with Wilson's interval; None among them stands for a run that failed.
+
+    ``intervention`` is the share of runs in which a shield acted at least once.
+    """
+    outcomes = [outcome(metrics, scenario) for metrics in runs]
+    return {
+        "success": rate([one.success for one in outcomes]),
+        "reached": rate([one.reached for one in outcomes]),
+        "violation": rate([one.violated for one in outcomes]),
+        "struck": rate([one.struck for one in outcomes]),
+        "collided": rate([one.collided for one in outcomes]),
+        "intervention": rate([intervened(metrics) for metrics in runs]),
+    }

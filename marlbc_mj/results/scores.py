@@ -44,6 +44,10 @@ def _least(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: min(map(read, metrics["agents"]))
 
 
+def _mean(read: _Read) -> Callable[[Metrics], float]:
+    return lambda metrics: float(np.mean([read(agent) for agent in metrics["agents"]]))
+
+
 def _rms(read: _Read) -> Callable[[Metrics], float]:
     return lambda metrics: float(np.sqrt(np.mean([read(agent) ** 2 for agent in metrics["agents"]])))
 
@@ -59,6 +63,7 @@ SCORES = {
     "effort_integral_sum": Score("effort", SUM, "N s", 0, _sum(lambda a: a["effort_integral"])),
     "cost_integral_sum": Score("cost", SUM, "10⁴", 1, _sum(lambda a: a["cost_integral"]), 1e-4),
     "saturation_duty_worst": Score("at limit", WORST, "%", 1, _greatest(lambda a: a["saturation_duty"]), 100.0),
+    "intervention_share_mean": Score("shield at work", MEAN, "%", 2, _mean(lambda a: a["intervention_share"]), 100.0),
     "rms_position_error_rms": Score("‖e_p‖", RMS, "m", 3, _rms(lambda a: a["rms_position_error"])),
     "rms_velocity_error_rms": Score("‖e_v‖", RMS, "m/s", 2, _rms(lambda a: a["rms_velocity_error"])),
 }

@@ -68,6 +68,9 @@ class Robot:
     substep: float = np.inf  # largest that its contacts and inner loops take [s]
     height: float = 0.0  # that it flies at [m]
     contact: bool = False  # obstacles and other agents are solid
+    force_error: float | None = (
+        None  # bound of what moves it besides u and f, at once and in every direction [N]; None: no shield
+    )
     ground: bool = False  # stands on the arena's ground by its own geoms' contact; else its MJCF has a floor, or it flies
     prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
 

@@ -12,6 +12,7 @@ def point_mass() -> Robot:
         motors=("x", "y"),
         body="body",
         radius=0.5,
+        force_error=0.0,
         description=POINT_MASS,
     )
 

@@ -1,7 +1,8 @@
 """Scenarios: frozen problem instances, by name."""
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterable
+from dataclasses import fields, replace
+from inspect import Parameter, signature
 from typing import Any
 
 from marlbc_mj.scenarios.base import Draw, Obstacle, Perturbation, Scenario, Window, standard_behaviors
@@ -22,8 +23,13 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
 """Factory by name."""
 
 
-def make_scenario(name: str, **changes: Any) -> Scenario:
+def make_scenario(name: str, *, allow_code: bool = False, **changes: Any) -> Scenario:
     """A scenario by name, from a ``.toml`` file, or ``file.py:Name`` of a user's Python file, with any of its fields changed.
+
+    Args:
+        name: of a scenario, or a path that ends in ``.toml``.
+        allow_code: whether a file's robot may be a Python file, which is run.
+        **changes: fields and their values.
 
     Raises:
         ConfigurationError: unknown name, a file that cannot be loaded, or a change that cannot be run.
@@ -31,9 +37,11 @@ def make_scenario(name: str, **changes: Any) -> Scenario:
     if names_attribute(name):
         return _from_python(name, changes)
     if name.endswith(SUFFIX):
-        return load_scenario(name, **changes)
+        return load_scenario(name, allow_code=allow_code, **changes)
     if name not in SCENARIOS:
         raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
+    if name not in FAMILIES:  # families look at their own
+        check_fields(SCENARIOS[name], changes)
     return SCENARIOS[name](**changes)
 
 
@@ -46,6 +54,15 @@ def _from_python(name: str, changes: dict[str, Any]) -> Scenario:
         return replace(scenario, **changes)
     except TypeError as error:
         raise ConfigurationError(f"{name}: {error}") from error
+
+
+def check_fields(factory: Callable[..., Scenario], changes: Iterable[str]) -> None:
+    """Raise ConfigurationError for a change that is neither a field of a scenario nor an argument of its factory."""
+    own = [name for name, each in signature(factory).parameters.items() if each.kind is not Parameter.VAR_KEYWORD]
+    valid = dict.fromkeys([*own, *(field.name for field in fields(Scenario))])
+    for name in changes:
+        if name not in valid:
+            raise unknown("field of a scenario", name, valid)
 
 
 __all__ = [

@@ -17,8 +17,11 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
+MOST_STEPS = 10_000_000  # mission steps of an episode: what an hour of simulation makes
 MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
+COMPOSITIONS = ("null-space", "set-based")
+"""Avoidance as an equality task (12), or as an inequality."""
 YOUNG = {"young": True}
 """Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
 
@@ -103,6 +106,8 @@ class Scenario:
     motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one an obstacle, or none: all at rest
     layout: Layout | None = field(default=None, metadata=YOUNG)  # draws obstacles and motions anew for every seed
     split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # whose layouts are drawn
+    # how an order becomes a reference: avoidance as an equality task (12), or as an inequality
+    composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
@@ -179,10 +184,12 @@ class Scenario:
         return obstacles.copy(), motions, number
 
     def check_windows(self, windows: tuple[Window, ...]) -> None:
-        """Raise ConfigurationError for a window with an unknown agent or times that are not finite."""
+        """Raise ConfigurationError for a window with an unknown agent, or times that are not finite or not in order."""
         for window in windows:
             if not np.isfinite((window.start, window.end)).all():
                 raise ConfigurationError(f"window {tuple(window)}: times must be finite")
+            if window.start > window.end:
+                raise ConfigurationError(f"window {tuple(window)}: it ends before it starts")
             if not -1 <= window.agent < self.agents:
                 raise ConfigurationError(
                     f"window {tuple(window)}: agent must be -1 (all) or 0 to {self.agents - 1}, got {window.agent}"
@@ -208,6 +215,8 @@ class Scenario:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be positive, got {getattr(self, name)}")
         if self.reference not in REFERENCE_MODES:
             raise unknown("reference mode", self.reference, REFERENCE_MODES)
+        if self.composition not in COMPOSITIONS:
+            raise unknown("composition", self.composition, COMPOSITIONS)
         if self.split not in SPLITS:
             raise unknown("split", self.split, SPLITS)
         arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}
@@ -233,6 +242,10 @@ class Scenario:
             offsets = getattr(behavior, "offsets", None)
             if offsets is not None:
                 self._check_slots(behavior.name, offsets)
+            if self.composition == "set-based" and getattr(behavior, "two_sided", False):
+                raise ConfigurationError(
+                    f"scenario {self.name!r}: a two-sided {behavior.name} is an equality task, but composition is set-based"
+                )
         check_motions(self.motions, len(self.obstacles))
         first = obstacles_at(0.0, self.obstacle_array(), motion_array(self.motions))
         starts = np.array(self.starts, dtype=np.float64)
@@ -256,6 +269,10 @@ class Scenario:
         if self.mission_step / self.substep > MOST_SUBSTEPS:
             raise ConfigurationError(
                 f"substep {self.substep} s makes more than {MOST_SUBSTEPS} of a mission step of {self.mission_step} s"
+            )
+        if self.duration / self.mission_step > MOST_STEPS:
+            raise ConfigurationError(
+                f"duration {self.duration} s has more than {MOST_STEPS} mission steps of {self.mission_step} s"
             )
         for long, short in (("mission_step", "substep"), ("duration", "mission_step")):
             ratio = getattr(self, long) / getattr(self, short)

@@ -38,6 +38,7 @@ class Mission:
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"
+    composition: Literal["null-space", "set-based"] = "null-space"  # avoidance as an equality task, or as an inequality
     robot: str = "point_mass"
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]

@@ -28,8 +28,11 @@ from marlbc_mj.scenarios.family import Family, Mission
 from marlbc_mj.scenarios.layout import Motion
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.settings import choose, convert, field_types, misfit, tables
+from marlbc_mj.util.text import one_line
 
 SUFFIX = ".toml"
+MOST_DEPTH = 20
+"""Deepest nesting of tables and lists in a scenario file."""
 MOST_BYTES = 1_000_000
 """Largest size of a scenario file."""
 
@@ -57,18 +60,22 @@ class Custom(Mission):
         return Scenario(**{**self.shared(), "behaviors": behaviors, "description": description, **changes})
 
 
-def load_scenario(path: str | Path, **changes: Any) -> Scenario:
-    """The scenario of a TOML file, with any of its fields changed.
+def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any) -> Scenario:
+    """The scenario of a TOML file, with any of its fields changed. Reading it runs no code unless that is allowed.
+
+    A robot's file is looked up beside the TOML file, and a robot that has a scale (mass, limits, substep) gives it to fields that
+    the file does not name.
 
     Args:
         path: the file.
+        allow_code: whether its robot may be a Python file, which is run.
         **changes: fields of the family, or of the scenario where the family has none of that name.
 
     Raises:
         ConfigurationError: no such file, no TOML, an unknown key or a value of another type (named, with the valid ones), or a
             mission that cannot be flown (with the reason).
     """
-    content = _with_robot(_read(Path(path)), Path(path), changes)
+    content = _with_robot(_read(Path(path)), Path(path), changes, allow_code=allow_code)
     name = content.pop("family", None)
     kinds = (*FAMILIES, "custom", "paper", "cruise")
     if name not in kinds:
@@ -82,31 +89,54 @@ def load_scenario(path: str | Path, **changes: Any) -> Scenario:
         return mission.build(**changes)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from error
+    except (ArithmeticError, TypeError, ValueError, RecursionError, MemoryError) as error:  # numbers that no check foresaw
+        raise ConfigurationError(
+            f"{path}: a value that no scenario can have: {one_line(error) or type(error).__name__}"
+        ) from error
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(f"{path} is not a file")
         if path.stat().st_size > MOST_BYTES:
             raise ConfigurationError(f"{path} is larger than {MOST_BYTES} bytes; that is no scenario file")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8-sig")
+        if _depth(text) > MOST_DEPTH:
+            raise ConfigurationError(f"{path} is nested more than {MOST_DEPTH} deep; that is no scenario file")
+        return tomllib.loads(text)
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"{path} is not TOML: {error}") from error
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or a number of thousands of digits
+        raise ConfigurationError(f"{path} is not TOML: {one_line(error)}") from error
 
 
-def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any]) -> dict[str, Any]:
+def _depth(text: str) -> int:
+    """An upper bound of how deep TOML is nested: brackets that are open at once, and parts of a dotted key."""
+    deepest = depth = 0
+    for character in text:
+        depth += (character in "[{") - (character in "]}")
+        deepest = max(deepest, depth)
+    return max(deepest, *(line.partition("=")[0].count(".") for line in text.splitlines()), 0)
+
+
+def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any], *, allow_code: bool) -> dict[str, Any]:
     """The content with the robot's file found beside the scenario's, and the robot's scale where the file does not set it.
 
     Raises:
-        ConfigurationError: a robot that cannot be made.
+        ConfigurationError: a robot that cannot be made, or a program that the file names, without leave to run it.
     """
     name = changes.get("robot", content.get("robot"))
     if not isinstance(name, str):
         return content
-    beside = path.parent / name
-    if is_file(name) and "robot" not in changes and beside.is_file():
-        name = str(beside)
+    if "robot" not in changes:
+        if name.partition(":")[0].endswith(".py") and not allow_code:
+            raise ConfigurationError(
+                f"{path}: robot {name!r} is a program; add --allow-code (allow_code=True in Python) to run it"
+            )
+        beside = path.parent / name
+        if is_file(name) and beside.is_file():
+            name = str(beside)
     scale = {key: value for key, value in make_robot(name).scale().items() if value != math.inf}
     return {**scale, **content, "robot": name}
 

@@ -38,6 +38,7 @@ class BenchConfig:
     overwrite: bool = False
     seeds: int | None = None  # this many draws around the scenario, from ``seed`` on, instead of one
     workers: int = 1  # processes that share the methods of ``seeds``
+    shield: bool = False  # give agents a shield, see marlbc_mj.core.shield
     against: str | None = None  # with ``seeds``: the method that others are compared with; None: the first
 
     def __post_init__(self) -> None:
@@ -95,7 +96,7 @@ class BenchStudy:
     config: BenchConfig
 
     def jobs(self) -> list[EpisodeJob]:
-        return [EpisodeJob(self.scenario, *method, self.config.seed) for method in self.config.methods]
+        return [EpisodeJob(self.scenario, *method, self.config.seed, self.config.shield) for method in self.config.methods]
 
     def run(self, job: EpisodeJob, watch: Watch) -> Result:
         return fly_or_fail(job, watch.folder if self.config.logs else None, watch.progress)
@@ -166,6 +167,7 @@ def run_single(
     *,
     seed: int = 0,
     overwrite: bool = False,
+    shield: bool = False,
     progress: Progress | None = None,
 ) -> Result:
     """One method, its log, metrics.json and config.json in ``out``.
@@ -176,9 +178,9 @@ def run_single(
         ConfigurationError: a setting or the output folder; a method that cannot start is a wrong setting here.
         SimulationError: the run failed; its log stays as it was.
     """
-    config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite)
+    config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite, shield=shield)
     check_folder(out, overwrite=overwrite)
-    job = EpisodeJob(scenario, supervisor, controller, seed)
+    job = EpisodeJob(scenario, supervisor, controller, seed, shield)
     flight = prepare(job, *name_method(job))
     result = fly(flight, out, progress or silent, overwrite=overwrite)
     if result.metrics is None:

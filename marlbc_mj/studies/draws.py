@@ -37,6 +37,7 @@ class DrawsJob(NamedTuple):
     supervisor: str
     controller: str
     seeds: tuple[int, ...]
+    shield: bool = False  # whether agents have a shield
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,8 @@ class DrawsStudy:
             make_controller(controller)
 
     def jobs(self) -> list[DrawsJob]:
-        return [DrawsJob(self.scenario, *method, self.seeds) for method in self.methods]
+        shield = self.config is not None and self.config.shield
+        return [DrawsJob(self.scenario, *method, self.seeds, shield) for method in self.methods]
 
     def run(self, job: DrawsJob, watch: Watch) -> MethodRuns:
         return fly_draws(job, watch.progress)
@@ -148,7 +150,7 @@ def fly_draws(job: DrawsJob, progress: Progress = silent) -> MethodRuns:
     """One method on every seed; ``progress`` is called with how many seeds are done."""
     law = make_controller(job.controller)
     try:
-        world = World(job.scenario, law, record=True)
+        world = World(job.scenario, law, record=True, shield=job.shield)
     except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
         refused = tuple(SeedRun(seed, None, failure=str(error)) for seed in job.seeds)
         return MethodRuns(job.supervisor, job.controller, refused)

@@ -31,6 +31,7 @@ class EpisodeJob(NamedTuple):
     supervisor: str
     controller: str
     seed: int
+    shield: bool = False  # whether agents have a shield, of the scenario's own numbers
 
     @property
     def key(self) -> str:
@@ -89,7 +90,7 @@ def prepare(job: EpisodeJob, law: Controller, supervisor: Supervisor) -> Flight:
     Raises:
         ConfigurationError: the controller or the supervisor does not suit the scenario.
     """
-    world = World(job.scenario, law, record=True)
+    world = World(job.scenario, law, record=True, shield=job.shield)
     return Flight(job, law, world, Stopwatch(supervisor, job.scenario))
 
 
@@ -152,8 +153,10 @@ def open_log(flight: Flight, folder: Path, *, overwrite: bool = False) -> LogWri
             "controller": flight.law,
             "supervisor": flight.supervisor.supervisor,
             "seed": job.seed,
+            **({"shield": True} if job.shield else {}),
         },
         overwrite=overwrite,
+        shielded=job.shield,
         model=flight.world.plan.xml,
     )
 

@@ -32,6 +32,7 @@ def evaluation(
     seed: int = 0,
     workers: int = 1,
     overwrite: bool = False,
+    shield: bool = False,
 ) -> BenchConfig:
     """Supervisors with one controller on ``seeds`` layouts, from ``seed`` on; by default every supervisor without learning.
 
@@ -47,5 +48,6 @@ def evaluation(
         seeds=seeds,
         workers=workers,
         overwrite=overwrite,
+        shield=shield,
         against=method_key(against, controller),
     )

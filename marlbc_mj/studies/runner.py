@@ -7,10 +7,10 @@ they end.
 import os
 import signal
 from collections import Counter
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, nullcontext
+from contextlib import closing, contextmanager, nullcontext
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.queues import SimpleQueue
@@ -146,7 +146,8 @@ def _pooled(
     context = get_context("spawn")
     stopping, told = context.Event(), context.SimpleQueue()
     with ProcessPoolExecutor(min(workers, len(jobs)), context, _begin_worker, (told, stopping, folder, stop is not None)) as pool:
-        places = {pool.submit(_work, study, job): place for place, job in enumerate(jobs)}
+        with _ctrl_c_later():
+            places = {pool.submit(_work, study, job): place for place, job in enumerate(jobs)}
         waiting = set(places)
         try:
             while waiting:
@@ -158,6 +159,18 @@ def _pooled(
         finally:
             stopping.set()
             _drain(waiting, told, progress)
+
+
+@contextmanager
+def _ctrl_c_later() -> Iterator[None]:
+    """Hold Ctrl-C back while workers are started, which inherit that: during their imports it would be a traceback each."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 def _was_stopped(future: Future[Any]) -> bool:
@@ -200,6 +213,11 @@ def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, folder: Path | None
     _worker = _Worker(watch, stopping, saving)
     if saving:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    except KeyboardInterrupt:  # it came while this process was starting
+        stopping.set()
 
 
 def _work(study: Study[JobT, ResultT], job: JobT) -> ResultT:

@@ -6,14 +6,20 @@ from pathlib import Path
 
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
+from marlbc_mj.supervisors.cbf_qp import CBFQP
+from marlbc_mj.supervisors.fixed import FixedPriority
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.supervisors.fsams import FSAMS
 from marlbc_mj.supervisors.learned import Learned
+from marlbc_mj.supervisors.lookahead import LookAhead
 from marlbc_mj.supervisors.mpcms import MPCMS
 from marlbc_mj.supervisors.one_team import OneTeam, batched
 from marlbc_mj.supervisors.oracle import Oracle
+from marlbc_mj.supervisors.orca import ORCA
+from marlbc_mj.supervisors.rollout import Rollout
 from marlbc_mj.supervisors.scripted import Scripted
+from marlbc_mj.supervisors.set_based_rule import SetBasedRule
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.modules import made, names_attribute
 
@@ -46,15 +52,23 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
     "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
+    "fixed": (FixedPriority, "one priority order for ever, FM (classic null-space control, Antonelli & Chiaverini)"),
+    "set-based-rule": (SetBasedRule, "avoidance on top only while the formation would break the safe distance; per agent"),
+    "lookahead": (LookAhead, "the same, and the column while two lanes of the formation are blocked within 8 s"),
+    "rollout": (Rollout, "the same, and a search over 14 s of when to form the column and go back (Bertsekas)"),
+    "orca": (ORCA, "reciprocal velocity obstacles on the formation's velocity (van den Berg)"),
+    "cbf-qp": (CBFQP, "second-order barrier functions on the reference's acceleration (Ames)"),
 }
 """Factory and one line of description by name."""
 ORACLES = ("oracle", "oracle-schedule")
 """Supervisors whose factories take the name of the controller that the schedule was found with."""
 LEARNED = ("marlms", "rlms")
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
-ON_REQUEST = ("mpcms-mujoco", "oracle-schedule")
+LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "rollout", "orca", "cbf-qp")
+"""Supervisors for layouts that nobody has seen before, to be compared by ``marlbc evaluate``."""
+ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS)
 """Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
-oracle itself where nothing is perturbed."""
+oracle itself where nothing is perturbed, the others are no part of the paper's comparison."""
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
 """Supervisors that nothing was trained for, without those on request."""
 
@@ -86,24 +100,31 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
 
 
 __all__ = [
+    "CBFQP",
     "CHECKPOINT_SUFFIX",
     "FMS",
     "FSAMS",
     "LEARNED",
+    "LOCAL_RIVALS",
     "MPCMS",
     "ON_REQUEST",
+    "ORCA",
     "SUPERVISORS",
     "UNLEARNED",
     "Blend",
     "Decision",
+    "FixedPriority",
     "FuzzyBlend",
     "Layered",
     "Learned",
+    "LookAhead",
     "MotorSchema",
     "OneTeam",
     "OneTeamSupervisor",
     "Oracle",
+    "Rollout",
     "Scripted",
+    "SetBasedRule",
     "Supervisor",
     "batched",
     "carry_out",

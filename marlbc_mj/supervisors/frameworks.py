@@ -8,7 +8,7 @@ the velocity may change, even jump, without one, and no label says that its comp
 Their sources describe other robots and other behaviors. What is read into them here is said at each class.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +25,7 @@ from marlbc_mj.supervisors.neighbors import GiveWay, crowded, give_way
 from marlbc_mj.util.errors import ConfigurationError
 
 _FM, _FR, _OA, _AA = 0, 1, 2, 3
-_LABELS = {"FM": "FM", "FR": "FR", "OA": "OA>FM", "AA": "AA>FM"}
+_LABELS = {"OA": "OA>FM", "AA": "AA>FM"}
 
 
 class Repertoire(NamedTuple):
@@ -44,9 +44,11 @@ def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) 
     Raises:
         ConfigurationError: the scenario lacks one of them.
     """
-    orders = np.array([scenario.orders.index(_LABELS[name]) for name in names])
+    orders = np.array([scenario.orders.index(_LABELS.get(name, name)) for name in names])
     place = [b.name for b in scenario.behaviors]
-    alone = make_behaviors(scenario)._replace(table=np.array([[place.index(name)] for name in names]))
+    alone = make_behaviors(replace(scenario, composition="null-space"))._replace(
+        table=np.array([[place.index(name)] for name in names])
+    )
     return Repertoire(alone, orders, scenario.safe_distance, give_way(scenario), np.zeros(grid_room(scenario)))
 
 

@@ -11,16 +11,15 @@ import numba
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
+from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.laws import allocation_free, compiled, threaded
 from marlbc_mj.core.motion import drift
-from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.composition import Behaviors, compose_team, keep, limit, path_at
+from marlbc_mj.engine.inequalities import workspace_rows
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-
-PAIR_ROOM = WORKSPACE + 1
-"""Rows of two that one pair needs: those of a composition, and a normal."""
 
 
 class CostWeights(NamedTuple):
@@ -65,7 +64,7 @@ class Pairs(NamedTuple):
 class Scratch(NamedTuple):
     """What a pair needs room for."""
 
-    rows: np.ndarray  # (C, PAIR_ROOM, 2)
+    rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.plan.workspace_rows
     velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
     obstacles: np.ndarray  # (C, K, 3 or 5)
     grid: np.ndarray  # (C, room)
@@ -89,9 +88,9 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
             v_r[i, axis] = teams.moving[b, i, axis]
     for k in range(orders.shape[0]):
         keep(behaviors, v_r, before_v)
-        seen = _after(k * duration, teams.obstacles[b], scratch.obstacles[c])
+        seen = extrapolate(k * duration, teams.obstacles[b], scratch.obstacles[c])
         t = (teams.first[b] + k) * duration
-        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c, :WORKSPACE], v_r)
+        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c], v_r)
         limit(behaviors, duration, before_v, v_r)
         for i in range(before.shape[0]):
             for axis in range(2):
@@ -100,7 +99,7 @@ def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
 
 
 @allocation_free
-def _after(t, obstacles, drifted):
+def extrapolate(t, obstacles, drifted):
     """Obstacles after ``t`` [s]: themselves where they are at rest."""
     if obstacles.shape[1] == 3:
         return obstacles
@@ -110,24 +109,31 @@ def _after(t, obstacles, drifted):
 
 @allocation_free
 def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
-    """Cost of the trail (H, N, 2) [m] of pair ``c``.
-
-    The sum over predicted steps and agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale).
-    Slots are those of the desired centroid.
-    """
-    b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
-    now, normal = scratch.rows[c, :2], scratch.rows[c, WORKSPACE]
+    """Cost of the trail (H, N, 2) [m] of pair ``c``: the sum of :func:`add_step_cost` over all predicted steps."""
     cost = 0.0
     for k in range(trail.shape[0]):
-        path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
-        seen = _after((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
-        for i in range(trail.shape[1]):
-            for which in range(2):
-                x = trail[k, i, 0] - now[0, 0] - formations[which, i, 0]
-                y = trail[k, i, 1] - now[0, 1] - formations[which, i, 1]
-                weight = problem.w_formation if which == 0 else problem.w_reconstruction
-                cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
-            cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(trail[k, i], seen, normal))
+        cost = add_step_cost(cost, k, trail[k], c, behaviors, problem, teams, pairs, scratch)
+    return cost
+
+
+@allocation_free
+def add_step_cost(cost, k, at, c, behaviors, problem, teams, pairs, scratch):
+    """``cost`` and what predicted step ``k`` of pair ``c`` adds to it, the team being ``at`` (N, 2) [m] at its end.
+
+    The sum over agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale). Slots are those of the
+    desired centroid.
+    """
+    b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
+    now, normal = scratch.rows[c, :2], scratch.rows[c, 2]
+    path_at((teams.first[b] + k + 1) * duration, behaviors.path, now)
+    seen = extrapolate((k + 1) * duration, teams.obstacles[b], scratch.obstacles[c])
+    for i in range(at.shape[0]):
+        for which in range(2):
+            x = at[i, 0] - now[0, 0] - formations[which, i, 0]
+            y = at[i, 1] - now[0, 1] - formations[which, i, 1]
+            weight = problem.w_formation if which == 0 else problem.w_reconstruction
+            cost += weight * min(1.0, np.sqrt(x * x + y * y) / problem.scale)
+        cost += problem.w_slack * max(0.0, problem.least - nearest_obstacle(at[i], seen, normal))
     return cost
 
 
@@ -172,17 +178,16 @@ def judge_pairs(
         trails = np.empty((count, *pairs.orders.shape[1:], 2))
     costs = np.empty(count)
     scratch = Scratch(
-        np.zeros((count, PAIR_ROOM, 2)),
+        np.zeros((count, workspace_rows(scenario), 2)),
         np.zeros((count, 2, scenario.agents, 2)),
         np.zeros((count, *teams.obstacles.shape[1:])),
         np.zeros((count, grid_room(scenario))),
     )
     arguments = kinematic, behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
-    if threads == 1 or count == 1:
-        _judge_serial(*arguments)
-    else:
-        numba.set_num_threads(threads)
+    if count > 1 and threads_usable(threads):
         _judge_parallel(*arguments)
+    else:
+        _judge_serial(*arguments)
     return costs, trails
 
 

@@ -19,6 +19,12 @@ class SimulationError(MarlbcError, RuntimeError):
     exit_status = 3
 
 
+class NoSpaceError(ConfigurationError):
+    """An output that the disk has no room for: the command was right, what it was to leave is missing. Exit status 3."""
+
+    exit_status = 3
+
+
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
     """The error for a name that is not in a list: says which one and shows the list."""
     return ConfigurationError(f"unknown {kind} {name!r}; choose from: {', '.join(valid)}")

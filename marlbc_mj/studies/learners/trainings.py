@@ -198,6 +198,11 @@ def _observer(job: TrainingJob, watch: Watch) -> Callable[[Any, Mapping[str, flo
     return observe
 
 
+def failed_runs(study: LearnerStudy) -> list[str]:
+    """Names of the runs of a study that failed the last time they were tried."""
+    return [job.key for job in study.jobs() if (job.folder / FAILED_MARK).is_file()]
+
+
 def _trained(folder: Path) -> str | None:
     """Hash of the configuration that the folder's run finished with, or goes on with."""
     if (folder / DONE_MARK).is_file():

@@ -1,0 +1,124 @@
+"""Which references of limited acceleration keep inequality tasks possible: those from which braking straight stays clear.
+
+An agent's *way* is the straight line that it makes until it rests, if it brakes from the next mission step on. A velocity is
+admissible if its way keeps d_OA + m from every obstacle at rest, and if it and the way of every other agent keep d_AA + m between
+any two of their points. What is left of a way after one mission step lies within the way that was foreseen. So who brakes stays
+admissible: from an admissible state there always is an admissible velocity, whatever the wishes are.
+
+For one obstacle and T -> 0, |v| max(0, -n . v) <= 2 A (d - d_OA - m) is enough. The distance to a convex body is convex along a
+line, so at the end of the way and before it is at least d + n . v |v| / (2 A).
+"""
+
+import numpy as np
+
+from marlbc_mj.core.laws import allocation_free
+
+BISECTIONS = 8
+"""Halvings of the change of velocity, where all of it cannot be had."""
+
+
+@allocation_free
+def restrain(i, before, barrier, at, obstacles, v_r):
+    """Change the wish ``v_r[i]`` of agent ``i`` to an admissible velocity that the acceleration limit allows, in place.
+
+    Of the velocities between braking and the limited wish it is one far towards the wish, found by bisection. Agents choose one
+    after the other: i knows what those before it chose, and those behind it can still brake from the velocity that they have.
+    Obstacles that move bound the wish alone (:mod:`marlbc_mj.core.barriers`); nothing is promised for them.
+
+    Args:
+        i: agent.
+        before: (2,) its velocity in the mission step before [m/s].
+        barrier: see :class:`marlbc_mj.core.barriers.Barrier`, with a finite ``braking``.
+        at: (N, 2) [m].
+        obstacles: (K, 3) x, y, radius [m]; (K, 5) where they move.
+        v_r: (N, 2) [m/s], new for the agents before i, and that of the mission step before for those behind it.
+    """
+    brake_x, brake_y = brake(before[0], before[1], barrier)
+    x, y = v_r[i, 0] - before[0], v_r[i, 1] - before[1]
+    change, most = np.sqrt(x * x + y * y), barrier.braking * barrier.duration
+    part = most / change if change > most else 1.0
+    x, y = before[0] + part * x - brake_x, before[1] + part * y - brake_y
+    share, step, found = 1.0, 0.5, 0.0
+    for _ in range(1 + BISECTIONS):
+        if stays_clear(i, brake_x + share * x, brake_y + share * y, brake_x, brake_y, barrier, at, obstacles, v_r):
+            found = share
+            if share == 1.0:
+                break
+            share += step
+        else:
+            share -= step
+        step *= 0.5
+    v_r[i, 0], v_r[i, 1] = brake_x + found * x, brake_y + found * y
+
+
+@allocation_free
+def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
+    """Whether the way of agent ``i`` with velocity (x, y) keeps all distances, or as much of them as if it braked.
+
+    ``brake_x``, ``brake_y`` [m/s] is the velocity if it brakes; the rest as in :func:`restrain`.
+    """
+    time, brake_time = stopping_time(x, y, barrier), stopping_time(brake_x, brake_y, barrier)
+    a, b, c, d = time * x, time * y, brake_time * brake_x, brake_time * brake_y
+    length = np.sqrt(a * a + b * b)
+    if barrier.obstacle_distance > 0.0 and obstacles.shape[1] == 3:
+        for k in range(obstacles.shape[0]):
+            r_x, r_y = at[i, 0] - obstacles[k, 0], at[i, 1] - obstacles[k, 1]
+            least = barrier.obstacle_distance + barrier.margin + obstacles[k, 2]
+            if r_x * r_x + r_y * r_y < (least + length) ** 2:
+                gap = least_distance(r_x, r_y, a, b, 0.0, 0.0)
+                if gap < least and gap < least_distance(r_x, r_y, c, d, 0.0, 0.0):
+                    return False
+    if barrier.agent_distance > 0.0:
+        least = barrier.agent_distance + barrier.margin
+        for j in range(at.shape[0]):
+            if j == i:
+                continue
+            v_x, v_y = (v_r[j, 0], v_r[j, 1]) if j < i else brake(v_r[j, 0], v_r[j, 1], barrier)
+            other_time = stopping_time(v_x, v_y, barrier)
+            e, f = other_time * v_x, other_time * v_y
+            r_x, r_y = at[i, 0] - at[j, 0], at[i, 1] - at[j, 1]
+            if r_x * r_x + r_y * r_y < (least + length + np.sqrt(e * e + f * f)) ** 2:
+                gap = least_distance(r_x, r_y, a, b, e, f)
+                if gap < least and gap < least_distance(r_x, r_y, c, d, e, f):
+                    return False
+    return True
+
+
+@allocation_free
+def stopping_time(x, y, barrier):
+    """L(s) / s [s], where L(s) = (s + A T / 2)^2 / (2 A) is the length of the way from a velocity (x, y) of speed s.
+
+    The reference holds s for a mission step T and then loses A T in every step. L(s) - s T >= L(s - A T): ways are nested.
+    For T -> 0, L is s^2 / (2 A).
+    """
+    speed, half = np.sqrt(x * x + y * y), 0.5 * barrier.braking * barrier.duration
+    return (speed + half) ** 2 / (2.0 * barrier.braking * speed) if speed > 0.0 else 0.0
+
+
+@allocation_free
+def brake(x, y, barrier):
+    """The velocity (x, y) [m/s] one mission step later if it brakes straight."""
+    speed, loss = np.sqrt(x * x + y * y), barrier.braking * barrier.duration
+    factor = 1.0 - loss / speed if speed > loss else 0.0
+    return factor * x, factor * y
+
+
+@allocation_free
+def least_distance(x, y, a, b, c, d):
+    """Least |(x, y) + s (a, b) - t (c, d)| over s and t in [0, 1]: how near any points of two ways are to each other.
+
+    (x, y) is from where the second begins to where the first begins, (a, b) and (c, d) are the two ways [m].
+    """
+    cross = a * d - b * c
+    if cross != 0.0 and 0.0 <= (c * y - d * x) / cross <= 1.0 and 0.0 <= (a * y - b * x) / cross <= 1.0:
+        return 0.0
+    along_first = min(_from_origin(x, y, a, b), _from_origin(x - c, y - d, a, b))
+    return min(along_first, _from_origin(x, y, -c, -d), _from_origin(x + a, y + b, -c, -d))
+
+
+@allocation_free
+def _from_origin(x, y, a, b):
+    """Distance of the segment from (x, y) to (x + a, y + b) from the origin."""
+    square = a * a + b * b
+    s = min(max(-(x * a + y * b) / square, 0.0), 1.0) if square > 0.0 else 0.0
+    return np.sqrt((x + s * a) ** 2 + (y + s * b) ** 2)

@@ -1,0 +1,103 @@
+"""A log as a recording of Rerun, whose viewer shows of an MCAP only what it has decoders for: plots, events and a scene in 3D.
+
+The package ``rerun-sdk`` is optional.
+"""
+
+from importlib import import_module
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.palette import agent_color
+
+TIMELINE = "mission"
+"""Name of the mission's clock."""
+HEIGHT = 1.2  # of an obstacle in the scene [m]
+RADIUS = 0.25  # of an agent, and of an obstacle that is a point [m]
+PAIRS = {"state": ("position", "velocity"), "reference": ("reference", "reference_velocity"), "force": ("force",)}
+"""Fields of a log with two axes, by the topic under which the MCAP has them."""
+
+
+def write_rerun(log: EpisodeLog, stream: BinaryIO) -> None:
+    """Write a recording: ``/state``, ``/reference``, ``/force``, ``/metrics`` and ``/priorities`` by agent, and ``/scene``.
+
+    Raises:
+        ConfigurationError: ``rerun-sdk`` is not installed.
+    """
+    try:
+        rerun: Any = import_module("rerun")
+    except ImportError as error:
+        raise ConfigurationError("a recording for Rerun needs its package: pip install rerun-sdk") from error
+    recording = rerun.RecordingStream("marlbc", recording_id=f"{log.scenario}-{log.supervisor}-{log.controller}-{log.seed}")
+    sink = recording.binary_stream()
+    _write_plots(rerun, recording, log)
+    _write_priorities(rerun, recording, log)
+    _write_scene(rerun, recording, log)
+    stream.write(sink.read())
+
+
+def _write_plots(rerun: Any, recording: Any, log: EpisodeLog) -> None:
+    """Numbers over the mission's time, a plot per agent and field."""
+    for topic, fields in PAIRS.items():
+        for field in fields:
+            values = getattr(log, field)
+            for i in range(values.shape[1]):
+                _plot(rerun, recording, f"{topic}/agent{i + 1}/{field}", log.time, values[:, i], ("x", "y"))
+    for i in range(log.clearance.shape[1]):
+        _plot(rerun, recording, f"metrics/agent{i + 1}/clearance", log.time, log.clearance[:, i, None], ("clearance",))
+    for field in ("formation", "reward", "decision_ms"):
+        _plot(rerun, recording, f"metrics/{field}", log.time, getattr(log, field)[:, None], (field,))
+
+
+def _plot(rerun: Any, recording: Any, entity: str, time: np.ndarray, values: np.ndarray, names: tuple[str, ...]) -> None:
+    """Values (M, C) under ``entity``; moments at which one is not finite are left out."""
+    finite = np.isfinite(values).all(axis=1)
+    recording.log(entity, rerun.SeriesLines(names=names), static=True)
+    columns = rerun.Scalars.columns(scalars=values[finite].astype(np.float64).ravel())
+    recording.send_columns(entity, [_clock(rerun, time[finite])], columns.partition(np.full(finite.sum(), len(names))))
+
+
+def _clock(rerun: Any, time: np.ndarray) -> Any:
+    return rerun.TimeColumn(TIMELINE, duration=time)
+
+
+def _write_priorities(rerun: Any, recording: Any, log: EpisodeLog) -> None:
+    """Every agent's command as a text where it changes, and as a plot of its index."""
+    for i in range(log.command.shape[1]):
+        entity, commands = f"priorities/agent{i + 1}", log.command[:, i]
+        changed = np.flatnonzero(np.diff(commands, prepend=-1))
+        texts = [log.commands[k] for k in commands[changed]]
+        recording.send_columns(f"{entity}/command", [_clock(rerun, log.time[changed])], rerun.TextLog.columns(text=texts))
+        _plot(rerun, recording, f"{entity}/index", log.time, commands[:, None], ("command",))
+
+
+def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
+    """Agents and references as balls that move, their paths, and the obstacles where they are at every moment."""
+    steps, agents = log.position.shape[:2]
+    colors = [[round(255 * part) for part in agent_color(i)] for i in range(agents)]
+    for name, places, radius in (("agents", log.position, RADIUS), ("references", log.reference, 0.5 * RADIUS)):
+        recording.log(f"scene/{name}", rerun.Points3D.from_fields(colors=colors, radii=radius), static=True)
+        raised = np.concatenate([places, np.full((*places.shape[:2], 1), RADIUS)], axis=2).reshape(-1, 3)
+        columns = rerun.Points3D.columns(positions=raised).partition(np.full(steps, agents))
+        recording.send_columns(f"scene/{name}", [_clock(rerun, log.time)], columns)
+    strips = [np.column_stack([log.position[:, i], np.zeros(steps)]) for i in range(agents)]
+    recording.log("scene/paths", rerun.LineStrips3D(strips, colors=colors), static=True)
+    if not len(log.obstacles):
+        return
+    places = np.array([log.obstacles_at(float(time)) for time in (log.time if len(log.motions) else log.time[:1])])
+    radii = np.maximum(places[0, :, 2], RADIUS)
+    cylinders = rerun.Cylinders3D(lengths=np.full(len(radii), HEIGHT), radii=radii, centers=_upright(places[0]))
+    recording.log("scene/obstacles", cylinders, static=not len(log.motions))
+    if len(log.motions):
+        recording.log("scene/obstacles", rerun.Cylinders3D(lengths=np.full(len(radii), HEIGHT), radii=radii), static=True)
+        columns = rerun.Cylinders3D.columns(centers=_upright(places)).partition(np.full(steps, len(radii)))
+        recording.send_columns("scene/obstacles", [_clock(rerun, log.time)], columns)
+
+
+def _upright(places: np.ndarray) -> np.ndarray:
+    """(..., 3) x, y, radius as the middles (P, 3) of cylinders that stand on the ground [m]."""
+    middles = places.reshape(-1, 3).copy()
+    middles[:, 2] = 0.5 * HEIGHT
+    return middles

@@ -1,0 +1,181 @@
+"""Does any force lead out of the shield's safe set? Random states on its edge, hostile wishes, and f where it hurts most.
+
+``python -m marlbc_mj.studies.shield_states [STATES]`` tries 10^7 states by default, and two shields that are wrong on purpose.
+"""
+
+import sys
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.core.laws import compiled
+from marlbc_mj.core.shield import (
+    ForceBound,
+    ShieldCounts,
+    ShieldNumbers,
+    ShieldView,
+    force_bound,
+    gap_to,
+    retreat_drift,
+    shield_team,
+    stopping_distance,
+)
+
+ROUNDING = 1e-9  # [m]
+
+
+class Trial(NamedTuple):
+    """A plant, and what its shield believes of it."""
+
+    bound: ForceBound  # of f
+    speed_cap: float  # [m/s]
+    force_limit: float = 200.0  # [N]
+    mass: float = 1.0  # [kg]
+    substep: float = 0.005  # [s]
+    things: int = 1  # obstacles and neighbors that press at once, at most
+    believed: ForceBound | None = None  # None: the bound itself
+    believed_force: float | None = None  # None: the limit itself [N]
+
+    def numbers(self) -> ShieldNumbers:
+        """The shield's: it keeps 0.5 m from obstacles and 1 m between agents."""
+        believed = self.bound if self.believed is None else self.believed
+        force = self.force_limit if self.believed_force is None else self.believed_force
+        return ShieldNumbers(force, force, self.mass, *believed, self.speed_cap, 0.5, 1.0, 0.0)
+
+    def truth(self) -> ShieldNumbers:
+        """The plant's."""
+        return self._replace(believed=None, believed_force=None).numbers()
+
+
+def leave_rate(trial: Trial, states: int, seed: int = 0) -> float:
+    """Share of random states on the edge of S that one substep leads out of it.
+
+    With several things the :func:`drift` of a retreat is let pass, which the margin of a shield leaves room for.
+    """
+    return float(_leave_rate(trial.numbers(), trial.truth(), trial.substep, trial.things, states, np.random.default_rng(seed)))
+
+
+@compiled
+def _leave_rate(numbers, truth, h, things, states, rng):
+    left, agents, obstacles = 0, 2, np.zeros((max(things - 1, 1), 3))
+    p, v, stopping, force = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
+    last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, 3))
+    view = ShieldView(h, p, v, v, obstacles, stopping)
+    counts = ShieldCounts(interventions, change, breaches)
+    for _ in range(states):
+        _draw_state(rng, numbers, h, things, view)
+        for i in range(agents):
+            _draw_wish(rng, numbers, view, i, force[i])
+        shield_team(numbers, view, last, force, counts)
+        allowed = ROUNDING
+        if things > 1:
+            for i in range(agents):
+                allowed += retreat_drift(truth, h, np.sqrt(v[i, 0] ** 2 + v[i, 1] ** 2))
+        for i in range(agents):
+            _push(rng, numbers, truth, view, i, force[i])
+        for i in range(agents):
+            for axis in range(2):
+                p[i, axis] += h * v[i, axis]
+        left += _is_outside(numbers, view, allowed)
+    return left / states
+
+
+@compiled
+def _draw_state(rng, numbers, h, things, view):
+    """Two agents and obstacles, all with a gap that is 0 or small: the edge of S. Speeds of every size."""
+    for i in range(2):
+        speed = min(numbers.speed_cap * rng.random() ** rng.integers(1, 5), numbers.speed_cap)
+        if rng.random() < 0.1:
+            speed = 3.0 * h * numbers.force_limit / numbers.mass * rng.random()
+        angle = 2.0 * np.pi * rng.random()
+        view.v[i, 0], view.v[i, 1] = speed * np.cos(angle), speed * np.sin(angle)
+        view.stopping[i] = stopping_distance(numbers, speed)
+    far = 1e6
+    alone = things == 1 and rng.random() < 0.5
+    _place(rng, view.p[1], view, -1.0 if alone else far if things == 1 else -1.0, 1.0 + view.stopping[0] + view.stopping[1])
+    for k in range(view.obstacles.shape[0]):
+        radius = 0.0 if rng.random() < 0.3 else 5.0 * rng.random()
+        _place(rng, view.obstacles[k], view, far if alone else -1.0, radius + 0.5 + view.stopping[0])
+        view.obstacles[k, 2] = radius
+    if things > 1:  # the second agent must be in S as well
+        for k in range(view.obstacles.shape[0]):
+            if gap_to(numbers, view, 1, k)[0] < 0.0:
+                view.obstacles[k, 0] = far
+
+
+@compiled
+def _place(rng, out, view, far, least):
+    """A place at the distance ``least`` from the first agent, which is at the origin, or a little more; or ``far``."""
+    view.p[0, 0] = view.p[0, 1] = 0.0
+    gap = 0.0 if rng.random() < 0.5 else 0.1 * rng.random() ** 4
+    distance = far if far > 0.0 else least + gap
+    angle = 2.0 * np.pi * rng.random()
+    if rng.random() < 0.5:  # ahead
+        angle = np.arctan2(view.v[0, 1], view.v[0, 0]) + 0.3 * (rng.random() - 0.5)
+    out[0], out[1] = distance * np.cos(angle), distance * np.sin(angle)
+
+
+@compiled
+def _draw_wish(rng, numbers, view, i, force):
+    """A force of any size up to twice the limit, often straight at a thing."""
+    size, angle = 2.0 * numbers.force_limit * rng.random(), 2.0 * np.pi * rng.random()
+    k = rng.integers(0, view.obstacles.shape[0] + 2)
+    force[0], force[1] = size * np.cos(angle), size * np.sin(angle)
+    if k != view.obstacles.shape[0] + i and rng.random() < 0.7:
+        _, normal_x, normal_y = gap_to(numbers, view, i, k)
+        force[0], force[1] = -size * normal_x, -size * normal_y
+
+
+@compiled
+def _push(rng, numbers, truth, view, i, force):
+    """v+ of agent ``i``: actuators are as weak as they are, and f is at its bound, where it hurts most, or anywhere."""
+    per = view.h / truth.mass
+    for axis in range(2):
+        force[axis] *= truth.force_limit / numbers.force_limit
+    speed = np.sqrt(view.v[i, 0] ** 2 + view.v[i, 1] ** 2)
+    x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
+    angle = 2.0 * np.pi * rng.random()
+    towards_x, towards_y = np.cos(angle), np.sin(angle)
+    k = rng.integers(0, view.obstacles.shape[0] + 2)
+    if k != view.obstacles.shape[0] + i and rng.random() < 0.8:
+        _, normal_x, normal_y = gap_to(numbers, view, i, k)
+        centre = view.h * (truth.force_limit - force_bound(truth, speed)) / truth.mass
+        away_x, away_y = x - centre * normal_x, y - centre * normal_y
+        distance = np.sqrt(away_x**2 + away_y**2)
+        if distance > 0.0:
+            towards_x, towards_y = away_x / distance, away_y / distance
+    view.v[i, 0] = x + per * force_bound(truth, speed) * towards_x
+    view.v[i, 1] = y + per * force_bound(truth, speed) * towards_y
+
+
+@compiled
+def _is_outside(numbers, view, allowed):
+    for i in range(2):
+        view.stopping[i] = stopping_distance(numbers, np.sqrt(view.v[i, 0] ** 2 + view.v[i, 1] ** 2))
+    for i in range(2):
+        if np.sqrt(view.v[i, 0] ** 2 + view.v[i, 1] ** 2) > numbers.speed_cap + ROUNDING:
+            return True
+        for k in range(view.obstacles.shape[0] + 2):
+            if k != view.obstacles.shape[0] + i and gap_to(numbers, view, i, k)[0] < -allowed:
+                return True
+    return False
+
+
+def report_states() -> None:
+    """Print how many states were left, for the shield and for two wrong ones."""
+    states = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10_000_000
+    drag = ForceBound(linear=5.0 * float(np.sqrt(2.0)))
+    right = Trial(drag, speed_cap=14.0)
+    trials = {
+        "drag x 5, one thing": right,
+        "drag x 5, four things": right._replace(things=4),
+        "wind of 20 N, one thing": right._replace(bound=ForceBound(20.0, 1.0)),
+        "wrong: brakes 10 % too strong": right._replace(believed_force=1.1 * right.force_limit),
+        "wrong: half of the bound": right._replace(believed=ForceBound(linear=0.5 * drag.linear)),
+    }
+    for name, trial in trials.items():
+        print(f"{name}: {leave_rate(trial, states):.3g} of {states} states left", flush=True)
+
+
+if __name__ == "__main__":
+    report_states()

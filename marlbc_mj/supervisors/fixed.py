@@ -1,0 +1,31 @@
+"""Classic null-space-based control (Antonelli & Chiaverini 2006): one priority order for the whole mission, nobody decides."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.scenarios import Scenario
+
+
+@dataclass(frozen=True)
+class FixedPriority:
+    """The same ``order`` for every agent, for ever.
+
+    FM alone ignores obstacles under (12). OA>FM forbids every motion along the line to the nearest obstacle, however far that one
+    is (erratum 6): the team stops. Both are why somebody has to decide.
+    """
+
+    order: str = "FM"  # a priority order, or the command it gives
+
+    def start(self, scenario: Scenario, teams: int) -> np.ndarray:
+        """(B, N) the orders of all mission steps.
+
+        Raises:
+            ConfigurationError: the scenario has no such order.
+        """
+        return np.full((teams, scenario.agents), scenario.orders.index(self.order))
+
+    def decide(self, observation: Observation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The order, again."""
+        return memory.copy(), memory

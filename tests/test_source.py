@@ -1,0 +1,71 @@
+"""What every source file keeps: few arguments, names instead of indices, no silenced tools without need."""
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+from test_layers import ROOT, sources
+
+MOST_PARAMETERS = 9
+MOST_BODY = 60  # lines
+MOST_IGNORES = 20
+NAMED = ("gains", "params", "state", "limits", "senses", "settings")
+"""Arguments of laws whose entries have names."""
+COMPILED = {"allocation_free", "behavior", "compiled", "controller", "disturbance", "drive", "inlined", "reading", "threaded"}
+"""Decorators of laws and of what they call."""
+
+
+def crowded(path: Path) -> list[str]:
+    """``file: function`` for functions with too many parameters or too long a body."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            own = node.args
+            count = len(own.posonlyargs) + len(own.args) + len(own.kwonlyargs)
+            body = node.body[1:] if ast.get_docstring(node) and len(node.body) > 1 else node.body
+            if count > MOST_PARAMETERS or (node.end_lineno or 0) - body[0].lineno + 1 > MOST_BODY:
+                found.append(f"{path.name}: {node.name}")
+    return found
+
+
+def test_functions_are_short_and_take_few_arguments() -> None:
+    assert [entry for path in sources(ROOT) for entry in crowded(path)] == []
+
+
+@pytest.mark.parametrize("text", ["def f(a, b, c, d, e, f, g, h, i, j): ...", "def f():\n" + "    x = 1\n" * 61])
+def test_a_planted_crowd_is_found(tmp_path: Path, text: str) -> None:
+    (tmp_path / "planted.py").write_text(text)
+    assert crowded(tmp_path / "planted.py") == ["planted.py: f"]
+
+
+def indexed(text: str) -> list[str]:
+    """Laws in a source text that read an entry with a name by a literal index; none in a text that is only a signature."""
+    try:
+        tree = ast.parse(text)
+    except SyntaxError:
+        return []
+    functions = [node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)]
+    laws = [node for node in functions if any(set(re.findall(r"\w+", ast.unparse(d))) & COMPILED for d in node.decorator_list)]
+    return [law.name for law in laws for node in ast.walk(law) if isinstance(node, ast.Subscript) and literal(node)]
+
+
+def literal(node: ast.Subscript) -> bool:
+    """Whether it is ``gains[3]`` or ``state[_TAU]``."""
+    index = node.slice
+    constant = isinstance(index, ast.Constant) or (isinstance(index, ast.Name) and index.id.isupper())
+    return isinstance(node.value, ast.Name) and node.value.id in NAMED and constant
+
+
+def test_laws_read_names_instead_of_indices() -> None:
+    """In the library, in the how-tos and in the README."""
+    pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
+    blocks = [block for page in pages for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
+    assert [name for text in (*(path.read_text() for path in sources(ROOT)), *blocks) for name in indexed(text)] == []
+    assert indexed("@laws.controller\ndef law(params, state): return params[3]") == ["law"]
+
+
+def test_few_lines_are_silenced() -> None:
+    text = "\n".join(path.read_text() for path in sources(ROOT))
+    assert "fmt: skip" not in text and "fmt: off" not in text
+    assert text.count("type: ignore") < MOST_IGNORES
