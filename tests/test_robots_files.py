@@ -353,8 +353,10 @@ def test_an_include_cannot_be_hidden_from_the_check(write):
     """Not between what looks like a comment, and not in what only MuJoCo would read."""
     with pytest.raises(ConfigurationError, match="outside its folder: ../secret.xml"):
         make_robot(write(cart(head=HIDDEN)))
+    with pytest.raises(ConfigurationError, match="outside its folder: ../secret.xml"):
+        make_robot(write(cart(head='<![CDATA[<!--]]><include file="../secret.xml"/><!-- -->')))
     with pytest.raises(ConfigurationError, match="is no MJCF that MuJoCo reads"):
-        make_robot(write(cart(head='<![CDATA[<!--]]><include file="../secret.xml"/>')))
+        make_robot(write('<!DOCTYPE mujoco [<!ENTITY a "../secret.xml">]>' + cart(head='<include file="&a;"/>')))
 
 
 BOMBS = {

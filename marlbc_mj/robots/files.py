@@ -98,14 +98,14 @@ def _parse(path: Path, here: Path) -> ElementTree.Element:
         raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {here.name}: {one_line(error)}") from error
 
 
-_TOKEN = re.compile(r"""<!--.*?-->|<\?.*?\?>|<!|<(?:[^>"']|"[^"]*"|'[^']*')*>|[^<]+""", re.DOTALL)
+_TOKEN = re.compile(r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<!|<(?:[^>"']|"[^"]*"|'[^']*')*>|[^<]+""", re.DOTALL)
 
 
 def _strict(text: str) -> str:
     """XML as MuJoCo's parser takes it in words that Python's takes: comments may hold ``--``, values ``<`` and ``&``.
 
     Raises:
-        ValueError: a part that is neither a tag, a comment nor text between them.
+        ValueError: a part that is neither a tag, a comment nor text; a document type, for example.
     """
     out, at = [], 0
     for token in _TOKEN.finditer(text):
@@ -113,7 +113,7 @@ def _strict(text: str) -> str:
         if token.start() != at or part == "<!":
             break
         at = token.end()
-        if part.startswith("<!--") or part.startswith("<?") or not part.startswith("<"):
+        if part.startswith(("<!", "<?")) or not part.startswith("<"):
             continue  # nothing of an MJCF is in texts between tags
         out.append("<" + re.sub("&(?!#?\\w+;)", "&amp;", part[1:].replace("<", "&lt;")))
     if at != len(text):

@@ -1,7 +1,7 @@
 """A user's MJCF in the form that a team's world takes: one text, complete in itself, in which everything that matters is named.
 
 What plain MuJoCo loads is loaded; what the text means is not changed. Files that it uses become part of it, frames are resolved,
-keyframes and lights are left out, and names get no slash, which dm_control keeps for itself.
+keyframes, lights, skins and custom texts are left out, and names get no slash, which dm_control keeps for itself.
 """
 
 import subprocess
@@ -63,7 +63,7 @@ def _standard_text(path: Path, changed: int, size: int) -> str:
             spec.copy().compile()
         except (ValueError, FileNotFoundError, mujoco.FatalError) as error:
             raise ConfigurationError(f"{path} {_blame(error)}: {one_line(error)}") from error
-        for element in [*spec.lights, *spec.keys, *spec.skins]:
+        for element in [*spec.lights, *spec.keys, *spec.skins, *spec.tuples, *spec.texts]:
             spec.delete(element)
         try:
             embed(spec)
