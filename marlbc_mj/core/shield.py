@@ -106,6 +106,14 @@ class ShieldNumbers(NamedTuple):
     slack: float = 0.0  # part of the margin that drifts may use up before the state counts as outside S [m]
 
 
+_RECORD = np.dtype((np.record, [(name, np.float64) for name in ShieldNumbers._fields]))
+
+
+def as_records(numbers: ShieldNumbers) -> np.ndarray:
+    """(1,) records with the same fields: a loop over threads takes arrays within a named tuple, but no named tuple."""
+    return np.array([tuple(numbers)], dtype=_RECORD)
+
+
 NO_SHIELD = ShieldNumbers(0.0, np.inf, 1.0, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)
 
 

@@ -21,7 +21,7 @@ from marlbc_mj.core.imperfections import sense, weaken
 from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
-from marlbc_mj.core.shield import ShieldCounts, ShieldNumbers, ShieldView, shield_team
+from marlbc_mj.core.shield import ShieldCounts, ShieldView, shield_team
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
@@ -60,7 +60,7 @@ class Plant(NamedTuple):
     loss: float  # share of the force that is lost
     loss_agent: float  # whose; negative: everybody's
     loss_start: float  # from then on [s]
-    shield: ShieldNumbers  # what it assumes and keeps, where the team has one
+    shield: np.ndarray  # (1,) records of ShieldNumbers: what a shield assumes and keeps, where the team has one
 
 
 class Native(NamedTuple):
@@ -241,7 +241,7 @@ def shield_forces(b, h, plant, team):
         p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
         view = ShieldView(h, p, v, team.velocity[b], team.obstacles[b], team.stopping[b])
         counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
-        shield_team(plant.shield, view, team.last_substep[b], team.force[b], counts)
+        shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
 
 
 @inlined

@@ -12,7 +12,7 @@ from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
-from marlbc_mj.core.shield import NO_SHIELD, Shield, ShieldNumbers
+from marlbc_mj.core.shield import NO_SHIELD, Shield, ShieldNumbers, as_records
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
@@ -178,7 +178,7 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
         robot_params=np.tile(make_robot(scenario.robot).params_row(), (scenario.agents, 1)),
         controller_params=_padded([params])[0],
         unit_force=float(scenario.unit_force),
-        shield=shield,
+        shield=as_records(shield),
         **{name: float(value) for name, value in scenario.imperfections.params()._asdict().items()},
     )
 

@@ -77,7 +77,7 @@ def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarra
     draw = plan.scenario.draw(rng)
     _check_solid(plan, draw.obstacles)
     if plan.shielded:
-        check_start(plan.plant.shield, draw.starts, draw.obstacles)
+        check_start(plan.plant.shield[0], draw.starts, draw.obstacles)
     team.obstacles[b, :, :3] = draw.obstacles
     if team.motions.shape[1]:
         team.anchors[b], team.motions[b] = draw.obstacles, draw.motions
