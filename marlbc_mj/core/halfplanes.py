@@ -15,7 +15,7 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free
 
 PARALLEL = 1e-12  # sine below which two borders are parallel
-_NEGLIGIBLE = 1e-12  # violation that counts as none [m/s]
+ROUND_OFF = 1e-12  # violation that counts as none [m/s]
 MEETING = 1e-10  # by which borders may miss each other and still meet [m/s]
 RELAXATION = 1e-9  # beyond the least violation, so that rounding leaves something feasible [m/s]
 
@@ -64,7 +64,7 @@ def _least_violation(planes, first, end, speed, v):
     least = 0.0
     for i in range(first, end):
         violation = planes[i, 2] - planes[i, 0] * v[0] - planes[i, 1] * v[1]
-        if violation <= least + _NEGLIGIBLE:
+        if violation <= least + ROUND_OFF:
             continue
         x, y = v[0], v[1]
         if not _insert(planes[i], planes, i, first, i, speed, v):
@@ -86,7 +86,7 @@ def _insert(goal, planes, stop, first, most, speed, v):
         v[0], v[1] = speed * goal[0], speed * goal[1]
     for k in range(stop):
         x, y, bound = _border(planes, k, first, most)
-        if x * v[0] + y * v[1] < bound - _NEGLIGIBLE and not _on_border(goal, planes, k, first, most, speed, v):
+        if x * v[0] + y * v[1] < bound - ROUND_OFF and not _on_border(goal, planes, k, first, most, speed, v):
             return False
     return True
 
