@@ -257,4 +257,4 @@ class World:
 
     @property
     def _recording(self) -> bool:
-        return self._record.force.shape[1] > 0
+        return bool(self._record.force.shape[1] > 0)
