@@ -31,6 +31,8 @@ def entities(path: Path) -> dict[str, dict[str, Any]]:
     for each in chunk.RrdReader(str(path)).stream():
         batch = each.to_record_batch()
         for name in batch.schema.names:
+            if name.startswith("RecordingInfo"):
+                continue  # when the recording was made
             column = batch.column(name)
             found.setdefault(each.entity_path, {})[name] = column.to_numpy() if name == "mission" else column.to_pylist()
     return found

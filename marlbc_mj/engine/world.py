@@ -215,7 +215,7 @@ class World:
 
     def _serial(self) -> bool:
         """Whether one thread does it all; otherwise numba has been told how many there are."""
-        return self.worlds == 1 or not bool(threads_usable(self.threads))
+        return bool(self.worlds == 1 or not threads_usable(self.threads))
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""

@@ -88,12 +88,13 @@ def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
         return
     places = np.array([log.obstacles_at(float(time)) for time in (log.time if len(log.motions) else log.time[:1])])
     radii = np.maximum(places[0, :, 2], RADIUS)
-    cylinders = rerun.Cylinders3D(lengths=np.full(len(radii), HEIGHT), radii=radii, centers=_upright(places[0]))
-    recording.log("scene/obstacles", cylinders, static=not len(log.motions))
-    if len(log.motions):
-        recording.log("scene/obstacles", rerun.Cylinders3D(lengths=np.full(len(radii), HEIGHT), radii=radii), static=True)
-        columns = rerun.Cylinders3D.columns(centers=_upright(places)).partition(np.full(steps, len(radii)))
-        recording.send_columns("scene/obstacles", [_clock(rerun, log.time)], columns)
+    shape = {"lengths": np.full(len(radii), HEIGHT), "radii": radii}
+    if not len(log.motions):
+        recording.log("scene/obstacles", rerun.Cylinders3D(**shape, centers=_upright(places[0])), static=True)
+        return
+    recording.log("scene/obstacles", rerun.Cylinders3D.from_fields(**shape), static=True)
+    columns = rerun.Cylinders3D.columns(centers=_upright(places)).partition(np.full(steps, len(radii)))
+    recording.send_columns("scene/obstacles", [_clock(rerun, log.time)], columns)
 
 
 def _upright(places: np.ndarray) -> np.ndarray:
