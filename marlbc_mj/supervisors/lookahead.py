@@ -4,6 +4,10 @@ A *lane* is the way of an FM slot along the path. It is blocked while the slot, 
 ``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the
 column while at least ``blocked`` lanes are blocked: one agent can go around, several cannot at once.
 
+It looks at the formation's lanes and not at the column: with the default ``behind`` the team opens up while its last agent may
+still be between the walls of a long passage. Under the set-based composition that agent waits; under (12) it does not, and
+``behind`` has to cover the length of formation and column (corridor: 0 of 40 layouts with 2 s).
+
 The order in which an agent avoids comes from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published
 composition FM and FR alone would run into whatever is in the way. Under the set-based composition it is FM or FR alone.
 """
