@@ -71,6 +71,7 @@ class World:
             raise ConfigurationError(f"threads must be between 1 and {most} on this machine, got {threads}")
         self.plan = make_plan(scenario, controller or SORLC(), shield)
         self.scenario = scenario
+        self.shield = shield
         self.worlds = worlds
         self.threads = threads
         self.native = self.plan.native if native is None else native
@@ -86,7 +87,7 @@ class World:
     def __getstate__(self) -> dict[str, Any]:
         """What a copy or a pickle holds: the settings, and the state of all worlds. Addresses are nobody else's business."""
         options = {"worlds": self.worlds, "threads": self.threads, "record": self._recording, "native": self.native}
-        settings = {"scenario": self.scenario, "controller": self.plan.controller, **options}
+        settings = {"scenario": self.scenario, "controller": self.plan.controller, "shield": self.shield, **options}
         return {"settings": settings, "snapshot": self.snapshot()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
