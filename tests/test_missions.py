@@ -164,7 +164,11 @@ def test_the_outcome_in_summary_json(tmp_path: Path):
 def test_outcome_rates_by_hand(flown):
     """One success, one run that came too late, one that failed; in the second a shield acted."""
     scenario, metrics = flown
-    late = {**metrics, "team": {**metrics["team"], "end_error": 0.51, "intervention_share": 0.1}}
+    late = {
+        **metrics,
+        "team": {**metrics["team"], "end_error": 0.51},
+        "agents": [{**agent, "intervention_share": 0.1} for agent in metrics["agents"]],
+    }
     rates = outcome_rates([metrics, late, None], scenario)
     values = {name: estimate.value for name, estimate in rates.items()}
     third = pytest.approx(1 / 3)

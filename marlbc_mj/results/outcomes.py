@@ -1,7 +1,7 @@
 """The outcome of a mission: whether the team ended in formation, and what it came too close to on the way."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
@@ -41,14 +41,9 @@ def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
     )
 
 
-INTERVENTION = "intervention_share"
-"""Metric of a team that flies under a shield: the share of substeps in which the shield acted."""
-
-
 def intervened(metrics: Metrics | None) -> bool:
     """Whether a shield changed what the team would have done; never where there was none, or where the run failed."""
-    shares: Mapping[str, Any] = {} if metrics is None else metrics["team"]
-    return bool(shares.get(INTERVENTION, 0.0) > 0.0)
+    return metrics is not None and any(agent["intervention_share"] > 0.0 for agent in metrics["agents"])
 
 
 def outcome_rates(runs: Sequence[Metrics | None], scenario: Scenario) -> dict[str, Estimate]:
