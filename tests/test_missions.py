@@ -127,7 +127,13 @@ def test_a_small_scale_run_has_every_figure(tmp_path: Path, monkeypatch: pytest.
     assert figures["growth"]["4"] == 1.0
     for key in ("us_per_agent_and_mission_step", "kib_per_world", "kib_per_agent", "growth"):
         assert set(figures[key]) == {"4", "16"} and min(figures[key].values()) > 0
-    assert {path.name for path in tmp_path.rglob("*.*")} == {"scale.md", "scale.json", "scale.pdf", "scale.png"}
+    assert {path.name for path in tmp_path.rglob("*.*")} == {
+        "scale.md",
+        "scale.json",
+        "scale.pdf",
+        "scale.png",
+        ".marlbc-files.json",
+    }
 
 
 def test_256_agents_run_under_every_supervisor_that_decides_per_agent():

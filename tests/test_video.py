@@ -193,7 +193,7 @@ def test_wrong_files_and_logs_are_named(log: EpisodeLog, tmp_path: Path) -> None
         render_video(log, tmp_path / "none" / "clip.mp4")
     with pytest.raises(ConfigurationError, match="no mission step"):
         render_video(replace(log, time=log.time[:0]), tmp_path / "clip.mp4")
-    with pytest.raises(ConfigurationError, match="agent1_x"):
+    with pytest.raises(ConfigurationError, match="'agent1_ has no slides along x and y'"):
         make_stage(replace(log, mjcf="<mujoco/>"))
 
 

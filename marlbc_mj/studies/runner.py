@@ -164,13 +164,27 @@ def _pooled(
 @contextmanager
 def _ctrl_c_later() -> Iterator[None]:
     """Hold Ctrl-C back while workers are started, which inherit that: during their imports it would be a traceback each."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    _mask("SIG_BLOCK")
     try:
         yield
     finally:
-        if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        _mask("SIG_UNBLOCK")
+
+
+@contextmanager
+def _ctrl_c_now() -> Iterator[None]:
+    """Let Ctrl-C through, also one that came before; in a worker it is held back outside, where jobs are unpacked."""
+    _mask("SIG_UNBLOCK")
+    try:
+        yield
+    finally:
+        _mask("SIG_BLOCK")
+
+
+def _mask(how: str) -> None:
+    """Change what this thread, and what it starts, takes of Ctrl-C, where there are masks."""
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(getattr(signal, how), {signal.SIGINT})
 
 
 def _was_stopped(future: Future[Any]) -> bool:
@@ -213,11 +227,6 @@ def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, folder: Path | None
     _worker = _Worker(watch, stopping, saving)
     if saving:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    except KeyboardInterrupt:  # it came while this process was starting
-        stopping.set()
 
 
 def _work(study: Study[JobT, ResultT], job: JobT) -> ResultT:
@@ -227,9 +236,10 @@ def _work(study: Study[JobT, ResultT], job: JobT) -> ResultT:
     """
     assert _worker is not None
     try:
-        if not _worker.saving and _worker.watch.stopping():
-            raise Stopped
-        return study.run(job, _worker.watch)
+        with _ctrl_c_now():
+            if not _worker.saving and _worker.watch.stopping():
+                raise Stopped
+            return study.run(job, _worker.watch)
     except KeyboardInterrupt:
         _worker.stopping.set()
         raise
