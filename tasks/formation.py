@@ -19,6 +19,7 @@ from marlbc_mj.engine import loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.seeding import stream
 
 
 class FormationArena(composer.Arena):
@@ -102,7 +103,7 @@ class FormationTask(composer.Task):
         side = self.plan.compiled_side if self.plan.native else self.plan.python_side
         self._native = side([physics.data.ptr])
         seed = int(random_state.randint(2**31))
-        starts = team.reset(self.plan, self.state, 0, np.random.default_rng(np.random.SeedSequence([seed, 0])))
+        starts = team.reset(self.plan, self.state, 0, stream(seed, 0))
         team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
 
     def before_step(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:

@@ -17,6 +17,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.text import one_line
 
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
@@ -114,8 +115,7 @@ class World:
         if mask is not None and np.asarray(mask).dtype != np.bool_:
             raise ConfigurationError(f"mask must be bool, got {np.asarray(mask).dtype}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
-            rng = np.random.default_rng(np.random.SeedSequence([seed, int(b)]))
-            starts = team.reset(self.plan, self.state, int(b), rng)
+            starts = team.reset(self.plan, self.state, int(b), stream(seed, int(b)))
             mujoco.mj_resetData(self.plan.model, self.data[b])
             team.put(self.plan, self.state, int(b), self.data[b], starts, np.zeros_like(starts))
         return self.observe()

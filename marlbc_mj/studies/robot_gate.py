@@ -44,8 +44,6 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
 
 STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
 CLIP = (0.10, 0.66)  # shares of the mission
-LOST = 50.0
-"""Tracking error in a robot's lengths from which on it counts as lost: about half the length of the mission."""
 SHOWN = [name for name in ROBOTS if name != "point_mass"]
 
 
