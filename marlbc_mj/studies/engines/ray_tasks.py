@@ -1,0 +1,109 @@
+"""Jobs as tasks of Ray: on the cluster that ``RAY_ADDRESS`` names, else in worker processes that are started here.
+
+Ray tries a task again whose worker or node died. Jobs whose study leaves large files need a folder that all nodes see.
+"""
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
+from marlbc_mj.studies.protocol import JobT, ResultT
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.text import one_line
+
+AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
+ADDRESS = "RAY_ADDRESS"
+
+
+class RayTasks:
+    """Ray's tasks, one CPU each.
+
+    Args:
+        workers: CPUs of a Ray that is started for the study; a cluster has its own number.
+
+    Raises:
+        ConfigurationError: Ray is not installed.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        try:
+            import ray
+        except ImportError as error:
+            raise ConfigurationError("the engine ray needs Ray: pip install 'marlbc-mj[ray]'") from error
+        self.ray: Any = ray
+
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+        if ears.stop is not None:
+            raise ConfigurationError("jobs that save themselves run on this machine only; leave out --engine ray")
+        with self._connected():
+            yield from self._finished(work, tasks)
+
+    def _finished(self, work: Work[JobT, ResultT], tasks: Sequence[Task]) -> Generator[tuple[int, ResultT]]:
+        ray = self.ray
+        remote = ray.remote(num_cpus=1, max_retries=MOST_TRIES - 1)(_attempt)
+        shared = ray.put((work, os.getcwd(), list(sys.path)))
+        ahead = (1 + AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        left, places = list(reversed(tasks)), {}
+        try:
+            while left or places:
+                while left and len(places) < ahead:
+                    task = left.pop()
+                    places[remote.remote(shared, task)] = task.place
+                done, _ = ray.wait(list(places), num_returns=1)
+                for each in done:
+                    yield places.pop(each), self._outcome(each).unpack()
+        finally:
+            for each in places:
+                with suppress(Exception):
+                    ray.cancel(each, force=True)
+
+    def _outcome(self, reference: Any) -> Outcome:
+        exceptions = self.ray.exceptions
+        try:
+            found: Outcome = self.ray.get(reference)
+        except (exceptions.RayTaskError, exceptions.RaySystemError) as error:
+            raise SimulationError(f"a task of Ray failed: {one_line(str(error)[-300:])}") from error
+        except exceptions.RayError as error:
+            said = f"a worker of Ray died {MOST_TRIES} times on the same job"
+            raise SimulationError(f"{said}: {one_line(str(error)[:300])}") from error
+        return found
+
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Ray during the block; its handler of SIGTERM would replace ours.
+
+        Raises:
+            ConfigurationError: the cluster cannot be reached.
+        """
+        main = threading.current_thread() is threading.main_thread()
+        before = signal.getsignal(signal.SIGTERM) if main else None
+        ray, address = self.ray, os.environ.get(ADDRESS)
+        where: dict[str, Any] = {"address": address} if address else {"address": "local", "num_cpus": self.workers}
+        if not address:
+            where["include_dashboard"] = False
+        try:
+            ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
+        except Exception as error:
+            raise ConfigurationError(f"no Ray at {address or 'this machine'}: {one_line(error)}") from error
+        try:
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
+            yield
+        finally:
+            ray.shutdown()
+
+
+def _attempt(shared: tuple[Work[Any, Any], str, list[str]], task: Task) -> Outcome:
+    """A job on a worker, in the folder and with the search path of the study's process where those are there, too."""
+    work, folder, path = shared
+    if Path(folder).is_dir():
+        os.chdir(folder)
+    sys.path += [entry for entry in path if entry not in sys.path]
+    return attempt(work.visible(), task)
