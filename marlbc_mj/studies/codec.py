@@ -1,7 +1,7 @@
 """Jobs and results as bytes, and back: no pickle, no constructor runs, and every number comes back bit for bit.
 
-A record is a JSON text, what is nested in it marked by type, followed by the arrays' bytes. Equal values of equal types give equal
-bytes, so that the bytes of a job are its canonical form.
+A record is a JSON text, what is nested in it marked by type, followed by the arrays' bytes. Equal values of equal types give
+equal bytes, so that the bytes of a job are its canonical form.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ import numpy as np
 from marlbc_mj.util.errors import ConfigurationError
 
 _MARK = "~"
+_NUMBERS = "biufcSU"  # kinds of NumPy's types that are kept
 _LENGTH = struct.Struct("<I")
 _PACKAGE = __name__.partition(".")[0]
 
@@ -61,7 +62,7 @@ class Encoder:
             return {_MARK: "tuple", "v": [self._plain(entry) for entry in value]}
         if kind is dict:
             return {_MARK: "dict", "v": [[self._plain(key), self._plain(entry)] for key, entry in value.items()]}
-        if kind is np.ndarray and not value.dtype.hasobject:
+        if kind is np.ndarray and value.dtype.kind in _NUMBERS:
             return {_MARK: "array", **self._array(value)}
         if isinstance(value, np.generic):
             return {_MARK: "scalar", **self._array(np.asarray(value))}
@@ -78,7 +79,7 @@ class Encoder:
         data = np.ascontiguousarray(value).tobytes()
         self._arrays.append(data)
         self._size += len(data)
-        return {"dtype": np.lib.format.dtype_to_descr(value.dtype), "shape": list(value.shape), "at": self._size - len(data)}
+        return {"dtype": value.dtype.str, "shape": list(value.shape), "at": self._size - len(data)}
 
 
 def encode(value: Any) -> bytes:
@@ -113,16 +114,11 @@ def _value(plain: Any, arrays: memoryview) -> Any:
 
 
 def _array_of(plain: dict[str, Any], arrays: memoryview) -> np.ndarray:
-    dtype, shape = np.lib.format.descr_to_dtype(_descr(plain["dtype"])), tuple(plain["shape"])
+    dtype, shape = np.dtype(plain["dtype"]), tuple(plain["shape"])
     count = math.prod(shape)
     if count == 0:
         return np.zeros(shape, dtype)
     return np.frombuffer(arrays, dtype, count, plain["at"]).reshape(shape).copy()
-
-
-def _descr(plain: Any) -> Any:
-    """JSON has lists where descriptions of structured arrays have tuples."""
-    return [tuple(_descr(part) if k == 1 else part for k, part in enumerate(entry)) for entry in plain] if isinstance(plain, list) else plain
 
 
 def _object(plain: dict[str, Any], arrays: memoryview) -> Any:

@@ -4,7 +4,6 @@ One process writes a pack, others may read it meanwhile. Whatever stops the writ
 but the last one are whole, and the last one is found to be torn.
 """
 
-import mmap
 import os
 import struct
 import zlib
@@ -12,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import zstandard
 
@@ -43,30 +42,31 @@ class Entry(NamedTuple):
 
 def entries(path: Path, begin: int = 0) -> Iterator[Entry]:
     """All whole records of a pack from a place on. What is damaged is passed over."""
-    if path.stat().st_size <= begin:
-        return
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-        while begin + _HEAD.size <= len(data):
-            entry = _entry(path, data, begin)
+    with path.open("rb") as file:
+        while (entry := _entry(path, file, begin)) is not None or (begin := _next_magic(file, begin + 1)) > 0:
             if entry is not None:
                 yield entry
                 begin = entry.start + entry.length
-                continue
-            begin = data.find(MAGIC, begin + 1)
-            if begin < 0:
-                return
 
 
-def _entry(path: Path, data: mmap.mmap, begin: int) -> Entry | None:
+def _entry(path: Path, file: BinaryIO, begin: int) -> Entry | None:
     """The record at a place; None where there is no whole one."""
-    magic, key, length, checksum = _HEAD.unpack_from(data, begin)
-    start = begin + _HEAD.size
-    if magic != MAGIC or start + length > len(data):
+    file.seek(begin)
+    head = file.read(_HEAD.size)
+    if len(head) < _HEAD.size or not head.startswith(MAGIC):
         return None
-    with memoryview(data) as view, view[start : start + length] as payload:
-        if zlib.crc32(payload, zlib.crc32(key)) != checksum:
-            return None
+    _, key, length, checksum = _HEAD.unpack(head)
+    start = begin + _HEAD.size
+    if start + length > os.fstat(file.fileno()).st_size or zlib.crc32(file.read(length), zlib.crc32(key)) != checksum:
+        return None
     return Entry(key.hex(), path, start, length)
+
+
+def _next_magic(file: BinaryIO, begin: int) -> int:
+    """The next place from ``begin`` on where a record may begin, or −1."""
+    file.seek(begin)
+    found = file.read().find(MAGIC)
+    return begin + found if found >= 0 else -1
 
 
 class PackWriter:

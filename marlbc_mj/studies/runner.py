@@ -2,13 +2,13 @@
 
 A study is a list of jobs, each a pure function of its configuration (:mod:`~marlbc_mj.studies.protocol`).
 
-**Addresses.** A job's key is a hash of its configuration and of the code that runs it (:mod:`~marlbc_mj.studies.addresses`). Under
-one key there is one result, whoever computes it, where and when. So whether a job is done is one look-up, a longer study takes
-over the results of a shorter one, and a changed setting or source finds nothing instead of something wrong.
+**Addresses.** A job's key is a hash of its configuration and of the code that runs it (:mod:`~marlbc_mj.studies.addresses`).
+Under one key there is one result, whoever computes it, where and when. So whether a job is done is one look-up, a longer study
+takes over the results of a shorter one, and a changed setting or source finds nothing instead of something wrong.
 
-**Storage.** Each result is appended to a pack under its key (:mod:`~marlbc_mj.studies.packs`), a file for as many results as 256 MiB
-hold. A record that is whole is the mark that its job is done. A torn one, of a process that was killed or a disk that was full, is
-cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`). Large files
+**Storage.** Each result is appended to a pack under its key (:mod:`~marlbc_mj.studies.packs`), a file for as many results as
+256 MiB hold. A record that is whole is the mark that its job is done. A torn one, of a process that was killed or a disk that was
+full, is cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`). Large files
 of a job lie in a folder of its own until it ends, then get its key as their name in one rename. Only the process of the study
 writes packs, and it holds the lock of the folder: a second run is refused.
 

@@ -110,9 +110,7 @@ class Ears:
 class Engine(Protocol):
     """A place where jobs run."""
 
-    def map(
-        self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears
-    ) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         """Places of jobs with their results, as they end; closing the generator ends everything that it started.
 
         A job whose worker dies is tried again, :data:`MOST_TRIES` times at most.

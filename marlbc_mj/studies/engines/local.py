@@ -61,14 +61,10 @@ class Processes:
                 ears.retried(DIED)
 
 
-def _pooled(
-    work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, workers: int
-) -> Generator[tuple[int, ResultT]]:
+def _pooled(work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, workers: int) -> Generator[tuple[int, ResultT]]:
     context = get_context("spawn")
     stopping, told = context.Event(), context.SimpleQueue()
-    with ProcessPoolExecutor(
-        min(workers, len(tasks)), context, _begin_worker, (told, stopping, ears.stop is not None)
-    ) as pool:
+    with ProcessPoolExecutor(min(workers, len(tasks)), context, _begin_worker, (told, stopping, ears.stop is not None)) as pool:
         with _ctrl_c_later():
             places = {pool.submit(_work, work, task): task.place for task in tasks}
         waiting, failure = set(places), None
