@@ -75,13 +75,15 @@ class Addresses:
         """
         describe = getattr(self._study, "describe", None)
         configuration = job if describe is None else describe(job)
-        digest = hashlib.sha256(self._common)
-        for part in configuration if isinstance(configuration, tuple) else (configuration,):
-            digest.update(self._digest(part))
-        return digest.hexdigest()
+        return hashlib.sha256(self._common + self._digest(configuration)).hexdigest()
 
     def _digest(self, part: Any) -> bytes:
-        """Of one part of a configuration, together with the files of the user that it means."""
+        """Digest of one part of a configuration, together with the files of the user that it means."""
+        if isinstance(part, tuple):
+            digest = hashlib.sha256(f"{type(part).__qualname__} {len(part)}\0".encode())
+            for entry in part:
+                digest.update(self._digest(entry))
+            return digest.digest()
         known = self._parts.get(id(part))
         if known is not None:
             return known[1]

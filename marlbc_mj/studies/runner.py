@@ -8,12 +8,12 @@ takes over the results of a shorter one, and a changed setting or source finds n
 
 **Storage.** Each result is appended to a pack under its key (:mod:`~marlbc_mj.studies.packs`), a file for as many results as
 256 MiB hold. A record that is whole is the mark that its job is done. A torn one, of a process that was killed or a disk that was
-full, is cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`). Large files
-of a job lie in a folder of its own until it ends, then get its key as their name in one rename. Only the process of the study
-writes packs, and it holds the lock of the folder: a second run is refused.
+full, is cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`).
+Large files of a job lie in a folder of its own until it ends, then get its key as their name in one rename. Only the process of
+the study writes packs, and it holds the lock of the folder: a second run is refused.
 
-**The folder.** ``OUT/.jobs`` holds all this while a run has not ended (:mod:`~marlbc_mj.studies.store`). The report is made from all
-results in another folder, which replaces OUT in one rename; only then is the run finished and ``.jobs`` gone. What OUT held
+**The folder.** ``OUT/.jobs`` holds all this while a run has not ended (:mod:`~marlbc_mj.studies.store`). The report is made from
+all results in another folder, which replaces OUT in one rename; only then is the run finished and ``.jobs`` gone. What OUT held
 before, with ``--overwrite``, stays until then. So the same command, at any time, either goes on, or is told that OUT is finished.
 
 **Engines** move work and keep nothing: processes of this machine, Ray's tasks, SLURM's arrays
