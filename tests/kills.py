@@ -1,9 +1,9 @@
-"""Kills commands with SIGKILL at random moments, runs the same commands again, and compares what they leave with undisturbed runs.
+"""Kills commands with SIGKILL at random moments, runs them again, and compares what they leave with undisturbed runs.
 
 ``python tests/kills.py --kills 50 --seed 0 --out FOLDER [--engine ray] [--commands bench evaluate ...]``. Every kill is checked:
-no half-written file under a final name, the same command (with --resume or --overwrite, where it has them) then finishes, what it
-leaves is equal bit for bit but for times, and no process and no temporary file of it stays. Lines of ``kills.jsonl`` in the folder
-say what happened; a second call with the same folder goes on. Exit status 1 if any check failed.
+no half-written file under a final name; the same command (with --resume or --overwrite, where it has them) then finishes; what it
+leaves is equal bit for bit but for times; no process and no temporary file of it stays. Lines of ``kills-ENGINE.jsonl`` in the
+folder say what happened; a second call with the same folder goes on. Exit status 1 if any check failed.
 """
 
 import argparse
@@ -23,6 +23,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from marlbc_mj.studies.packs import entries
 
 MOST_SECONDS = 400.0  # of one command
 ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
@@ -151,14 +153,15 @@ class Killer:
         seconds, out = self.reference(name), self.folder / f"{name}-killed"
         _remove(out)
         faults: list[str] = []
-        moments = []
+        moments, kept = [], []
         for _ in range(rng.choice((1, 1, 2, 3))):
             process = self.start(name, out)
-            moments.append(rng.uniform(0.3, 1.0) * seconds)
+            moment = rng.uniform(0.3, 1.0) * seconds
             with suppress(subprocess.TimeoutExpired):
-                process.wait(moments[-1])
+                process.wait(moment)
             if process.poll() is not None:
                 break
+            moments.append(moment)
             whom = rng.choice(("study", "study", "group", "worker"))
             _strike(process, whom, rng)
             if whom == "worker":  # the command itself goes on, or ends with an error
@@ -166,13 +169,14 @@ class Killer:
                     process.wait(MOST_SECONDS)
             process.wait()
             faults += self.leftovers(name, out)
+            kept.append(sum(1 for pack in out.glob(".jobs/*.pack") for _ in entries(pack)))
         status, _ = self.finish(name, out)
         if status != 0:
             faults.append(f"exit {status}: {(self.folder / 'said.txt').read_text().strip().splitlines()[-1:]}")
         faults += self.leftovers(name, out)
         faults += differences(_output(name, self.folder / f"{name}-whole"), _output(name, out))
         faults += [f"left: {path.name}" for path in self.folder.rglob("*") if path.name.startswith(out.name) and _temporary(path)]
-        return {"command": name, "engine": self.engine, "kills": len(moments), "at": moments, "faults": faults}
+        return {"command": name, "engine": self.engine, "kills": len(moments), "at": moments, "kept": kept, "faults": faults}
 
     def leftovers(self, name: str, out: Path) -> list[str]:
         """Processes of the command that stay, and files under final names that are not whole."""

@@ -4,13 +4,14 @@ Ray tries a task again whose worker or node died. Jobs whose study leaves large 
 """
 
 import os
+import pickle
 import signal
 import sys
 import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
 from marlbc_mj.studies.protocol import JobT, ResultT
@@ -48,14 +49,14 @@ class RayTasks:
     def _finished(self, work: Work[JobT, ResultT], tasks: Sequence[Task]) -> Generator[tuple[int, ResultT]]:
         ray = self.ray
         remote = ray.remote(num_cpus=1, max_retries=MOST_TRIES - 1)(_attempt)
-        shared = ray.put((work, os.getcwd(), list(sys.path)))
+        shared = ray.put(_Shared(pickle.dumps(work), os.getcwd(), tuple(sys.path)))
         ahead = (1 + AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
         left, places = list(reversed(tasks)), {}
         try:
             while left or places:
                 while left and len(places) < ahead:
                     task = left.pop()
-                    places[remote.remote(shared, task)] = task.place
+                    places[remote.remote(shared, pickle.dumps(task))] = task.place
                 done, _ = ray.wait(list(places), num_returns=1)
                 for each in done:
                     yield places.pop(each), self._outcome(each).unpack()
@@ -67,7 +68,7 @@ class RayTasks:
     def _outcome(self, reference: Any) -> Outcome:
         exceptions = self.ray.exceptions
         try:
-            found: Outcome = self.ray.get(reference)
+            found: Outcome = pickle.loads(self.ray.get(reference))  # so that arrays can be written to, as elsewhere
         except (exceptions.RayTaskError, exceptions.RaySystemError) as error:
             raise SimulationError(f"a task of Ray failed: {one_line(str(error)[-300:])}") from error
         except exceptions.RayError as error:
@@ -100,10 +101,18 @@ class RayTasks:
             ray.shutdown()
 
 
-def _attempt(shared: tuple[Work[Any, Any], str, list[str]], task: Task) -> Outcome:
+class _Shared(NamedTuple):
+    """What all tasks have in common."""
+
+    work: bytes  # pickled: it can be read only where the search path is the study's
+    folder: str
+    path: tuple[str, ...]
+
+
+def _attempt(shared: _Shared, pickled: bytes) -> bytes:
     """A job on a worker, in the folder and with the search path of the study's process where those are there, too."""
-    work, folder, path = shared
-    if Path(folder).is_dir():
-        os.chdir(folder)
-    sys.path += [entry for entry in path if entry not in sys.path]
-    return attempt(work.visible(), task)
+    if Path(shared.folder).is_dir():
+        os.chdir(shared.folder)
+    sys.path += [entry for entry in shared.path if entry not in sys.path]
+    work: Work[Any, Any] = pickle.loads(shared.work)
+    return pickle.dumps(attempt(work.visible(), pickle.loads(pickled)))
