@@ -25,7 +25,7 @@ from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import MANIFEST, UNFINISHED
+from marlbc_mj.util.files import MANIFEST, JOBS_FOLDER
 from marlbc_mj.util.progress import silent
 
 WORKERS = pytest.mark.parametrize("workers", [1, 2])
@@ -100,7 +100,7 @@ def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
         run_study(Squares(), tmp_path / "out", workers=workers)
     assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("*/*.*")} == {
         *(f"out/{name}" for name in (MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4)))),
-        f"other/{UNFINISHED}",
+        f"other/{JOBS_FOLDER}",
     }
     assert run_study(Squares(), None, workers=workers).report.text == "sum 14"
 

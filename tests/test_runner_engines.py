@@ -82,11 +82,11 @@ def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Results that came after the end of the study are found by the next run, and nothing is submitted for them."""
-    from marlbc_mj.studies.engines.slurm_arrays import Share
+    from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
 
     tasks = [Task(k, f"{k:064x}", k) for k in range(5)]
     work = Work(Roots(), None, tmp_path)
-    Share(work, tuple(tasks), tmp_path / "0-0.pack")()
+    ArrayShare(work, tuple(tasks), tmp_path / "0-0.pack")()
     engine = SlurmArray(2, "local")
     monkeypatch.setattr(engine, "_submit", None)
     found = dict(engine.map(work, tasks, Ears()))
@@ -95,10 +95,10 @@ def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypat
 
 def test_a_share_goes_on_where_it_was_killed(tmp_path: Path) -> None:
     """As SLURM requeues it: a torn result is made again, the others are not."""
-    from marlbc_mj.studies.engines.slurm_arrays import Share
+    from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
     from marlbc_mj.studies.packs import entries
 
-    share = Share(Work(Roots(), None, tmp_path), tuple(Task(k, f"{k:064x}", k) for k in range(3)), tmp_path / "0.pack")
+    share = ArrayShare(Work(Roots(), None, tmp_path), tuple(Task(k, f"{k:064x}", k) for k in range(3)), tmp_path / "0.pack")
     share()
     whole = share.pack.read_bytes()
     os.truncate(share.pack, len(whole) - 3)

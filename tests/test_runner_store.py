@@ -22,7 +22,7 @@ from marlbc_mj.studies.packs import PackWriter, entries
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.util.errors import ConfigurationError, NoSpaceError, SimulationError
-from marlbc_mj.util.files import MANIFEST, UNFINISHED
+from marlbc_mj.util.files import MANIFEST, JOBS_FOLDER
 from marlbc_mj.util.progress import silent
 
 
@@ -59,16 +59,16 @@ PLAIN = st.recursive(
 @given(PLAIN)
 def test_what_is_stored_comes_back(value: object) -> None:
     """Of the same types, to the last bit, also infinities, negative zero, and texts that are no text."""
-    data = codec.encode(value)
-    again = codec.decode(data)
-    assert repr(again) == repr(value) and codec.encode(again) == data
+    data = codec.to_bytes(value)
+    again = codec.from_bytes(data)
+    assert repr(again) == repr(value) and codec.to_bytes(again) == data
 
 
 @pytest.mark.parametrize("dtype", ["f8", "f4", "i2", "u1", "?", "U3", "c16", ">f8"])
 @pytest.mark.parametrize("shape", [(), (0,), (2, 0, 3), (2, 3)])
 def test_arrays_come_back(dtype: str, shape: tuple[int, ...]) -> None:
     array = np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(dtype)
-    again = codec.decode(codec.encode({"a": array, "b": array.T}))
+    again = codec.from_bytes(codec.to_bytes({"a": array, "b": array.T}))
     for found, wanted in ((again["a"], array), (again["b"], array.T)):
         assert found.dtype == wanted.dtype and found.shape == wanted.shape and found.tobytes() == wanted.tobytes()
         assert found.flags.writeable
@@ -76,14 +76,14 @@ def test_arrays_come_back(dtype: str, shape: tuple[int, ...]) -> None:
 
 def test_numbers_of_numpy_dataclasses_and_paths_come_back() -> None:
     value = [np.float64(0.1), np.float32(np.nan), np.int64(-3), np.bool_(True), Checked(2), Path("a/b"), {"~": 1}]
-    again = codec.decode(codec.encode(value))
+    again = codec.from_bytes(codec.to_bytes(value))
     assert repr(again) == repr(value) and [type(each) for each in again] == [type(each) for each in value]
 
 
 @pytest.mark.parametrize("value", [print, object(), {1, 2}, np.array([None]), lambda: 0, type])
 def test_what_is_no_data_is_refused(value: object) -> None:
     with pytest.raises(ConfigurationError, match="is no data that can be kept"):
-        codec.encode([value])
+        codec.to_bytes([value])
 
 
 @pytest.mark.parametrize(
@@ -100,13 +100,13 @@ def test_what_is_no_data_is_refused(value: object) -> None:
 def test_bytes_of_something_else_make_nothing(text: str) -> None:
     """Neither an object that is no data, nor a call."""
     with pytest.raises(ConfigurationError, match="cannot be read"):
-        codec.decode(len(text).to_bytes(4, "little") + text.encode())
+        codec.from_bytes(len(text).to_bytes(4, "little") + text.encode())
 
 
 def test_a_whole_result_comes_back(episode) -> None:
     """An episode with scenario and arrays, and the tables made from it."""
     result = Result.of(episode("scripted", "sorlc", duration=5.0))
-    again = codec.decode(codec.encode(result))
+    again = codec.from_bytes(codec.to_bytes(result))
     assert again.metrics == result.metrics and again.trajectory.scenario == result.trajectory.scenario
     for name in Trajectory.__dataclass_fields__:
         here, there = getattr(result.trajectory, name), getattr(again.trajectory, name)
@@ -230,12 +230,12 @@ def test_the_same_call_goes_on(tmp_path: Path, ran: list[int], capsys: pytest.Ca
         with pytest.raises(error):
             run_study(Halves(stop_at=stop_at, error=error), tmp_path / "out")
         said = capsys.readouterr().err
-        assert [path.name for path in (tmp_path / "out").iterdir()] == [UNFINISHED]
+        assert [path.name for path in (tmp_path / "out").iterdir()] == [JOBS_FOLDER]
         assert f"{stop_at} of 6 jobs are done and kept in" in said and ("going on" in said) == (stop_at == 4)
     assert ran == [*range(6), 0, 1, 2, 3]
     done = run_study(Halves(), tmp_path / "out")
     assert ran == [*range(6), *range(6)] and [float(each[0]) for each in done.results] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
-    assert files(tmp_path / "out") == files(tmp_path / "whole") and not (tmp_path / "out" / UNFINISHED).exists()
+    assert files(tmp_path / "out") == files(tmp_path / "whole") and not (tmp_path / "out" / JOBS_FOLDER).exists()
     assert {path.name for path in tmp_path.iterdir()} == {"out", "whole"}
 
 
@@ -258,12 +258,12 @@ def test_a_finished_folder_stays_until_it_is_replaced(tmp_path: Path, ran: list[
     before = files(out)
     with pytest.raises(KeyboardInterrupt):
         run_study(Halves(scale=2.0, stop_at=3), out, overwrite=True)
-    assert {name: text for name, text in files(out).items() if not name.startswith(UNFINISHED)} == before
+    assert {name: text for name, text in files(out).items() if not name.startswith(JOBS_FOLDER)} == before
     with pytest.raises(ConfigurationError, match="is not empty"):
         run_study(Halves(scale=2.0), out)
     ran.clear()
     run_study(Halves(scale=2.0), out, overwrite=True)
-    assert ran == [3, 4, 5] and (out / "all.txt").read_text() == "0.0 2.0 4.0 6.0 8.0 10.0" and not (out / UNFINISHED).exists()
+    assert ran == [3, 4, 5] and (out / "all.txt").read_text() == "0.0 2.0 4.0 6.0 8.0 10.0" and not (out / JOBS_FOLDER).exists()
 
 
 def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
@@ -271,8 +271,8 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
     (tmp_path / "mine" / "thesis.txt").write_text("chapter")
     with pytest.raises(ConfigurationError, match="is not empty"):
         run_study(Halves(), tmp_path / "mine")
-    (tmp_path / "other" / UNFINISHED).mkdir(parents=True)
-    (tmp_path / "other" / UNFINISHED / "run.json").write_text('{"schema": 99}')
+    (tmp_path / "other" / JOBS_FOLDER).mkdir(parents=True)
+    (tmp_path / "other" / JOBS_FOLDER / "run.json").write_text('{"schema": 99}')
     with pytest.raises(ConfigurationError, match=r"run.json is of another version of marlbc, or of something else"):
         run_study(Halves(), tmp_path / "other")
 
@@ -322,12 +322,12 @@ def test_two_runs_on_one_folder(tmp_path: Path) -> None:
             with pytest.raises(ConfigurationError, match="out is being written by another process"):
                 run_study(Halves(), tmp_path / "out", overwrite=overwrite)
         first.keep(KEYS[0], 1)
-    assert (tmp_path / "out" / UNFINISHED / "run.json").exists()
+    assert (tmp_path / "out" / JOBS_FOLDER / "run.json").exists()
 
 
 def test_results_of_a_torn_pack_are_run_again(tmp_path: Path, ran: list[int]) -> None:
     stopped(tmp_path / "out")
-    (pack,) = (tmp_path / "out" / UNFINISHED).glob("*.pack")
+    (pack,) = (tmp_path / "out" / JOBS_FOLDER).glob("*.pack")
     os.truncate(pack, pack.stat().st_size - 1)
     ran.clear()
     run_study(Halves(), tmp_path / "out")
@@ -336,7 +336,7 @@ def test_results_of_a_torn_pack_are_run_again(tmp_path: Path, ran: list[int]) ->
 
 def test_what_killed_workers_left_is_removed(tmp_path: Path) -> None:
     stopped(tmp_path / "out")
-    begun = tmp_path / "out" / UNFINISHED / "files" / ".begun-1-2"
+    begun = tmp_path / "out" / JOBS_FOLDER / "files" / ".begun-1-2"
     begun.mkdir()
     (begun / "3.txt").write_text("half")
     run_study(Halves(), tmp_path / "out")
@@ -361,6 +361,6 @@ def test_an_edited_file_of_the_user_is_another_job(tmp_path: Path) -> None:
 
 def test_what_a_run_is_can_be_read(tmp_path: Path) -> None:
     stopped(tmp_path / "out")
-    about = json.loads((tmp_path / "out" / UNFINISHED / "run.json").read_text())
-    assert about["schema"] == store.SCHEMA and about["study"] == "Halves" and about["jobs"] == 6
+    about = json.loads((tmp_path / "out" / JOBS_FOLDER / "run.json").read_text())
+    assert about["schema"] == store.STORE_SCHEMA and about["study"] == "Halves" and about["jobs"] == 6
     assert all(name in about["code"] for name in ("marlbc-mj", "mujoco", "numpy", "numba", "python", "sources"))

@@ -10,7 +10,7 @@ from typing import Any
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.progress import Progress
 
-TELL_EVERY = 60.0  # where there is no terminal [s]
+SELDOM = 60.0  # where there is no terminal [s]
 LEAST_WIDTH = 112  # least width of the table of results [characters]
 
 
@@ -68,7 +68,7 @@ def progress_bars() -> Iterator[Progress]:
         yield update
 
 
-def seldom(every: float = TELL_EVERY) -> Progress:
+def seldom(every: float = SELDOM) -> Progress:
     """A line on the stage that is told of, with its rate and the time left, at most every so many seconds."""
     began: dict[str, tuple[float, float]] = {}
     last = monotonic()

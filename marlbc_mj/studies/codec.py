@@ -82,13 +82,13 @@ class Encoder:
         return {"dtype": value.dtype.str, "shape": list(value.shape), "at": self._size - len(data)}
 
 
-def encode(value: Any) -> bytes:
+def to_bytes(value: Any) -> bytes:
     """The value as bytes, see :class:`Encoder`."""
     return Encoder().encode(value)
 
 
-def decode(data: bytes) -> Any:
-    """The value that :func:`encode` made bytes of. Only dataclasses and named tuples are made, and without their constructors.
+def from_bytes(data: bytes) -> Any:
+    """The value that :func:`to_bytes` made bytes of. Only dataclasses and named tuples are made, and without their constructors.
 
     Raises:
         ConfigurationError: bytes of something else, or a type that is not there any more.

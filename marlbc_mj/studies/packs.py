@@ -19,9 +19,9 @@ from marlbc_mj.util.files import writing
 
 MAGIC = b"MJr1"
 _HEAD = struct.Struct("<4s32sQI")  # magic, key, length of the payload, CRC-32 of key and payload
-LARGEST = 256 * 2**20  # size from which another pack is begun [bytes]
+LARGEST_PACK = 256 * 2**20  # size from which another pack is begun [bytes]
 SYNC_EVERY = 1.0  # between two flushes to the disk [s]
-_PREFIX, SUFFIX = "results-", ".pack"
+_PREFIX, PACK_SUFFIX = "results-", ".pack"
 
 
 class Entry(NamedTuple):
@@ -91,7 +91,7 @@ class PackWriter:
     @property
     def full(self) -> bool:
         """Whether another pack should be begun."""
-        return self._end >= LARGEST
+        return self._end >= LARGEST_PACK
 
     def add(self, key: str, payload: bytes) -> Entry:
         """Append a record; on the disk within about a second, or when the pack is closed.
@@ -133,12 +133,12 @@ def _write_all(file: int, data: bytes) -> None:
 
 def packs(folder: Path) -> list[Path]:
     """The packs of a folder that :func:`next_pack` named, the last one last."""
-    return sorted(folder.glob(f"{_PREFIX}*{SUFFIX}"))
+    return sorted(folder.glob(f"{_PREFIX}*{PACK_SUFFIX}"))
 
 
 def next_pack(folder: Path) -> Path:
     """The pack to append to: the last one, or another one where that is full."""
     there = packs(folder)
-    if there and there[-1].stat().st_size < LARGEST:
+    if there and there[-1].stat().st_size < LARGEST_PACK:
         return there[-1]
-    return folder / f"{_PREFIX}{len(there):06d}{SUFFIX}"
+    return folder / f"{_PREFIX}{len(there):06d}{PACK_SUFFIX}"

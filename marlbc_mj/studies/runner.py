@@ -33,7 +33,7 @@ from marlbc_mj.studies.engines.base import Ears, StopRequest
 from marlbc_mj.studies.protocol import JobT, Report, ResultT, Stopped, Study
 from marlbc_mj.studies.store import RunStore, open_store
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import UNFINISHED, staged_folder
+from marlbc_mj.util.files import JOBS_FOLDER, staged_folder
 from marlbc_mj.util.progress import Progress, note, silent
 
 
@@ -97,7 +97,7 @@ def run_study(
         except BaseException:
             if store.kept:
                 done = sum(key in store.kept for key in keys)
-                note(f"{done} of {len(keys)} jobs are done and kept in {out / UNFINISHED}; the same command goes on")
+                note(f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; the same command goes on")
             raise
     return Conclusion(results, report)
 
@@ -219,7 +219,7 @@ def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Pa
             raise ConfigurationError(
                 f"{out} holds an unfinished run, {unused}, of which nothing can be used here; choose another or add --overwrite"
             )
-        note(f"{unused} in {out / UNFINISHED} cannot be used here")
+        note(f"{unused} in {out / JOBS_FOLDER} cannot be used here")
     if not used:
         store.drop()
     else:

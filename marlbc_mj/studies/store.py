@@ -14,7 +14,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,12 @@ from typing import Any
 from marlbc_mj.studies import codec
 from marlbc_mj.studies.packs import PackWriter, entries, next_pack, packs
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import UNFINISHED, check_folder, duplicate, remove_orphans, write_json, writing
+from marlbc_mj.util.files import JOBS_FOLDER, check_folder, duplicate, remove_orphans, write_json, writing
 from marlbc_mj.util.locks import alone
 
-SCHEMA = 1
+STORE_SCHEMA = 1
 _BEGUN = ".begun-"
 _RUN, _LOCK, _FILES, _ENGINE = "run.json", "lock", "files", "engine"
-
-Say = Callable[[str], None]
-"""Called with a line for whoever started the study."""
 
 
 class RunStore:
@@ -46,7 +43,7 @@ class RunStore:
 
     def result(self, key: str) -> Any:
         """A stored result."""
-        return codec.decode(self.kept[key].payload())
+        return codec.from_bytes(self.kept[key].payload())
 
     def keep(self, key: str, result: Any) -> None:
         """Store a result.
@@ -58,7 +55,7 @@ class RunStore:
         if self._writer is None or self._writer.full:
             self.close()
             self._writer = PackWriter(next_pack(self.folder))
-        self.kept[key] = self._writer.add(key, codec.encode(result))
+        self.kept[key] = self._writer.add(key, codec.to_bytes(result))
 
     def drop(self) -> None:
         """Remove all results and files."""
@@ -80,7 +77,7 @@ class RunStore:
             self.files.mkdir(exist_ok=True)
             for path in self.files.glob(f"{_BEGUN}*"):
                 shutil.rmtree(path, ignore_errors=True)
-        write_json(self.folder / _RUN, {"schema": SCHEMA, **about})
+        write_json(self.folder / _RUN, {"schema": STORE_SCHEMA, **about})
 
     def about(self) -> dict[str, Any]:
         """What the last run here was; empty where none has begun.
@@ -93,7 +90,7 @@ class RunStore:
             return {}
         with suppress(OSError, ValueError):
             found = json.loads(path.read_text(encoding="utf-8"))
-            if isinstance(found, dict) and found.get("schema") == SCHEMA:
+            if isinstance(found, dict) and found.get("schema") == STORE_SCHEMA:
                 return found
         raise ConfigurationError(f"{path} is of another version of marlbc, or of something else; remove {self.folder}")
 
@@ -140,7 +137,7 @@ def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
     """
     remove_orphans(out)
     check_folder(out, overwrite=overwrite)
-    folder, made = out / UNFINISHED, not out.exists()
+    folder, made = out / JOBS_FOLDER, not out.exists()
     with writing(out):
         folder.mkdir(parents=True, exist_ok=True)
     with alone(folder / _LOCK, f"{out} is being written by another process; wait for it or choose another folder"):

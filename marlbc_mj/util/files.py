@@ -18,7 +18,7 @@ PARTIAL = ".partial-"
 """Part of the name of an incomplete file or folder, before the number of the process that writes it and a random token."""
 REPLACED = ".old-"
 """Part of the name of a folder that is being replaced, before the same."""
-UNFINISHED = ".jobs"
+JOBS_FOLDER = ".jobs"
 """Folder, in an output folder, of what a run that has not ended keeps; not counted as content, and replaced with the rest."""
 MANIFEST = ".marlbc-files.json"
 """Names of all files that :func:`staged_folder` wrote into a folder: the only ones that ``overwrite`` removes."""
@@ -66,7 +66,7 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 def _counts_not(name: str) -> bool:
     """Whether what has this name in an output folder is something unfinished of this program's."""
-    return PARTIAL in name or name == UNFINISHED
+    return PARTIAL in name or name == JOBS_FOLDER
 
 
 @contextmanager
@@ -165,7 +165,7 @@ def _put_in_place(out: Path, target: Path, staging: Path, overwrite: bool) -> No
 def _files(folder: Path) -> list[str]:
     """Names of all files below ``folder``, relative to it, but those of an unfinished run."""
     found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
-    return sorted(path.relative_to(folder).as_posix() for path in found if not path.is_relative_to(folder / UNFINISHED))
+    return sorted(path.relative_to(folder).as_posix() for path in found if not path.is_relative_to(folder / JOBS_FOLDER))
 
 
 def _written_before(folder: Path) -> set[str]:
@@ -196,7 +196,7 @@ def _swap(target: Path, staging: Path, ours: set[str]) -> None:
             (staging / name).parent.mkdir(parents=True, exist_ok=True)
             duplicate(target / name, staging / name)
     for folder in (path for path in target.rglob("*") if path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
-        if folder.is_relative_to(target / UNFINISHED):
+        if folder.is_relative_to(target / JOBS_FOLDER):
             continue
         (staging / folder.relative_to(target)).mkdir(parents=True, exist_ok=True)
     old = target.with_name(f"{target.name}{REPLACED}{_token()}")
@@ -225,7 +225,7 @@ def _move_into(out: Path, target: Path, staging: Path, ours: set[str]) -> None:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (staging / name).rename(target / name)
     shutil.rmtree(staging)
-    shutil.rmtree(target / UNFINISHED, ignore_errors=True)
+    shutil.rmtree(target / JOBS_FOLDER, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:

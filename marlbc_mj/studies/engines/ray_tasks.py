@@ -18,7 +18,7 @@ from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.text import one_line
 
-AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
+TASKS_AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
 ADDRESS = "RAY_ADDRESS"
 
 
@@ -50,7 +50,7 @@ class RayTasks:
         ray = self.ray
         remote = ray.remote(num_cpus=1, max_retries=MOST_TRIES - 1)(_attempt)
         shared = ray.put(_Shared(pickle.dumps(work), os.getcwd(), tuple(sys.path)))
-        ahead = (1 + AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        ahead = (1 + TASKS_AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
         left, places = list(reversed(tasks)), {}
         try:
             while left or places:

@@ -18,13 +18,13 @@ from typing import Any, NamedTuple
 
 from marlbc_mj.studies import codec
 from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
-from marlbc_mj.studies.packs import SUFFIX, PackWriter, entries
+from marlbc_mj.studies.packs import PACK_SUFFIX, PackWriter, entries
 from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import writing
 from marlbc_mj.util.text import one_line
 
-POLL = 0.5  # between two looks for results [s]
+RESULTS_EVERY = 0.5  # between two looks for results [s]
 ALIVE_EVERY = 5.0  # between two looks whether tasks are alive [s]
 GRACE = 60.0  # until an array that was cancelled has gone [s]
 SLICE = 60  # after which a task of the array makes room for others, and goes on later [min]
@@ -32,7 +32,7 @@ MOST_SLICES = 10_000
 _ARRAYS, _LOGS = "arrays", "logs"
 
 
-class Share(NamedTuple):
+class ArrayShare(NamedTuple):
     """What one task of an array does; submitit pickles it, and calls it again after its time was up."""
 
     work: Work[Any, Any]
@@ -45,7 +45,7 @@ class Share(NamedTuple):
         with PackWriter(self.pack) as results:
             for task in self.tasks:
                 if task.key not in done:
-                    results.add(task.key, codec.encode(attempt(self.work, task)))
+                    results.add(task.key, codec.to_bytes(attempt(self.work, task)))
 
     def checkpoint(self) -> Any:
         """What submitit submits when the time of a task is up: the same again."""
@@ -83,7 +83,7 @@ class SlurmArray:
         self._cancel(work.scratch)
         array = _Array({task.key: task for task in tasks}, work.scratch)
         yield from array.arrived()  # of an array whose study was killed
-        for pack in work.scratch.glob(f"*{SUFFIX}"):
+        for pack in work.scratch.glob(f"*{PACK_SUFFIX}"):
             pack.unlink()
         try:
             yield from self._rounds(work, array, ears)
@@ -107,7 +107,7 @@ class SlurmArray:
                     if not self._alive(jobs):
                         yield from array.arrived()  # what came between the two looks
                         break
-                sleep(POLL)
+                sleep(RESULTS_EVERY)
         if array.left:
             raise SimulationError(f"tasks of SLURM ended {MOST_TRIES} times without their results{_last_words(work.scratch)}")
 
@@ -116,7 +116,7 @@ class SlurmArray:
         count = min(self.workers, len(tasks))
         executor = self.submitit.AutoExecutor(scratch / _LOGS, cluster=self.cluster, slurm_max_num_timeout=MOST_SLICES)
         executor.update_parameters(name="marlbc", timeout_min=SLICE, slurm_cpus_per_task=1)
-        shares = [Share(work, tuple(tasks[k::count]), scratch / f"{tries}-{k}{SUFFIX}") for k in range(count)]
+        shares = [ArrayShare(work, tuple(tasks[k::count]), scratch / f"{tries}-{k}{PACK_SUFFIX}") for k in range(count)]
         try:
             with executor.batch():
                 jobs = [executor.submit(share) for share in shares]
@@ -146,7 +146,7 @@ class SlurmArray:
             subprocess.run(["scancel", *names], capture_output=True, check=False)
             until = monotonic() + GRACE
             while _queued(names) and monotonic() < until:
-                sleep(POLL)
+                sleep(RESULTS_EVERY)
         (scratch / _ARRAYS).unlink(missing_ok=True)
 
 
@@ -164,12 +164,12 @@ class _Array:
         Raises:
             ConfigurationError, SimulationError: what a job raised.
         """
-        for pack in sorted(self.scratch.glob(f"*{SUFFIX}")):
+        for pack in sorted(self.scratch.glob(f"*{PACK_SUFFIX}")):
             for entry in entries(pack, self._read.get(pack, 0)):
                 self._read[pack] = entry.start + entry.length
                 task = self.left.pop(entry.key, None)
                 if task is not None:
-                    outcome: Outcome = codec.decode(entry.payload())
+                    outcome: Outcome = codec.from_bytes(entry.payload())
                     yield task.place, outcome.unpack()
 
 
