@@ -25,7 +25,7 @@ from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import MANIFEST, JOBS_FOLDER
+from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST
 from marlbc_mj.util.progress import silent
 
 WORKERS = pytest.mark.parametrize("workers", [1, 2])

@@ -22,7 +22,7 @@ from marlbc_mj.studies.packs import PackWriter, entries
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.util.errors import ConfigurationError, NoSpaceError, SimulationError
-from marlbc_mj.util.files import MANIFEST, JOBS_FOLDER
+from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST
 from marlbc_mj.util.progress import silent
 
 
@@ -217,8 +217,8 @@ def ran() -> list[int]:
     return RUN
 
 
-def files(folder: Path) -> dict[str, str]:
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*") if path.is_file()}
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, MemoryError, SimulationError])

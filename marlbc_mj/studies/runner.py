@@ -91,6 +91,7 @@ def run_study(
         _begin(store, study, keys, out, overwrite)
         try:
             results = _Run(study, jobs, keys, store, ended).results(Means(workers, engine), Ears(progress))
+            store.close()
             with staged_folder(out, overwrite=overwrite) as folder:
                 store.place_files(dict.fromkeys(keys), folder)
                 report = study.report(results, folder, progress)
