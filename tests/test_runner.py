@@ -6,12 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from small_studies import Squares
 
 from marlbc_mj.scenarios import paper
 from marlbc_mj.studies.ablation import AblationStudy, select_questions
@@ -26,7 +26,6 @@ from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST
-from marlbc_mj.util.progress import silent
 
 WORKERS = pytest.mark.parametrize("workers", [1, 2])
 
@@ -36,41 +35,6 @@ class Request:
     """A stop that may be asked for."""
 
     signal: int = 0
-
-
-@dataclass(frozen=True)
-class Squares:
-    """Squares of numbers; ``trouble`` is what happens instead at number 3."""
-
-    count: int = 4
-    trouble: str = ""
-
-    def jobs(self) -> list[int]:
-        return list(range(self.count))
-
-    def run(self, job: int, watch: Watch) -> int:
-        time.sleep(0.02 * (self.count - job))  # the first ends last
-        if job == 3 and self.trouble:
-            self.fail(watch)
-        if watch.folder is not None:
-            (watch.folder / f"{job}.txt").write_text(str(job))
-        for step in (1, 2):
-            watch.progress(f"job {job}", step, 2)
-        return job * job
-
-    def fail(self, watch: Watch) -> None:
-        if self.trouble == "death":
-            os._exit(9)
-        if self.trouble == "stop":
-            while not watch.stopping():
-                time.sleep(0.01)
-            raise Stopped
-        raise SimulationError(self.trouble)
-
-    def report(self, results: Sequence[int], out: Path | None, progress=silent) -> Report:
-        if out is not None:
-            (out / "sum.txt").write_text(str(sum(results)))
-        return Report(f"sum {sum(results)}", ("no picture",))
 
 
 @WORKERS

@@ -4,80 +4,66 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from test_runner import Squares
+from small_studies import Roots, Squares
 
 from marlbc_mj.studies import runner
 from marlbc_mj.studies.engines import make_engine
 from marlbc_mj.studies.engines.base import Ears, Engine, Task, Work
 from marlbc_mj.studies.engines.slurm_arrays import SlurmArray
-from marlbc_mj.studies.protocol import Watch
 from marlbc_mj.studies.runner import run_jobs, run_study
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-
-
-@dataclass(frozen=True)
-class Roots(Squares):
-    """Roots of numbers; number 2 kills its worker the first time, number 3 fails where ``trouble`` says so."""
-
-    once: Path | None = None
-    count: int = 5
-
-    def run(self, job: int, watch: Watch) -> np.ndarray:
-        if job == 2 and self.once is not None and not self.once.exists():
-            self.once.touch()
-            os.kill(os.getpid(), signal.SIGKILL)
-        if job == 3 and self.trouble == "error":
-            raise ZeroDivisionError("nothing to divide")
-        if job == 3 and self.trouble:
-            raise SimulationError(self.trouble)
-        if watch.folder is not None:
-            (watch.folder / f"{job}.txt").write_text(str(job))
-        return np.sqrt(np.arange(job, job + 3.0))
-
-    def report(self, results, out, progress=None):
-        if out is not None:
-            np.array(results).tofile(out / "all.bin")
-        return runner.Report()
 
 
 def files(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
-def check_engine(tmp_path: Path, use: Callable[[Path], Engine], monkeypatch: pytest.MonkeyPatch) -> None:
-    """A worker that dies in mid-job, then a job that fails: what has ended is kept, and the rest follows."""
+@pytest.fixture
+def whole(tmp_path: Path) -> dict[str, bytes]:
+    """What a study in this process leaves."""
     run_study(Roots(), tmp_path / "whole")
-    monkeypatch.setattr(runner, "make_engine", lambda name, workers: use(tmp_path))
+    return files(tmp_path / "whole")
+
+
+@pytest.fixture
+def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[Engine], None]:
+    """Has studies use an engine, whatever they ask for."""
+    return lambda engine: monkeypatch.setattr(runner, "make_engine", lambda name, workers: engine)
+
+
+def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> None:
+    """What had ended when a job failed is kept, and the rest follows."""
     with pytest.raises(SimulationError, match="it fell"):
-        run_study(Roots(trouble="it fell", once=tmp_path / "once"), tmp_path / "out", engine="ray")
-    assert (tmp_path / "once").exists()
+        run_study(Roots(trouble="it fell", once=once), out, engine="ray")
     said = []
-    done = run_study(Roots(), tmp_path / "out", engine="ray", progress=lambda *step: said.append(step))
-    assert files(tmp_path / "out") == files(tmp_path / "whole") and all(each.flags.writeable for each in done.results)
+    done = run_study(Roots(once=once), out, engine="ray", progress=lambda *step: said.append(step))
+    assert files(out) == whole and all(each.flags.writeable for each in done.results)
     assert said[0][0] == "jobs" and 0 < said[0][1] < 5 and said[-1] == ("jobs", 5, 5)
-    assert {path.name for path in tmp_path.iterdir()} == {"whole", "out", "once"}
+    assert once.exists() and [path.name for path in out.parent.glob("out*")] == ["out"]
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two local workers."""
+def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
+    """Two local workers, of which one is killed in mid-job: the job is done again, and another fails after that."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     handler = signal.getsignal(signal.SIGTERM)
-    engine = make_engine("ray", 2)
-    check_engine(tmp_path, lambda _: engine, monkeypatch)
-    assert signal.getsignal(signal.SIGTERM) == handler
+    use(make_engine("ray", 2))
+    goes_on_after_an_error(tmp_path / "out", whole, tmp_path / "once")
+    assert signal.getsignal(signal.SIGTERM) == handler and (tmp_path / "once").read_text() == "again"
 
 
-def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its processes on this machine stand for an array of two tasks."""
+def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
+    """Its processes on this machine stand for an array of two tasks; one is killed, and what it has left is submitted again."""
     monkeypatch.setattr("marlbc_mj.studies.engines.slurm_arrays.ALIVE_EVERY", 0.2)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
-    check_engine(tmp_path, lambda _: SlurmArray(2, "local"), monkeypatch)
+    use(SlurmArray(2, "local"))
+    run_study(Roots(once=tmp_path / "once"), tmp_path / "killed")
+    assert files(tmp_path / "killed") == whole and (tmp_path / "once").read_text() == "again"
+    goes_on_after_an_error(tmp_path / "out", whole, tmp_path / "once")
 
 
 def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 import os
 import signal
 import threading
+import time
 from collections.abc import Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -18,6 +19,7 @@ from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import Progress
 
 POLL = 0.2  # between two looks at the workers [s]
+GRACE = 5.0  # that a worker has to end by itself when its study was killed [s]
 DIED = "a worker process died (out of memory?)"
 
 
@@ -144,7 +146,7 @@ def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, saving: bool) -> No
     """What a worker's jobs tell goes to the study's process.
 
     Ctrl-C reaches the whole group of processes: where jobs save themselves, a worker leaves it to the study, which asks it to
-    stop. Where they do not, a worker ends at once when its study was killed.
+    stop. Where they do not, a worker ends soon after its study was killed, whatever its job does.
     """
     global _worker
     _worker = _Worker(told, stopping, saving)
@@ -158,6 +160,7 @@ def _end_with_parent() -> None:
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
+        time.sleep(GRACE)
         os._exit(1)
 
 

@@ -26,7 +26,7 @@ from marlbc_mj.util.text import one_line
 
 RESULTS_EVERY = 0.5  # between two looks for results [s]
 ALIVE_EVERY = 5.0  # between two looks whether tasks are alive [s]
-GRACE = 60.0  # until an array that was cancelled has gone [s]
+CANCELLED = 60.0  # until an array that was cancelled has gone [s]
 SLICE = 60  # after which a task of the array makes room for others, and goes on later [min]
 MOST_SLICES = 10_000
 _ARRAYS, _LOGS = "arrays", "logs"
@@ -74,6 +74,7 @@ class SlurmArray:
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise ConfigurationError("no SLURM here: there is no command sbatch")
         self.submitit: Any = submitit
+        self._jobs: list[Any] = []  # of the last array
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None or work.scratch is None:
@@ -139,12 +140,15 @@ class SlurmArray:
             return
         names = set((scratch / _ARRAYS).read_text().split())
         if self.cluster != "slurm":
-            for job in getattr(self, "_jobs", []):
+            for job in self._jobs:
                 with suppress(OSError):
                     job.cancel(check=False)
+            until = monotonic() + CANCELLED
+            while self._alive(self._jobs) and monotonic() < until:
+                sleep(RESULTS_EVERY)
         elif names:
             subprocess.run(["scancel", *names], capture_output=True, check=False)
-            until = monotonic() + GRACE
+            until = monotonic() + CANCELLED
             while _queued(names) and monotonic() < until:
                 sleep(RESULTS_EVERY)
         (scratch / _ARRAYS).unlink(missing_ok=True)
