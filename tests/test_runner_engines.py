@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,16 +68,27 @@ def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[s
 
 
 def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results that came after the end of the study are found by the next run, and nothing is submitted for them."""
+    """Results that came after the end of the study are found by the next run; only what failed is submitted again."""
     from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
 
     tasks = [Task(k, f"{k:064x}", k) for k in range(5)]
     work = Work(Roots(), None, tmp_path)
-    ArrayShare(work, tuple(tasks), tmp_path / "0-0.pack")()
+    ArrayShare(replace(work, study=Roots(trouble="it fell")), tuple(tasks), tmp_path / "0-0.pack")()
     engine = SlurmArray(2, "local")
-    monkeypatch.setattr(engine, "_submit", None)
+    submitted: list[Task] = []
+
+    def submit(work: Work, tasks: list[Task], scratch: Path, tries: int) -> list[object]:
+        submitted.extend(tasks)
+        ArrayShare(work, tuple(tasks), scratch / "0-0.pack")()
+        return []
+
+    monkeypatch.setattr(engine, "_submit", submit)
     found = dict(engine.map(work, tasks, Ears()))
-    assert sorted(found) == list(range(5)) and found[4].tobytes() == np.sqrt(np.arange(4.0, 7.0)).tobytes()
+    assert (
+        [task.place for task in submitted] == [3]
+        and sorted(found) == list(range(5))
+        and found[4].tobytes() == np.sqrt(np.arange(4.0, 7.0)).tobytes()
+    )
 
 
 def test_a_share_goes_on_where_it_was_killed(tmp_path: Path) -> None:
@@ -97,9 +109,7 @@ def test_an_error_that_is_not_ours_is_one_line(tmp_path: Path) -> None:
     from marlbc_mj.studies.engines.base import attempt
 
     outcome = attempt(Work(Roots(trouble="error")), Task(3, "", 3))
-    with pytest.raises(
-        SimulationError, match=r"a job failed: ZeroDivisionError: nothing to divide \(test_runner_engines.py, line"
-    ):
+    with pytest.raises(SimulationError, match=r"a job failed: ZeroDivisionError: nothing to divide \(small_studies.py, line"):
         outcome.unpack()
 
 

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -35,10 +36,9 @@ class RayTasks:
     def __init__(self, workers: int) -> None:
         self.workers = workers
         try:
-            import ray
+            self.ray: Any = import_module("ray")
         except ImportError as error:
             raise ConfigurationError("the engine ray needs Ray: pip install 'marlbc-mj[ray]'") from error
-        self.ray: Any = ray
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None:

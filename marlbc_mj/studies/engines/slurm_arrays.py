@@ -12,6 +12,7 @@ import shutil
 import subprocess
 from collections.abc import Generator, Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any, NamedTuple
@@ -49,9 +50,7 @@ class ArrayShare(NamedTuple):
 
     def checkpoint(self) -> Any:
         """What submitit submits when the time of a task is up: the same again."""
-        import submitit
-
-        return submitit.helpers.DelayedSubmission(self)
+        return import_module("submitit").helpers.DelayedSubmission(self)
 
 
 class SlurmArray:
@@ -68,12 +67,11 @@ class SlurmArray:
     def __init__(self, workers: int, cluster: str = "slurm") -> None:
         self.workers, self.cluster = workers, cluster
         try:
-            import submitit
+            self.submitit: Any = import_module("submitit")
         except ImportError as error:
             raise ConfigurationError("the engine slurm needs submitit: pip install 'marlbc-mj[slurm]'") from error
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise ConfigurationError("no SLURM here: there is no command sbatch")
-        self.submitit: Any = submitit
         self._jobs: list[Any] = []  # of the last array
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
@@ -83,7 +81,7 @@ class SlurmArray:
             (work.scratch / _LOGS).mkdir(parents=True, exist_ok=True)
         self._cancel(work.scratch)
         array = _Array({task.key: task for task in tasks}, work.scratch)
-        yield from array.arrived()  # of an array whose study was killed
+        yield from array.arrived(failed=False)  # of an array whose study was killed
         for pack in work.scratch.glob(f"*{PACK_SUFFIX}"):
             pack.unlink()
         try:
@@ -162,8 +160,11 @@ class _Array:
         self.scratch = scratch
         self._read: dict[Path, int] = {}
 
-    def arrived(self) -> Generator[tuple[int, Any]]:
+    def arrived(self, *, failed: bool = True) -> Generator[tuple[int, Any]]:
         """Results since the last call.
+
+        Args:
+            failed: whether jobs that raised count; if not, they are left, and done again.
 
         Raises:
             ConfigurationError, SimulationError: what a job raised.
@@ -171,10 +172,12 @@ class _Array:
         for pack in sorted(self.scratch.glob(f"*{PACK_SUFFIX}")):
             for entry in entries(pack, self._read.get(pack, 0)):
                 self._read[pack] = entry.start + entry.length
-                task = self.left.pop(entry.key, None)
-                if task is not None:
-                    outcome: Outcome = codec.from_bytes(entry.payload())
-                    yield task.place, outcome.unpack()
+                task = self.left.get(entry.key)
+                outcome: Outcome = codec.from_bytes(entry.payload())
+                if task is not None and (failed or not outcome.error):
+                    result = outcome.unpack()
+                    del self.left[entry.key]
+                    yield task.place, result
 
 
 def _queued(names: set[str]) -> list[str]:
