@@ -44,8 +44,8 @@ class Target:
     arguments: tuple[str, ...]  # OUT stands for the output
     again: Callable[[Path], tuple[str, ...] | None] = lambda out: None
     """Arguments for going on, where they differ."""
-    finished: str = ""  # a file of the output that is there when it is finished; the output itself where it is a file
     engines: bool = False  # whether it takes --engine
+    program: tuple[str, ...] = ("-m", "marlbc_mj")
 
 
 def _resumed(out: Path) -> tuple[str, ...] | None:
@@ -54,17 +54,17 @@ def _resumed(out: Path) -> tuple[str, ...] | None:
     return None
 
 
+DIGESTS = (str(Path(__file__).with_name("digests.py")),)
 METHODS = ("--supervisors", "scripted", "fsams", "fms", "--controllers", "sorlc", "pd")
 TARGETS = {
+    "digests": Target(("OUT", "ENGINE", "WORKERS", "0.05"), program=DIGESTS),
     "bench": Target(
         ("bench", "paper", *METHODS, "--no-figures", "--video", "none", *SHORT, "--out", "OUT"),
         engines=True,
-        finished="summary.json",
     ),
     "evaluate": Target(
         ("evaluate", "field", "--supervisors", "fsams", "fms", "layered", "--seeds", "6", *SHORT, "--out", "OUT"),
         engines=True,
-        finished="summary.json",
     ),
     "gate": Target(
         (
@@ -82,20 +82,15 @@ TARGETS = {
             "OUT",
         ),
         engines=True,
-        finished="gate.json",
     ),
     "study": Target(
         ("study", "--variants", "marlms", "vdn", "--seeds", "1", "--budget", "3200", "--out", "OUT", "--set", *TINY),
-        finished="study.csv",
     ),
     "train": Target(
         ("train", "--budget", "6400", "--threads", "1", "--overwrite", "--out", "OUT", "--set", *TINY),
         again=_resumed,
-        finished="eval.csv",
     ),
-    "run": Target(
-        ("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT"), finished="metrics.json"
-    ),
+    "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
     "video": Target(("video", "LOG", "--width", "160", "--height", "90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
 }
 """By name."""
@@ -112,15 +107,23 @@ class Killer:
     def arguments(self, name: str, out: Path) -> list[str]:
         """The command line of a target."""
         target = TARGETS[name]
-        given = [_filled(word, out, self.folder) for word in target.again(out) or target.arguments]
+        given = [self._filled(word, out) for word in target.again(out) or target.arguments]
         if target.engines:
             given += ["--engine", self.engine, "--workers", str(self.workers)]
         return given
 
+    def _filled(self, word: str, out: Path) -> str:
+        known = {
+            "LOG": str(self.folder / "run-whole" / "logs" / "fsams+sorlc.mcap"),
+            "ENGINE": self.engine,
+            "WORKERS": str(self.workers),
+        }
+        return known.get(word, word.replace("OUT", str(out)))
+
     def start(self, name: str, out: Path) -> subprocess.Popen[str]:
         """A command in a session of its own, with its output in a file."""
         said = (self.folder / "said.txt").open("w")
-        command = [sys.executable, "-m", "marlbc_mj", *self.arguments(name, out)]
+        command = [sys.executable, *TARGETS[name].program, *self.arguments(name, out)]
         with said:
             return subprocess.Popen(command, env=self.environment, stdout=said, stderr=said, text=True, start_new_session=True)
 
@@ -154,7 +157,7 @@ class Killer:
         _remove(out)
         faults: list[str] = []
         moments, kept = [], []
-        for _ in range(rng.choice((1, 1, 2, 3))):
+        for _ in range(rng.choice((1, 2, 3, 4))):
             process = self.start(name, out)
             moment = rng.uniform(0.3, 1.0) * seconds
             with suppress(subprocess.TimeoutExpired):
@@ -229,11 +232,6 @@ def _is_worker(process: int) -> bool:
         line = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
         return "spawn_main" in line or line.startswith(RAY_PARTS) or "/raylet" in line
     return False
-
-
-def _filled(word: str, out: Path, folder: Path) -> str:
-    log = folder / "run-whole" / "logs" / "fsams+sorlc.mcap"
-    return str(log) if word == "LOG" else word.replace("OUT", str(out))
 
 
 def _output(name: str, out: Path) -> Path:

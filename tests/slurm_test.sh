@@ -63,7 +63,7 @@ slurmd
 for _ in $(seq 60); do sinfo --noheader --format=%T 2>/dev/null | grep -q idle && break; sleep 1; done
 sinfo
 
-"$python" "$here/slurm_study.py" "$work/out" &
+"$python" "$here/digests.py" "$work/out" slurm 40 3 &
 study=$!
 until [ "$(squeue --noheader --states=R 2>/dev/null | wc -l)" -ge 4 ]; do sleep 0.5; kill -0 $study; done
 sleep 4

@@ -1,4 +1,4 @@
-"""A study of 40 small jobs, run by ``make slurm-test`` on an array of 40 tasks, and compared with one in this process."""
+"""A study of 40 small jobs, for ``make slurm-test`` and ``make kills``: ``python tests/digests.py OUT ENGINE WORKERS PAUSE``."""
 
 import hashlib
 import sys
@@ -37,13 +37,20 @@ class Digests:
         return Report()
 
 
-if __name__ == "__main__":
-    from slurm_study import Digests as Same  # not of __main__, which tasks cannot import
+def main(out: str, engine: str, workers: int, pause: float) -> None:
+    """Run the study on an engine and compare its results with those of this process."""
+    from digests import Digests as Same  # not of __main__, which workers cannot import
 
-    out = Path(sys.argv[1])
-    done = run_study(
-        Same(pause=3.0), out, engine="slurm", workers=JOBS, progress=lambda *step: print(*step, file=sys.stderr, flush=True)
-    )
-    assert done.results == run_jobs(Same()), "results of the array differ"
-    assert len(list(out.glob("*.txt"))) == JOBS + 1
+    def show(what: str, done: float, total: float) -> None:
+        print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)
+
+    done = run_study(Same(pause=pause), Path(out), overwrite=True, engine=engine, workers=workers, progress=show)
+    if done.results != run_jobs(Same()):
+        sys.exit("results differ from those of one process")
+    if len(list(Path(out).glob("*.txt"))) != JOBS + 1:
+        sys.exit("files are missing")
     print(f"{JOBS} of {JOBS} results, equal to those of one process")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), float(sys.argv[4]))
