@@ -60,7 +60,7 @@ def progress_bars() -> Iterator[Progress]:
 
         def update(what: str, done: float, total: float) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total, completed=done, rate="")  # what was done before has no rate
+                tasks[what] = bars.add_task(what, total=total, completed=int(done), rate="")  # what was done before has no rate
             task = bars.tasks[tasks[what]]
             rate = f"{task.finished_speed or task.speed or 0.0:.3g} /s"
             bars.update(tasks[what], completed=done, total=total, rate=rate)

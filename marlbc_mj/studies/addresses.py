@@ -108,9 +108,9 @@ def _user_files(encoder: Encoder) -> Iterator[str]:
         if file.endswith((*_NEIGHBORS, ".safetensors", ".toml")) and "\0" not in file and Path(file).is_file():
             yield file
     for kind in encoder.types:
-        file = getattr(sys.modules.get(kind.__module__), "__file__", None)
-        if file is not None and kind.__module__.partition(".")[0] != _PACKAGE and Path(file).is_file():
-            yield file
+        home = getattr(sys.modules.get(kind.__module__), "__file__", None)
+        if home is not None and kind.__module__.partition(".")[0] != _PACKAGE and Path(home).is_file():
+            yield str(home)
 
 
 def _contents(path: Path) -> bytes:

@@ -51,7 +51,8 @@ class RayTasks:
         remote = ray.remote(num_cpus=1, max_retries=MOST_TRIES - 1)(_attempt)
         shared = ray.put(_Shared(pickle.dumps(work), os.getcwd(), tuple(sys.path)))
         ahead = (1 + TASKS_AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        left, places = list(reversed(tasks)), {}
+        left = list(reversed(tasks))
+        places: dict[Any, int] = {}
         try:
             while left or places:
                 while left and len(places) < ahead:
