@@ -136,7 +136,10 @@ def compiled(function: Law) -> Law:
 
 def inlined(function: Law) -> Law:
     """A helper of laws, pasted into its caller: for a few lines that run in every substep."""
-    return cast(Law, register_jitable(inline="always")(function))
+    law: Any = register_jitable(inline="always")(function)
+    # With these two numba pastes before it looks at types, and does not compile the helper by itself for every type first.
+    law.targetoptions, law.py_func = {"inline": "always"}, law
+    return cast(Law, law)
 
 
 @inlined

@@ -1,6 +1,7 @@
 """How the compiled loop is called: what a World hands over is bundled once, and worlds are stepped in series or by threads."""
 
 import numba
+import numpy as np
 from numba import types
 from numba.experimental import structref
 
@@ -26,59 +27,42 @@ def bundle(mission, behaviors, native, plant, team, record):
     return Arguments(mission, behaviors, native, plant, team, record)
 
 
-@threaded
-def _step_parallel(worlds, orders, given, mission, behaviors, native, plant, team, record):
-    failed = 0
-    for b in numba.prange(worlds):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
 @compiled
-def step_parallel(orders, given, a):
-    """:func:`mission_step` of every world, shared out over numba's threads; the same numbers as in series."""
-    worlds = a.team.steps.shape[0]
-    return _step_parallel(worlds, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+def play(b, returns, sequence, given, mission, behaviors, native, plant, team, record):
+    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other, up to one that fails.
 
-
-@compiled
-def step_serial(orders, given, a):
-    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
-    mission, behaviors, native, plant, team, record = a.mission, a.behaviors, a.native, a.plant, a.team, a.record
-    failed = 0
-    for b in range(team.steps.shape[0]):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
-@compiled
-def roll_out(b, sequence, given, mission, behaviors, native, plant, team, record):
-    """MissionRules steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
-
-    Returns the sum of rewards, up to the step that failed if one did.
+    The sum of rewards goes into ``returns`` (B,). Returns 1 if a mission step failed, else 0.
     """
     total = 0.0
+    failed = 0
     for m in range(sequence.shape[0]):
-        if mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record):
+        failed = mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record)
+        if failed:
             break
         total += team.reward[b]
-    return total
+    returns[b] = total
+    return failed
 
 
 @threaded
-def _rollout_parallel(returns, sequence, given, mission, behaviors, native, plant, team, record):
+def _share_out(returns, sequence, given, mission, behaviors, native, plant, team, record):
+    failed = 0
     for b in numba.prange(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, mission, behaviors, native, plant, team, record)
+        # A parallel loop counts in uint64: without the conversion everything below would be compiled once more for that type.
+        failed += play(np.int64(b), returns, sequence, given, mission, behaviors, native, plant, team, record)
+    return failed
 
 
 @compiled
-def rollout_parallel(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series."""
-    _rollout_parallel(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+def play_parallel(returns, sequence, given, a):
+    """:func:`play` of every world, shared out over numba's threads; the same numbers as in series."""
+    return _share_out(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
 
 
 @compiled
-def rollout_serial(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), one after the other."""
+def play_serial(returns, sequence, given, a):
+    """:func:`play` of every world, one after the other. Returns how many failed."""
+    failed = 0
     for b in range(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+        failed += play(b, returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    return failed
