@@ -125,7 +125,10 @@ def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def threaded(function: Law) -> Law:
-    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads."""
+    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads.
+
+    Such a loop counts in uint64. It should hand on ``np.int64`` of that: otherwise whatever it calls is compiled once more.
+    """
     return _jit(function, parallel=True)
 
 
@@ -136,10 +139,7 @@ def compiled(function: Law) -> Law:
 
 def inlined(function: Law) -> Law:
     """A helper of laws, pasted into its caller: for a few lines that run in every substep."""
-    law: Any = register_jitable(inline="always")(function)
-    # With these two numba pastes before it looks at types, and does not compile the helper by itself for every type first.
-    law.targetoptions, law.py_func = {"inline": "always"}, law
-    return cast(Law, law)
+    return cast(Law, register_jitable(inline="always")(function))
 
 
 @inlined

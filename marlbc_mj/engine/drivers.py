@@ -28,41 +28,38 @@ def bundle(mission, behaviors, native, plant, team, record):
 
 
 @compiled
-def play(b, returns, sequence, given, mission, behaviors, native, plant, team, record):
-    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other, up to one that fails.
+def play(b, sequence, given, mission, behaviors, native, plant, team, record):
+    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
 
-    The sum of rewards goes into ``returns`` (B,). Returns 1 if a mission step failed, else 0.
+    Returns the sum of rewards, up to the step that failed if one did; ``team.status`` tells.
     """
     total = 0.0
-    failed = 0
     for m in range(sequence.shape[0]):
-        failed = mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record)
-        if failed:
+        if mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record):
             break
         total += team.reward[b]
-    returns[b] = total
-    return failed
+    return total
 
 
 @threaded
 def _share_out(returns, sequence, given, mission, behaviors, native, plant, team, record):
-    failed = 0
     for b in numba.prange(returns.shape[0]):
-        # A parallel loop counts in uint64: without the conversion everything below would be compiled once more for that type.
-        failed += play(np.int64(b), returns, sequence, given, mission, behaviors, native, plant, team, record)
-    return failed
+        returns[b] = play(np.int64(b), sequence, given, mission, behaviors, native, plant, team, record)
 
 
 @compiled
 def play_parallel(returns, sequence, given, a):
-    """:func:`play` of every world, shared out over numba's threads; the same numbers as in series."""
-    return _share_out(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    """:func:`play` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series.
+
+    Returns how many worlds failed.
+    """
+    _share_out(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    return np.count_nonzero(a.team.status)
 
 
 @compiled
 def play_serial(returns, sequence, given, a):
-    """:func:`play` of every world, one after the other. Returns how many failed."""
-    failed = 0
+    """:func:`play` of every world into ``returns`` (B,), one after the other. Returns how many worlds failed."""
     for b in range(returns.shape[0]):
-        failed += play(b, returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
-    return failed
+        returns[b] = play(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    return np.count_nonzero(a.team.status)
