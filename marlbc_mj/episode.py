@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.behaviors import clearances, clearances_among
+from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine.loop import Record
@@ -15,6 +16,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
+from marlbc_mj.supervisors.communication import Hearing, hearing
 from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
@@ -32,6 +34,7 @@ class Frame(NamedTuple):
     decision_ms: float  # what the supervisor took [ms]
     pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
     shield: ShieldCounts | None = None  # (N,) each, since the episode began, at the end of the mission step; with a shield only
+    hearing: Hearing | None = None  # (N, N) each, when orders were given; where messages are not ideal, of a supervisor with any
 
     @property
     def first(self) -> Record:
@@ -62,6 +65,7 @@ class Trajectory:
     motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as motion.move has them; (0, 6): at rest
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
     shield: ShieldCounts | None = None  # (M, N) each, at the end of each mission step, see Frame
+    hearing: Hearing | None = None  # (M, N, N) each, see Frame
 
     def clearances(self) -> np.ndarray:
         """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
@@ -103,13 +107,15 @@ def run_episode(
         began = perf_counter()
         decision, memory = supervisor.decide(observation, memory)
         decision_ms = 1e3 * (perf_counter() - began)
+        heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
         controller_state, pose = world.state.controller[0].copy(), body_poses(world)
         step = carry_out(world, decision)
         assert step.record is not None, "run_episode needs World(record=True)"
         record = Record(*(rows[0] for rows in step.record))
         command, reward = step.observation.command[0], float(step.reward[0])
         shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
-        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose, shield))
+        links = None if heard is None else heard.team(0)
+        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose, shield, links))
         if on_frame is not None:
             on_frame(frames[-1])
         observation, done = step.observation, bool(step.done[0])
@@ -142,6 +148,7 @@ def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int,
         motions=state.motions[0].copy(),
         pose=np.array([f.pose for f in frames]),
         shield=_shield(frames),
+        hearing=_hearing(frames),
     )
 
 
@@ -149,6 +156,12 @@ def _shield(frames: list[Frame]) -> ShieldCounts | None:
     """What a shield did by the end of each mission step; None without a shield."""
     counts = [f.shield for f in frames if f.shield is not None]
     return ShieldCounts(*(np.array(rows) for rows in zip(*counts, strict=True))) if counts else None
+
+
+def _hearing(frames: list[Frame]) -> Hearing | None:
+    """Who heard whom at each mission step; None where nobody said anything, or all heard everything."""
+    moments = [f.hearing for f in frames if f.hearing is not None]
+    return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True))) if moments else None
 
 
 def body_poses(world: World, b: int = 0) -> np.ndarray:
