@@ -1,6 +1,6 @@
 """One episode: supervisor and world in turn, and the trajectory they leave behind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
@@ -13,7 +13,7 @@ from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.world import World
+from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
 from marlbc_mj.supervisors.communication import Hearing, hearing
@@ -99,44 +99,89 @@ def run_episode(
     """
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
-    supervisor = batched(supervisor)
-    memory = supervisor.start(world.scenario, 1)
-    observation, done = world.reset(seed), False
-    frames: list[Frame] = []
+    frames, last = _play(world, batched(supervisor), world.reset(seed), on_frame)
+    return _trajectory(world, 0, frames[0], last, (seed, *names))
+
+
+def run_episodes(
+    world: World,
+    supervisor: Supervisor | OneTeamSupervisor,
+    seeds: Sequence[int],
+    *,
+    names: tuple[str, str] = ("supervisor", "controller"),
+) -> list[Trajectory]:
+    """Run the episodes of many seeds together, a world each: bit for bit those of :func:`run_episode`, in less time.
+
+    A decision counts as what it took for all, divided by their number.
+
+    Args:
+        world: made with ``worlds=len(seeds), record=True``.
+        supervisor: decides for B teams, or for one.
+        seeds: which draws of the scenario.
+        names: supervisor's and controller's.
+
+    Raises:
+        ConfigurationError: another number of worlds, or a decision of wrong shape or type.
+        SimulationError: one of the worlds diverged.
+    """
+    if world.worlds != len(seeds):
+        raise ConfigurationError(f"run_episodes needs a World of {len(seeds)} worlds, got {world.worlds}")
+    one = World(world.scenario, world.plan.controller, native=world.native, shield=world.shield)
+    for b, seed in enumerate(seeds):
+        one.reset(seed)
+        world.copy_world(one, 0, b)
+    frames, last = _play(world, batched(supervisor), world.observe())
+    return [_trajectory(world, b, frames[b], last, (seed, *names)) for b, seed in enumerate(seeds)]
+
+
+def _play(
+    world: World, supervisor: Supervisor, observation: Observation, on_frame: Callable[[Frame], None] | None = None
+) -> tuple[list[list[Frame]], Observation]:
+    """All worlds to the end of their episodes: the frames of each, and what is seen at the end."""
+    memory, done = supervisor.start(world.scenario, world.worlds), False
+    frames: list[list[Frame]] = [[] for _ in range(world.worlds)]
     while not done:
         began = perf_counter()
         decision, memory = supervisor.decide(observation, memory)
-        decision_ms = 1e3 * (perf_counter() - began)
+        decision_ms = 1e3 * (perf_counter() - began) / world.worlds
         heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
-        controller_state, pose = world.state.controller[0].copy(), body_poses(world)
+        before = [(world.state.controller[b].copy(), body_poses(world, b)) for b in range(world.worlds)]
         step = carry_out(world, decision)
-        assert step.record is not None, "run_episode needs World(record=True)"
-        record = Record(*(rows[0] for rows in step.record))
-        command, reward = step.observation.command[0], float(step.reward[0])
-        shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
-        links = None if heard is None else heard.team(0)
-        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose, shield, links))
-        if on_frame is not None:
-            on_frame(frames[-1])
-        observation, done = step.observation, bool(step.done[0])
-    return _trajectory(world, frames, observation, seed, names)
+        for b, (controller_state, pose) in enumerate(before):
+            frames[b].append(_frame(b, observation, step, (controller_state, decision_ms, pose), heard))
+            if on_frame is not None:
+                on_frame(frames[b][-1])
+        observation, done = step.observation, bool(step.done.all())
+    return frames, observation
 
 
-def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int, names: tuple[str, str]) -> Trajectory:
-    """The frames of a whole episode in one world, and the ``last`` observation of its end, as one record."""
+def _frame(b: int, seen: Observation, step: Step, others: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
+    """Of world ``b``; ``others`` are controller state, decision time and pose."""
+    assert step.record is not None, "an episode needs World(record=True)"
+    record = Record(*(rows[b] for rows in step.record))
+    shield = None if step.shield is None else ShieldCounts(*(rows[b] for rows in step.shield))
+    links = None if heard is None else heard.team(b)
+    return Frame(seen.team(b), record, step.observation.command[b], float(step.reward[b]), *others, shield, links)
+
+
+def _trajectory(world: World, b: int, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
+    """The frames of a whole episode in world ``b``, and the ``last`` observation of its end, as one record.
+
+    ``names`` are seed, supervisor and controller.
+    """
     scenario, state = world.scenario, world.state
     position, velocity, *others = (np.concatenate(rows) for rows in zip(*(f.record for f in frames), strict=True))
     reference, reference_velocity, force = others
-    formation = [*(f.observation.formation for f in frames[1:]), last.formation[0]]
+    formation = [*(f.observation.formation for f in frames[1:]), last.formation[b]]
     return Trajectory(
         scenario=scenario,
-        supervisor=names[0],
-        controller=names[1],
-        seed=seed,
-        obstacles=(state.anchors if scenario.moving else state.obstacles)[0].copy(),
+        supervisor=names[1],
+        controller=names[2],
+        seed=names[0],
+        obstacles=(state.anchors if scenario.moving else state.obstacles)[b].copy(),
         time=np.arange(len(position)) * scenario.substep,
-        position=np.concatenate([position, last.position]),
-        velocity=np.concatenate([velocity, last.velocity]),
+        position=np.concatenate([position, last.position[b, None]]),
+        velocity=np.concatenate([velocity, last.velocity[b, None]]),
         reference=reference,
         reference_velocity=reference_velocity,
         force=force,
@@ -145,7 +190,7 @@ def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int,
         reward=np.array([f.reward for f in frames]),
         controller_state=np.array([f.controller_state for f in frames]),
         decision_ms=np.array([f.decision_ms for f in frames]),
-        motions=state.motions[0].copy(),
+        motions=state.motions[b].copy(),
         pose=np.array([f.pose for f in frames]),
         shield=_shield(frames),
         hearing=_hearing(frames),

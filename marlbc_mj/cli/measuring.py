@@ -1,4 +1,4 @@
-"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speeds, and what is behind the numbers."""
+"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and what is behind it."""
 
 from dataclasses import dataclass, field
 from pathlib import Path

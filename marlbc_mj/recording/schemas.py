@@ -201,7 +201,10 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
         if not all(1 <= number <= agents for number in heard):
             raise ValueError(f"an agent hears {row['hears']}, of {agents} agents")
         link[i, [number - 1 for number in heard]] = True
-        age[i] = [math.inf if text == UNKNOWN_AGE else float(text) for text in row["ages"].split()]
+        ages = [math.inf if text == UNKNOWN_AGE else float(text) for text in row["ages"].split()]
+        if len(ages) != agents:
+            raise ValueError(f"an agent knows {len(ages)} ages, of {agents} agents")
+        age[i] = ages
     return Hearing(link, age)
 
 

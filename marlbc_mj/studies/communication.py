@@ -9,16 +9,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.communication import Communication
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episodes
 from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.results.metrics import Metrics, measure
 from marlbc_mj.results.outcomes import outcome_rates
-from marlbc_mj.results.seeds import MethodRuns
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.formations import column, grid
 from marlbc_mj.studies.draws import DrawsJob, fly_draws
+from marlbc_mj.studies.episodes import check_free
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.supervisors.communication import Consensus, Flooding, Radio
+from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
@@ -80,11 +85,11 @@ class CommunicationStudy:
         flown = [replace(mission, communication=case.settings(mission)) for mission, case in self.pairs()]
         return [DrawsJob(scenario, self.supervisor, self.controller, self.seeds, self.shield) for scenario in flown]
 
-    def run(self, job: DrawsJob, watch: Watch) -> MethodRuns:
-        return fly_draws(job, watch.progress)
+    def run(self, job: DrawsJob, watch: Watch) -> list[Metrics | None]:
+        return fly_together(job)
 
-    def report(self, results: Sequence[MethodRuns], out: Path | None, progress: Progress = silent) -> Report:
-        rows = [case_row(mission, case, runs) for (mission, case), runs in zip(self.pairs(), results, strict=True)]
+    def report(self, results: Sequence[list[Metrics | None]], out: Path | None, progress: Progress = silent) -> Report:
+        rows = [case_row(mission, case, metrics) for (mission, case), metrics in zip(self.pairs(), results, strict=True)]
         if out is not None:
             with open(out / "communication.csv", "w", newline="") as stream:
                 table = csv.DictWriter(stream, rows[0], lineterminator="\n")
@@ -95,9 +100,21 @@ class CommunicationStudy:
         return Report(to_markdown(case_table(rows)))
 
 
-def case_row(mission: Scenario, case: Case, runs: MethodRuns) -> dict[str, Any]:
+def fly_together(job: DrawsJob) -> list[Metrics | None]:
+    """Metrics of every seed, in one batch; None for a run that failed. One by one where a world diverged, to tell which."""
+    law = make_controller(job.controller)
+    world = World(job.scenario, law, worlds=len(job.seeds), record=True, shield=job.shield)
+    try:
+        flown = run_episodes(world, make_supervisor(job.supervisor, job.controller), job.seeds)
+        for trajectory in flown:
+            check_free(trajectory, law)
+    except SimulationError:
+        return [run.metrics for run in fly_draws(job).runs]
+    return [measure(trajectory) for trajectory in flown]
+
+
+def case_row(mission: Scenario, case: Case, metrics: Sequence[Metrics | None]) -> dict[str, Any]:
     """The numbers of one row; shares have Wilson's interval beside them."""
-    metrics = [run.metrics for run in runs.runs]
     rates = outcome_rates(metrics, mission)
     flown = [one for one in metrics if one is not None]
     shares = {name: rates[name] for name in ("success", "violation", "reached", "collided")}

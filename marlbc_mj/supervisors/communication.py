@@ -217,9 +217,13 @@ def _deliver(
     later = []
     for sent in under_way:
         arrived = sent.arrival <= count
-        knowledge = _newest(knowledge, sent.knowledge, sent.hears & arrived[:, None, None])
-        if not arrived.all():
+        if arrived.all():
+            knowledge = _newest(knowledge, sent.knowledge, sent.hears)
+        elif arrived.any():
+            knowledge = _newest(knowledge, sent.knowledge, sent.hears & arrived[:, None, None])
             later.append(sent._replace(hears=sent.hears & ~arrived[:, None, None]))
+        else:
+            later.append(sent)
     return knowledge, tuple(later)
 
 
@@ -228,12 +232,12 @@ def _newest(knowledge: Knowledge, sent: Knowledge, hears: np.ndarray) -> Knowled
     if not hears.any():
         return knowledge
     offered = np.where(hears[..., None], sent.stamp[:, None], NEVER_HEARD)  # (B, i, j, k): what j tells i of k
-    best = offered.argmax(axis=2)
-    newest = np.take_along_axis(offered, best[:, :, None], axis=2)[:, :, 0]
-    teams, receivers, authors = np.nonzero(newest > knowledge.stamp)
+    newer = offered.max(axis=2) > knowledge.stamp
+    teams, _, authors = np.nonzero(newer)
+    senders = offered.argmax(axis=2)[newer]
     heard, stamp = knowledge.heard.copy(), knowledge.stamp.copy()
-    stamp[teams, receivers, authors] = newest[teams, receivers, authors]
-    heard[teams, receivers, authors] = sent.heard[teams, best[teams, receivers, authors], authors]
+    stamp[newer] = sent.stamp[teams, senders, authors]
+    heard[newer] = sent.heard[teams, senders, authors]
     return Knowledge(heard, stamp)
 
 
