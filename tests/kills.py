@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj.studies.packs import entries
+from marlbc_mj.studies.packs import entries, packs
 
 MOST_SECONDS = 400.0  # of one command
 ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
@@ -57,7 +57,7 @@ def _resumed(out: Path) -> tuple[str, ...] | None:
 DIGESTS = (str(Path(__file__).with_name("digests.py")),)
 METHODS = ("--supervisors", "scripted", "fsams", "fms", "--controllers", "sorlc", "pd")
 TARGETS = {
-    "digests": Target(("OUT", "ENGINE", "WORKERS", "0.05"), program=DIGESTS),
+    "digests": Target(("OUT", "ENGINE", "WORKERS", "0.05"), engines=True, program=DIGESTS),
     "bench": Target(
         ("bench", "paper", *METHODS, "--no-figures", "--video", "none", *SHORT, "--out", "OUT"),
         engines=True,
@@ -108,7 +108,7 @@ class Killer:
         """The command line of a target."""
         target = TARGETS[name]
         given = [self._filled(word, out) for word in target.again(out) or target.arguments]
-        if target.engines:
+        if target.engines and target.program != DIGESTS:
             given += ["--engine", self.engine, "--workers", str(self.workers)]
         return given
 
@@ -159,12 +159,10 @@ class Killer:
         moments, kept = [], []
         for _ in range(rng.choice((1, 2, 3, 4))):
             process = self.start(name, out)
-            moment = rng.uniform(0.3, 1.0) * seconds
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(moment)
+            moments.append(_wait(process, out, seconds, TARGETS[name].engines, rng))
             if process.poll() is not None:
+                moments.pop()
                 break
-            moments.append(moment)
             whom = rng.choice(("study", "study", "group", "worker"))
             _strike(process, whom, rng)
             if whom == "worker":  # the command itself goes on, or ends with an error
@@ -172,7 +170,7 @@ class Killer:
                     process.wait(MOST_SECONDS)
             process.wait()
             faults += self.leftovers(name, out)
-            kept.append(sum(1 for pack in out.glob(".jobs/*.pack") for _ in entries(pack)))
+            kept.append(_kept(out))
         status, _ = self.finish(name, out)
         if status != 0:
             faults.append(f"exit {status}: {(self.folder / 'said.txt').read_text().strip().splitlines()[-1:]}")
@@ -201,6 +199,25 @@ class Killer:
                 state = (entry / "stat").read_text().rpartition(")")[2].split()[0]
                 if state not in "ZX" and mark in (entry / "environ").read_bytes().split(b"\0"):
                     yield int(entry.name)
+
+
+def _kept(out: Path) -> int:
+    """How many results an unfinished run has; −1 where there is none."""
+    return sum(1 for pack in packs(out / ".jobs") for _ in entries(pack)) if (out / ".jobs").is_dir() else -1
+
+
+def _wait(process: subprocess.Popen[str], out: Path, seconds: float, stores: bool, rng: random.Random) -> float:
+    """Until a random moment of the run, or until another result is there and a little longer; the time [s]."""
+    began, before = time.monotonic(), max(0, _kept(out))
+    until, more = began + rng.uniform(0.3, 1.0) * seconds, rng.choice((0, 1, 2, 3)) if stores else 0
+    while process.poll() is None:
+        if more and _kept(out) >= before + more:
+            time.sleep(rng.uniform(0.0, 0.05 * seconds))
+            break
+        if not more and time.monotonic() > until:
+            break
+        time.sleep(0.02)
+    return time.monotonic() - began
 
 
 def _strike(process: subprocess.Popen[str], whom: str, rng: random.Random) -> None:
