@@ -36,7 +36,7 @@ SlurmctldTimeout=10
 SlurmdTimeout=10
 ReturnToService=2
 JobRequeue=1
-RebootProgram=/bin/true
+SlurmdParameters=config_overrides
 NodeName=$host NodeAddr=127.0.0.1 CPUs=8 RealMemory=1000 State=UNKNOWN
 PartitionName=all Nodes=ALL Default=YES MaxTime=INFINITE State=UP
 END
@@ -50,6 +50,8 @@ clean() {
     [ -n "${KEEP:-}" ] && echo "$work" || rm -rf "$work"
 }
 trap clean EXIT
+trap "exit 143" TERM
+trap "exit 130" INT
 
 if ! munge -n >/dev/null 2>&1; then
     [ -f /etc/munge/munge.key ] || { dd if=/dev/urandom of=/etc/munge/munge.key bs=1024 count=1 status=none; }

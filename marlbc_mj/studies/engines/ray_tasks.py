@@ -5,15 +5,18 @@ Ray tries a task again whose worker or node died. Jobs whose study leaves large 
 
 import os
 import pickle
+import secrets
 import signal
+import subprocess
 import sys
 import threading
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from marlbc_mj.studies.engines import guard
 from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
 from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -43,7 +46,7 @@ class RayTasks:
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None:
             raise ConfigurationError("jobs that save themselves run on this machine only; leave out --engine ray")
-        with self._connected():
+        with nullcontext() if os.environ.get(ADDRESS) else _guarded(), self._connected():
             yield from self._finished(work, tasks)
 
     def _finished(self, work: Work[JobT, ResultT], tasks: Sequence[Task]) -> Generator[tuple[int, ResultT]]:
@@ -100,6 +103,20 @@ class RayTasks:
             yield
         finally:
             ray.shutdown()
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """A process that ends the Ray that is started in the block, should this one be killed."""
+    token = secrets.token_hex(8)
+    command = [sys.executable, "-m", guard.__name__, token]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as guarding:
+        os.environ[guard.TOKEN] = token
+        try:
+            yield
+        finally:
+            del os.environ[guard.TOKEN]
+            guarding.terminate()
 
 
 class _Shared(NamedTuple):
