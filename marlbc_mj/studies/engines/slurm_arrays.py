@@ -82,8 +82,7 @@ class SlurmArray:
         self._cancel(work.scratch)
         array = _Array({task.key: task for task in tasks}, work.scratch)
         yield from array.arrived(failed=False)  # of an array whose study was killed
-        for pack in work.scratch.glob(f"*{PACK_SUFFIX}"):
-            pack.unlink()
+        array.clear()
         try:
             yield from self._rounds(work, array, ears)
         finally:
@@ -159,6 +158,12 @@ class _Array:
         self.left = left
         self.scratch = scratch
         self._read: dict[Path, int] = {}
+
+    def clear(self) -> None:
+        """Remove all packs; new ones of the same names are read from their beginning."""
+        for pack in self.scratch.glob(f"*{PACK_SUFFIX}"):
+            pack.unlink()
+        self._read.clear()
 
     def arrived(self, *, failed: bool = True) -> Generator[tuple[int, Any]]:
         """Results since the last call.
