@@ -146,13 +146,22 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
+def moved_masses(model: mujoco.MjModel, base: Base) -> tuple[float, float]:
+    """What a force along x and one along y accelerate: all that the joint carries, and its own ``armature`` [kg]."""
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, posed(model), matrix)
+    along_x, along_y = (float(matrix[dof, dof]) for dof in base.dofs)
+    return along_x, along_y
+
+
 # Motors ------------------------------------------------------------------------------------------------------------------------
 
 
 def find_motors(model: mujoco.MjModel, base: Base) -> tuple[Motor, Motor] | Reason | None:
     """The motors of x and y, however the robot is turned.
 
-    A reason where an axis has none but an actuator that is no plain motor; None where nothing pushes along an axis.
+    A reason where an axis has none but an actuator that is no plain motor, or one beside its motor that acts at control 0; None
+    where nothing pushes along an axis.
     """
     upright, turned = effects(model, posed(model)), effects(model, posed(model, 0.4))
     found: list[Motor] = []
@@ -161,8 +170,11 @@ def find_motors(model: mujoco.MjModel, base: Base) -> tuple[Motor, Motor] | Reas
         plain = [u for u in pushing if no_motor(model, u) is None]
         if not pushing:
             return None
-        if not plain:
-            return Reason(model.actuator(pushing[0]).name, no_motor(model, pushing[0]) or "")
+        acting = [
+            u for u in pushing if u not in plain and (not plain or model.actuator_biastype[u] != mujoco.mjtBias.mjBIAS_NONE)
+        ]
+        if acting:
+            return Reason(model.actuator(acting[0]).name, no_motor(model, acting[0]) or "")
         found.append(_motor(model, plain[0], dof, float(upright[plain[0], dof])))
     return found[0], found[1]
 

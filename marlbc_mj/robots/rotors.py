@@ -51,6 +51,15 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
     return RotorNumbers(params, {"axis": (0.0, 0.0, 1.0), "thrust": mass * gravity}, mass)
 
 
+def agility(params: dict[str, Any]) -> float:
+    """Angular acceleration about x and y that the rotors can give in either sense while they hold the weight [rad/s^2]."""
+    shares, least, most = (np.array(params[name]) for name in ("moment_share", "least", "most"))
+    hover = params["mass"] * params["gravity"] * np.array(params["thrust_share"])
+    room, turning = np.minimum(most - hover, hover - least), np.abs(shares[:, :2])
+    moments = [float((room[used > 1e-12] / used[used > 1e-12]).min()) for used in turning.T]
+    return max(min(moment / inertia for moment, inertia in zip(moments, params["inertia"], strict=False)), 0.0)
+
+
 def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:
     """The gains that are one number or row per rotor, padded with zeros to MOST_ROTORS."""
     if model.nu > MOST_ROTORS:
@@ -72,9 +81,9 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
 
 
 def _control_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Least and most control (rotors,) by ``ctrlrange`` and, where it is tighter, by ``forcerange``."""
+    """Least and most control (rotors,) that ``ctrlrange`` and ``forcerange`` let through."""
     limits = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
     by_force = np.sort(model.actuator_forcerange / model.actuator_gainprm[:, :1], axis=1)
-    tighter = (model.actuator_forcelimited == 1)[:, None] & (np.abs(by_force) < np.abs(limits) * (1 - 1e-9))
-    least, most = np.where(tighter, by_force, limits).T
+    by_force = np.where(model.actuator_forcelimited[:, None], by_force, (-np.inf, np.inf))
+    least, most = np.clip(limits, by_force[:, :1], by_force[:, 1:]).T
     return least, most

@@ -12,6 +12,7 @@ from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.engine.assembly import OPTIONS
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import Robot, make_robot
+from marlbc_mj.robots.planar import base_of, moved_masses
 from marlbc_mj.scenarios import Scenario, standard_behaviors
 from marlbc_mj.studies.robot_truth import Truth, compare, try_laws
 from marlbc_mj.util.errors import MarlbcError
@@ -19,6 +20,7 @@ from marlbc_mj.util.text import one_line
 
 DURATION = 8.0  # of the step test [s]
 SETTLED, OVERSHOOT = 0.1, 0.35  # of the robot's length unit: error at the end, excursion beyond the reference
+MASSES = 0.01  # that a force along x and one along y may move, relative to each other
 _HEIGHT, TILT = 0.05, 35.0  # that a flying robot keeps [m], [deg]
 
 
@@ -65,6 +67,11 @@ def _mass(robot: Robot) -> Item:
     weighed = float(model.body(robot.body).subtreemass[0])
     if robot.mass is None:
         return Item("mass", weighed > 0, f"{weighed:g} kg, scaled to the scenario's")
+    if robot.direct and len(robot.joints) == 2:
+        along_x, along_y = moved_masses(model, base_of(model, robot.body, robot.joints))
+        if not np.isclose(along_x, along_y, rtol=MASSES):
+            said = f"{along_x:g} kg move along x, {along_y:g} kg along y; a robot has one mass"
+            return Item("mass", False, said)
     rotating = robot.mass - weighed
     good = weighed > 0 and -1e-6 <= rotating <= weighed
     return Item("mass", good, f"{weighed:g} kg in the MJCF, {robot.mass:g} kg with what turns along")
