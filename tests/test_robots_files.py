@@ -87,6 +87,7 @@ DRIVEN = {
     "actuatorfrcrange": (cart(joints=SLIDES.replace('axis="', 'actuatorfrcrange="-2 2" axis="')), 2.0),
     "tendons": (cart(motors=ON_TENDONS, tail=TENDONS.format("")), 12.0),
     "tendons with a limit": (cart(motors=ON_TENDONS, tail=TENDONS.format(' actuatorfrcrange="-1 1"')), 6.0),
+    "armature": (cart(joints=SLIDES.replace('axis="', 'armature="1.5" axis="')), 12.0),
     "site": (
         cart(shape=SHAPE + '<site name="fan"/>', motors='<motor site="fan" gear="2 0 0 0 0 0" ctrlrange="-3 3"/>'
              '<motor site="fan" gear="0 -2 0 0 0 0" ctrlrange="-3 3"/>'),
@@ -171,6 +172,9 @@ REFUSED = {
     "constant push": (
         '<general name="{name}" joint="{joint}" biastype="affine" biasprm="3 0 0" ctrlrange="-9 9"/>', "even at control 0"),
     "delay": ('<motor name="{name}" joint="{joint}" ctrlrange="-9 9" nsample="4" delay="0.01"/>', "acts after a delay"),
+    "a brake beside the motor": (
+        '<motor name="{name}" joint="{joint}" ctrlrange="-9 9"/><damper name="{name}b" joint="{joint}" kv="2" ctrlrange="0 1"/>'
+        '<velocity name="{name}_brake" joint="{joint}" kv="2"/>', "'push_e_brake' is no motor: it is a velocity servo"),
     "one side only": ('<motor name="{name}" joint="{joint}" ctrlrange="0 12"/>', "'push_e' pushes from 0 to 12 N only"),
     "no limit": ('<motor name="{name}" joint="{joint}"/>', "'push_e' has no limit"),
 }  # fmt: off
@@ -225,6 +229,13 @@ def test_a_robot_that_does_not_follow_is_a_failed_row(write):
     assert not step.passed and "its force is at the limit of 12 N" in step.said
 
 
+def test_a_carriage_on_a_rail_is_driven_but_fails_its_check(write):
+    """A force along the rail moves less than one across it; a robot has one mass, and that is said."""
+    rail = NESTED.format(SHAPE).replace('mass="1e-6"', 'mass="1"')
+    items = {item.name: item for item in checklist(write(cart(joints="", shape=rail)))}
+    assert not items["mass"].passed and items["mass"].said == "3 kg move along x, 4 kg along y; a robot has one mass"
+
+
 # Options ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -240,6 +251,20 @@ def test_options_are_taken_over_or_named(write, recwarn, monkeypatch, tmp_path):
     for option in OPTIONS:
         np.testing.assert_allclose(getattr(model.opt, option), getattr(alone.opt, option), err_msg=option)
     assert model.opt.timestep == 0.0025 and not recwarn.list and not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_no_section_of_a_file_makes_mujoco_warn(write, capfd, recwarn, monkeypatch, tmp_path):
+    """Sizes, pictures and statistics of the file conflict with the arena's; nobody has to read about it."""
+    monkeypatch.chdir(tmp_path)
+    head = (
+        '<size nuser_geom="3" memory="9M"/><statistic extent="9" meansize="0.5"/><visual><map znear="0.3"/>'
+        '<global offwidth="99"/></visual><option timestep="0.1" magnetic="1 2 3" o_margin="0.1" impratio="9" cone="elliptic"'
+        ' solver="CG" tolerance="1e-3" sdf_iterations="7"><flag contact="disable" energy="enable" sensornoise="enable"/></option>'
+    )
+    name = write(cart(head=head))
+    World(robot_gate(name), PD(64.0, 16.0))
+    make_environment(robot_gate(name, duration=0.5), PD(64.0, 16.0)).reset()
+    assert capfd.readouterr() == ("", "") and not recwarn.list and not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 # Parts of a model ------------------------------------------------------------------------------------------------------------
