@@ -453,6 +453,15 @@ def test_slips_in_a_robot_are_named(changes, message, write):
         direct(write(cart()), **changes).spec()
 
 
+@pytest.mark.parametrize("laws_of", [None, "omni"])
+def test_a_robot_in_python_must_not_turn_its_slides(laws_of, write):
+    """A yaw before the slides turns the axes that forces and unknown dynamics are given along."""
+    other = {} if laws_of is None else {f: getattr(make_robot(laws_of), f) for f in ("drive", "reading", "params", "state")}
+    robot = direct(write(DRIVEN["yaw first"][0]), **({"motors": (), **other} if other else {}))
+    with pytest.raises(ConfigurationError, match="joint 'yaw' turns the slide joints"):
+        robot.spec()
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

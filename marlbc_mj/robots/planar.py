@@ -82,7 +82,7 @@ def find_base(model: mujoco.MjModel, root: int) -> Base:
         body = children[0]
     if len(found) < 2:
         raise ConfigurationError(f"body {model.body(root).name!r} needs a free joint, or slide joints along x and y of the world")
-    _refuse_turning_slides(model, found)
+    _refuse_turning_slides(model, tuple(found.values()))
     along_x, along_y = found[0], found[1]
     dofs = int(model.jnt_dofadr[along_x]), int(model.jnt_dofadr[along_y])
     return Base(body, (model.joint(along_x).name, model.joint(along_y).name), dofs)
@@ -94,9 +94,9 @@ def _along(direction: np.ndarray) -> int | None:
     return at if at < 2 and abs(abs(direction[at]) - 1.0) < _PARALLEL else None
 
 
-def _refuse_turning_slides(model: mujoco.MjModel, found: dict[int, int]) -> None:
+def _refuse_turning_slides(model: mujoco.MjModel, slides: Sequence[int]) -> None:
     """Raise ConfigurationError where a joint before the slides turns them."""
-    last = max(found.values())
+    last = max(slides)
     tree = model.body_rootid[model.jnt_bodyid]
     for j in range(last):
         if model.jnt_type[j] != _SLIDE and tree[j] == tree[last] and model.jnt_bodyid[j] <= model.jnt_bodyid[last]:
@@ -259,6 +259,7 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
     model = spec.copy().compile()
     data = posed(model)
     if len(joints) == 2:
+        _refuse_turning_slides(model, [model.joint(name).id for name in joints])
         for axis, name in enumerate(joints):
             _straighten_slide(spec, model, data, name, axis, float(data.body(body).xpos[axis]))
     model = spec.copy().compile()
@@ -279,8 +280,9 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
 
 
 def check_slides(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
-    """Raise ConfigurationError unless two joints slide along +x and +y: unknown dynamics push there."""
+    """Raise ConfigurationError unless two joints slide along +x and +y, however the robot turns: unknown dynamics push there."""
     model = spec.copy().compile()
+    _refuse_turning_slides(model, [model.joint(name).id for name in joints])
     directions = posed(model).xaxis
     for axis, name in enumerate(joints):
         k = model.joint(name).id
