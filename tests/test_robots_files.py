@@ -14,7 +14,7 @@ from marlbc_mj.engine.assembly import OPTIONS
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.robots.standard import standard_text
-from marlbc_mj.scenarios import load_scenario
+from marlbc_mj.scenarios import load_scenario, make_scenario
 from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.studies.robot_check import checklist
 from marlbc_mj.studies.robot_gate import fly_gate
@@ -138,6 +138,16 @@ def test_the_recorded_force_is_what_moves_the_body(case, write):
     np.testing.assert_allclose(data.body(f"agent1_{robot.body}").xpos[:2], world.state.position[0, 0], atol=1e-12)
     *_, force = push(name, (-1e3, 1e3), 0.1, 0.1)
     np.testing.assert_allclose(force, np.tile([-limit, limit], (len(force), 1)), rtol=1e-9)
+
+
+def test_a_law_without_a_limit_does_not_make_motors_stronger(write):
+    """The file's limit is the robot's, whatever the law asks for."""
+    name = write(DRIVEN["forcerange"][0])
+    model = World(robot_gate(name), PD(64.0, 16.0, limited=False)).plan.model
+    np.testing.assert_array_equal(model.actuator_forcerange, np.tile([-2.0, 2.0], (8, 1)))
+    assert model.actuator_forcelimited.all()
+    free = World(make_scenario("paper", duration=1.0), PD(limited=False)).plan.model
+    assert not free.actuator_forcelimited.any()
 
 
 @pytest.mark.parametrize(
