@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from marlbc_mj.robots.motors import effects, no_motor
 from marlbc_mj.robots.multirotor import MOST_ROTORS
-from marlbc_mj.robots.planar import effects, no_motor
 from marlbc_mj.util.errors import ConfigurationError
 
 HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # of the height [1/s^2, 1/s]

@@ -15,21 +15,9 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.robots.base import Robot
+from marlbc_mj.robots.motors import Reason, check_motors, effects, find_motors, largest_force, no_motor, posed
 from marlbc_mj.robots.multirotor import REPORT, rotor_drive, rotor_reading
-from marlbc_mj.robots.planar import (
-    Base,
-    Reason,
-    base_of,
-    check_motors,
-    effects,
-    find_base,
-    find_motors,
-    largest_force,
-    moved_masses,
-    no_motor,
-    posed,
-    slides_first,
-)
+from marlbc_mj.robots.planar import Base, base_of, find_base, moved_masses, slides_first
 from marlbc_mj.robots.rotors import Attitude, agility, rotor_numbers
 from marlbc_mj.robots.standard import standard_text
 from marlbc_mj.util.errors import ConfigurationError
@@ -86,7 +74,7 @@ def _from_python(path: Path, name: str) -> Robot:
     robot = replace(robot, name=name)
     model = robot.spec().compile() if robot.shipped else check_mjcf(robot.mjcf)
     if robot.direct and robot.mass is not None and not robot.shipped:
-        most = largest_force(check_motors(model, base_of(model, robot.body, robot.joints), robot.motors))
+        most = largest_force(check_motors(model, base_of(model, robot.body, robot.joints).dofs, robot.motors))
         if robot.force_limit > most * (1 + 1e-9):
             raise ConfigurationError(
                 f"robot {name!r}: force_limit is {robot.force_limit:g} N, but {robot.mjcf.name} lets its motors give {most:g} N"
@@ -139,7 +127,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
     root = _moving_root(path, model)
     try:
         base = find_base(model, root)
-        motors = find_motors(model, base)
+        motors = find_motors(model, base.dofs)
         limit = largest_force(motors) if isinstance(motors, tuple) and not isinstance(motors, Reason) else np.inf
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from error
