@@ -110,6 +110,29 @@ def test_a_users_robot_is_the_same_in_every_process(skate, tmp_path):
     assert in_a_process(str(skate), tmp_path) == [0.8, 0.8]
 
 
+def test_a_robot_is_made_anew_after_an_edit_or_in_another_folder(skate, tmp_path, monkeypatch):
+    """In the same process, as in a notebook: of its file, of a helper, of its MJCF; without one it is the same object."""
+    monkeypatch.chdir(skate.parent)
+
+    def made() -> tuple[float, float, float]:
+        robot, ctrl, none = make_robot("skate.py"), np.zeros(2), np.zeros(0)
+        assert make_robot("skate.py") is robot
+        all_plain(robot.drive)(none, none, np.zeros(2), np.zeros(2), np.ones(2), 0.1, ctrl)
+        return robot.speed_limit, ctrl[0], robot.spec().compile().body("deck").mass[0]
+
+    assert made() == (1.5, 0.5, 4.0)
+    skate.write_text(SKATE_PY.replace("speed_limit=1.5", "speed_limit=1.0"))
+    assert made() == (1.0, 0.5, 4.0)
+    skate.with_name("helper.py").write_text(HELPER.replace("0.5", "0.25"))
+    assert made() == (1.0, 0.25, 4.0)
+    skate.with_name("skate.xml").write_text(SKATE.replace('mass="4"', 'mass="3"'))
+    assert made() == (1.0, 0.25, 3.0)
+    moved = shutil.copytree(skate.parent, tmp_path / "moved")
+    (moved / "skate.py").write_text(SKATE_PY)
+    monkeypatch.chdir(moved)
+    assert made() == (1.5, 0.25, 3.0)
+
+
 def test_torn_files_of_the_cache_are_compiled_anew(skate, tmp_path):
     """Whatever another program left there."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]

@@ -21,7 +21,7 @@ from marlbc_mj.robots.planar import Base, base_of, find_base, moved_masses, slid
 from marlbc_mj.robots.rotors import Attitude, agility, rotor_numbers
 from marlbc_mj.robots.standard import standard_text
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import guarded, load_module, made, split_name
+from marlbc_mj.util.modules import beside, guarded, load_module, made, split_name
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
@@ -54,6 +54,20 @@ def find(name: str) -> Path:
     if not path.is_file():
         raise ConfigurationError(f"no robot file {path}")
     return path
+
+
+Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
+"""Where a robot's file is, and the state of what is beside it."""
+
+
+def stamp_of(name: str) -> Stamp:
+    """Which file a name means now, and in which state it and what it may use are: another value after an edit.
+
+    Raises:
+        ConfigurationError: there is no such file.
+    """
+    path = find(name).resolve()
+    return path, beside(path, *SUFFIXES)
 
 
 def load(name: str) -> Robot:

@@ -4,6 +4,7 @@ import importlib.util
 import sys
 import zlib
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +13,8 @@ from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
+_MOST_BESIDE = 500
+"""More files beside a user's file than these are not looked at for changes."""
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -25,8 +28,23 @@ def names_attribute(name: str) -> bool:
     return bool(split_name(name)[1])
 
 
+def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, time of the last change and size of the files in a file's folder, itself included: another tuple after an edit.
+
+    Args:
+        path: the file.
+        suffixes: endings of the files that count.
+    """
+    found = []
+    for each in sorted(each for suffix in suffixes for each in path.resolve().parent.glob(f"*{suffix}"))[:_MOST_BESIDE]:
+        with suppress(OSError):
+            status = each.stat()
+            found.append((str(each), status.st_mtime_ns, status.st_size))
+    return tuple(found)
+
+
 def load_module(path: Path) -> ModuleType:
-    """Run a user's Python file, whose folder it may import from; a file that has not changed is not run again.
+    """Run a user's Python file, whose folder it may import from; it is not run again unless a Python file there has changed.
 
     Raises:
         ConfigurationError: the file is not there, or what it raised.
@@ -36,7 +54,8 @@ def load_module(path: Path) -> ModuleType:
         content = path.read_bytes()
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    name, stamp = f"marlbc_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}", zlib.crc32(content)
+    name = f"marlbc_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}"
+    stamp = zlib.crc32(content), beside(path, _SUFFIX)
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__marlbc_stamp__", None) == stamp:
         return known
