@@ -2,21 +2,25 @@
 
 import json
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import cloudpickle
 import numba
 import numpy as np
 import pytest
 
 from marlbc_mj.controllers import PD, make_controller
 from marlbc_mj.core import compiling, laws
+from marlbc_mj.engine.world import World
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.robots import make_robot
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import make_scenario, paper
 from marlbc_mj.studies.bench import BenchConfig
 from marlbc_mj.studies.robot_check import checklist
 from marlbc_mj.studies.robot_truth import all_plain
@@ -217,6 +221,56 @@ def test_names_in_a_users_file_are_taken(mine):
     assert method_key(f"{mine}:Careful", f"{mine}:soft") == "mine.Careful+mine.soft"
     assert BenchConfig((f"{mine}:Careful",), (f"{mine}:soft",)).methods == [(f"{mine}:Careful", f"{mine}:soft")]
     assert make_controller(f"{mine}:STIFF") is make_controller(f"{mine}:STIFF")
+
+
+def test_what_is_in_a_users_file_goes_to_another_process(mine, tmp_path):
+    """A pickle finds the file again, where the package is installed; without the file it says which module is missing."""
+    kept = pickle.dumps(make_supervisor(f"{mine}:Careful"))
+    code = "import pickle, sys; print(type(pickle.load(sys.stdin.buffer)).__name__)"
+    environment = {**os.environ, "PYTHONPATH": ":".join(p for p in sys.path if p)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, input=kept, capture_output=True, env=environment, check=False, cwd=tmp_path.parent)
+    assert done.stdout == b"OneTeam\n", done.stderr
+    Path(mine).unlink()
+    gone = subprocess.run(command, input=kept, capture_output=True, env=environment, check=False)
+    assert b"ModuleNotFoundError: No module named 'marlbc_user_mine_" in gone.stderr
+
+
+NOTEBOOK = """
+from dataclasses import dataclass
+import numpy as np
+from marlbc_mj.core import laws
+
+@laws.controller(gains="push")
+def pushed(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    force_out[0], force_out[1] = gains.push, 0.0
+
+@dataclass(frozen=True)
+class Push:
+    push: float = 2.0
+    limited = True
+    linear_gains = None
+    law = staticmethod(pushed)
+    def params(self, agent, limit):
+        return laws.gains_of(self)
+    def initial_state(self, agent):
+        return {}
+"""
+
+
+def test_a_law_of_a_notebook_runs_and_travels(monkeypatch):
+    """``__main__`` without a file: nothing is cached, and a copy by cloudpickle is compiled anew."""
+    main = ModuleType("__main__")
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    exec(compile(NOTEBOOK, "<ipython-input-3-0123456789ab>", "exec"), vars(main))
+    world = World(paper(duration=0.5), main.Push())
+    orders = np.zeros((1, 4), dtype=np.int64)
+    world.step(orders)
+    data = cloudpickle.dumps(world)
+    expected = world.step(orders).observation.position
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))  # as in another process
+    twin = pickle.loads(data)
+    assert world.native and twin.native and (twin.step(orders).observation.position == expected).all()
 
 
 def test_a_checkpoint_is_a_supervisor_by_its_path():
