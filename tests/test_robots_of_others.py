@@ -12,7 +12,7 @@ from marlbc_mj.studies.robot_truth import try_laws
 from marlbc_mj.util.errors import ConfigurationError
 
 FOLDER = Path(__file__).parent / "robots_of_others"
-SERVO = "it is a {} servo: its force depends on"
+SERVO = "it is a {} servo"
 REFUSED = {
     "robot_soccer_kit.xml": f"none of its 4 actuators pushes its base 'base'.*'wheel1_speed' .*{SERVO.format('velocity')}",
     "jackal.xml": f"none of its 4 actuators pushes its base 'base_link'.*'front_left.*{SERVO.format('velocity')}",

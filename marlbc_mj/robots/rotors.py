@@ -32,7 +32,7 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
     """Gains and state of the two laws for a robot at rest, and its mass.
 
     Raises:
-        ConfigurationError: the rotors cannot give thrust and three moments, or are too many.
+        ConfigurationError: the rotors cannot give thrust and moments about x and y, or are too many.
     """
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -70,9 +70,10 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
             raise ConfigurationError(f"{name}: actuator {model.actuator(u).name!r} is no motor: {why}")
     effect = effects(model, data)
     rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
-    if np.linalg.matrix_rank(rotors, tol=1e-9) < 4:
-        raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and three moments")
-    shares = np.linalg.pinv(rotors)
+    if np.linalg.matrix_rank(rotors[:3], tol=1e-9) < 3:
+        raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and moments about x and y")
+    turning = np.linalg.matrix_rank(rotors, tol=1e-9) == 4  # else the heading is left to itself
+    shares = np.linalg.pinv(rotors) if turning else np.pad(np.linalg.pinv(rotors[:3]), ((0, 0), (0, 1)))
     least, most = _control_limits(model)
     lift = rotors[0] / model.actuator_gainprm[:, 0]
     own = {"thrust_share": shares[:, 0], "moment_share": shares[:, 1:], "least": least, "most": most, "lift": lift}

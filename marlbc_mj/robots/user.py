@@ -235,6 +235,9 @@ def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
         raise ConfigurationError(
             f"{path}: rotors fly by tilting against gravity, but its rotors cannot both hold {weight} and turn it"
         )
+    heading = (
+        "" if any(turn for _, _, turn in params["moment_share"]) else "; none turns its heading alone, which is left to itself"
+    )
     share = float(np.sqrt(min(1.0, able * params["gravity"] / (max(FLIGHT.stiffness) * _MOST_TILTING))))
     for name, power in (("stiffness", 1.0), ("damping", 0.5)):
         params[name] = tuple(share**power * gain for gain in params[name])
@@ -245,7 +248,7 @@ def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
         params=params,
         state=state,
         report=REPORT,
-        description="rotors that lift and turn",
+        description=f"rotors that lift and turn{heading}",
         force_limit=0.3 * share * mass * params["gravity"],
         speed_limit=np.sqrt(share),
         acceleration_limit=share * _MOST_TILTING,
