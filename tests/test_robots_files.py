@@ -256,6 +256,7 @@ def test_options_are_taken_over_or_named(write, recwarn, monkeypatch, tmp_path):
     name = write(cart(head=head))
     said = {item.name: item.said for item in checklist(name)}["options"]
     assert "density 1.2" in said and "gravity 0 0 -1.62" in said and "not kept: timestep 0.01 s" in said
+    assert "integrator implicitfast" in said
     model = World(robot_gate(name), PD(64.0, 16.0)).plan.model
     alone = mujoco.MjModel.from_xml_path(name)
     for option in OPTIONS:

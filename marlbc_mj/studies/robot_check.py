@@ -24,6 +24,15 @@ MASSES = 0.01  # that a force along x and one along y may move, relative to each
 _HEIGHT, TILT = 0.05, 35.0  # that a flying robot keeps [m], [deg]
 
 
+_KINDS = {
+    "integrator": mujoco.mjtIntegrator,
+    "cone": mujoco.mjtCone,
+    "jacobian": mujoco.mjtJacobian,
+    "solver": mujoco.mjtSolver,
+}
+"""Options whose values are names."""
+
+
 class Item(NamedTuple):
     """One line of the checklist."""
 
@@ -97,7 +106,7 @@ def _options(robot: Robot) -> Item:
     """What of the file's options a team's world takes over, and what it cannot."""
     given, usual = robot.spec().option, mujoco.MjSpec().option
     kept = [
-        f"{name} {_shown(getattr(given, name))}"
+        f"{name} {_shown(name, getattr(given, name))}"
         for name in OPTIONS
         if not np.array_equal(getattr(given, name), getattr(usual, name))
     ]
@@ -106,7 +115,10 @@ def _options(robot: Robot) -> Item:
     return Item("options", True, said or "MuJoCo's own")
 
 
-def _shown(value: Any) -> str:
+def _shown(name: str, value: Any) -> str:
+    """A value of an option as its MJCF has it: by its name where it has one."""
+    if name in _KINDS:
+        return _KINDS[name](int(value)).name.split("_")[1].lower()
     return " ".join(f"{float(x):g}" for x in np.ravel(value))
 
 
