@@ -89,7 +89,7 @@ def no_motor(model: mujoco.MjModel, u: int) -> str | None:
         return "its gain is zero"
     if np.any(getattr(model, "actuator_delay", np.zeros(model.nu))[u]):
         return "its control acts after a delay"
-    if np.any(getattr(model, "actuator_damping", np.zeros(model.nu))[u]):
+    if any(np.any(getattr(model, name, np.zeros(model.nu))[u]) for name in ("actuator_damping", "actuator_dampingpoly")):
         return "it damps the joint that it drives"
     return None
 

@@ -45,6 +45,7 @@ def checklist(name: str) -> Iterator[Item]:
     """Check a robot by name or path; stops at what makes the rest meaningless."""
     try:
         robot = make_robot(name)
+        robot.spec()
     except MarlbcError as error:
         yield Item("file", False, str(error))
         return
