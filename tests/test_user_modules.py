@@ -259,9 +259,12 @@ class Push:
 """
 
 
-def test_a_law_of_a_notebook_runs_and_travels(monkeypatch):
+def test_a_law_of_a_notebook_runs_and_travels(monkeypatch, tmp_path):
     """``__main__`` without a file: it runs compiled, and a copy by cloudpickle is compiled anew."""
-    main = ModuleType("__main__")
+    main, paths = ModuleType("__main__"), ModuleType("IPython.paths")
+    vars(paths)["get_ipython_cache_dir"] = lambda: str(tmp_path)  # which numba asks
+    monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.paths", paths)
     monkeypatch.setitem(sys.modules, "__main__", main)
     cell, lines = "<ipython-input-3-0123456789ab>", NOTEBOOK.splitlines(keepends=True)
     monkeypatch.setitem(linecache.cache, cell, (len(NOTEBOOK), None, lines, cell))  # as IPython keeps what was typed
