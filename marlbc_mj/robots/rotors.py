@@ -57,7 +57,7 @@ def agility(params: dict[str, Any]) -> float:
     hover = params["mass"] * params["gravity"] * np.array(params["thrust_share"])
     room, turning = np.minimum(most - hover, hover - least), np.abs(shares[:, :2])
     moments = [float((room[used > 1e-12] / used[used > 1e-12]).min()) for used in turning.T]
-    return max(min(moment / inertia for moment, inertia in zip(moments, params["inertia"], strict=False)), 0.0)
+    return max(float((np.array(moments) / params["inertia"][:2]).min()), 0.0)
 
 
 def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:

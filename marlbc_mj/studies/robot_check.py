@@ -119,7 +119,7 @@ def _options(robot: Robot) -> Item:
 def _shown(name: str, value: Any) -> str:
     """A value of an option as its MJCF has it: by its name where it has one."""
     if name in _KINDS:
-        return _KINDS[name](int(value)).name.split("_")[1].lower()
+        return str(_KINDS[name](int(value)).name).split("_")[1].lower()
     return " ".join(f"{float(x):g}" for x in np.ravel(value))
 
 
