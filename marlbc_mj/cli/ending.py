@@ -22,11 +22,11 @@ class Terminated(BaseException):
     """SIGTERM was received; what is half written is removed on the way out, as after Ctrl-C."""
 
 
-class Interrupted(KeyboardInterrupt):
+class CtrlC(KeyboardInterrupt):
     """Ctrl-C was received."""
 
 
-_STOPS: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated, signal.SIGINT: Interrupted}
+_STOPS: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated, signal.SIGINT: CtrlC}
 _AGAIN = 0.25  # after which what was dropped is raised again [s]
 
 
@@ -119,7 +119,7 @@ class _Stop:
 
 @contextmanager
 def _stoppable() -> Iterator[None]:
-    """Turn SIGTERM into :class:`Terminated` and Ctrl-C into :class:`Interrupted` during the block, whatever is at work."""
+    """Turn SIGTERM into :class:`Terminated` and Ctrl-C into :class:`CtrlC` during the block, whatever is at work."""
     stop, ours = _Stop(), (signal.SIG_DFL, signal.default_int_handler)
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
