@@ -40,9 +40,8 @@ _FORCES = (
     "Right: both axes in the two seconds in which the forces change most."
 )
 _PARETO = (
-    "Control cost against what it buys. Colors are supervisors, shapes are controllers. Formation error: mean distance of an agent "
-    "from its slot in the first formation, "
-    "relative to the centroid [m]. Dashed: LQR, whose gains minimise the paper's cost in regulation."
+    "Control cost against what it buys. Colors are supervisors, shapes are controllers. Formation error: mean distance of an "
+    "agent from its slot in the first formation, relative to the centroid [m]. Dashed: LQR, whose gains minimise the paper's cost in regulation."
 )
 _CONTROL = (
     "with each framework's controller, below around the largest of them all. One scale: linear up to SORLC's limit (dashed), "
