@@ -13,15 +13,8 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.cells import spacing
 from marlbc_mj.core.disturbances import DISTURBANCES, ConstantWind, LinearDrag, PaperDrag, QuadraticDrag, WindGusts
 from marlbc_mj.core.imperfections import Imperfections
-from marlbc_mj.core.shield import (
-    ASSUMPTIONS,
-    FORCE_BROKEN,
-    ForceBound,
-    Shield,
-    ShieldNumbers,
-    braking,
-    stopping_distance,
-)
+from marlbc_mj.core.shield import ASSUMPTIONS, FORCE_BROKEN, Shield
+from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, braking, stopping_distance
 from marlbc_mj.engine.shielding import LEAST_CREEP, resolve
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
