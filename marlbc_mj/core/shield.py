@@ -174,7 +174,7 @@ def last_resort(numbers, view, i, k):
     _, normal_x, normal_y = gap_to(numbers, view, i, k)
     retreat = spread_of(numbers, view, i)
     if moves(view, k):
-        retreat += view.h * numbers.obstacle_acceleration
+        retreat += 2.0 * view.h * numbers.obstacle_acceleration
     return within(pace_x + retreat * normal_x, pace_y + retreat * normal_y, view.v[i, 0], view.v[i, 1], authority)
 
 

@@ -238,17 +238,18 @@ def disc_of(numbers, view, i, k, a, x, y):
     the disc is around its velocity, and ``a`` is what brakes relative to it.
     """
     gap, normal_x, normal_y = gap_to(numbers, view, i, k)
-    spread = spread_of(numbers, view, i)
+    spread, drawn = spread_of(numbers, view, i), 0.0
     pace_x, pace_y = pace_of(view, k)
     if moves(view, k):
         spread += view.h * numbers.obstacle_acceleration
-        gap -= 0.5 * view.h * view.h * numbers.obstacle_acceleration
+        drawn = 0.5 * view.h * view.h * numbers.obstacle_acceleration  # what the obstacle may come nearer by
         worst = np.sqrt((x - pace_x) ** 2 + (y - pace_y) ** 2) + spread
         a = max(braking(numbers, worst + numbers.obstacle_speed) - numbers.obstacle_acceleration, 0.0)
     j = k - view.obstacles.shape[0]
     share = 0.5 if 0 <= j < view.p.shape[0] else 1.0
-    room, centre = stopping_of(numbers, view, i, k) + share * max(gap, 0.0), a * view.h
-    return pace_x + centre * normal_x, pace_y + centre * normal_y, np.sqrt(2.0 * a * room + centre * centre) - spread
+    clear, centre = stopping_of(numbers, view, i, k) + share * max(gap, 0.0) - drawn, a * view.h
+    radius = np.sqrt(max(2.0 * a * clear + centre * centre, 0.0)) - spread
+    return pace_x + centre * normal_x, pace_y + centre * normal_y, radius
 
 
 @allocation_free

@@ -153,11 +153,11 @@ def _find_tube(shield: Shield, scenario: Scenario, robot: Robot, controller: Con
         return tracking_tube(scenario, controller, _disturbance_bound(shield, scenario))
     if robot.tube is None:
         raise ConfigurationError(_missing(robot))
-    gains = None if controller is None else controller.linear_gains
-    if gains != robot.gains:
+    gains = controller.linear_gains if isinstance(controller, PD | SORLC) else None
+    if gains not in (robot.gains, PD().linear_gains):
         raise ConfigurationError(
-            f"shield: robot {robot.name!r} stays within {robot.tube:g} m of its reference with the gains {robot.gains}, but "
-            f"{type(controller).__name__} has {gains}; take those, or give Shield(tube=...)"
+            f"shield: robot {robot.name!r} stays within {robot.tube:g} m of its reference under PD and SORLC with the gains "
+            f"{robot.gains} or {PD().linear_gains}, but {type(controller).__name__} has {gains}; give Shield(tube=...)"
         )
     return robot.tube
 
