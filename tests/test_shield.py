@@ -19,6 +19,9 @@ from marlbc_mj.engine.shielding import LEAST_CREEP, resolve
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.recording import schemas
+from marlbc_mj.recording.log import from_trajectory
+from marlbc_mj.recording.reader import export_log, read_log
+from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Obstacle, Perturbation, paper
@@ -297,3 +300,18 @@ def test_a_log_has_what_the_shield_did(tmp_path):
     assert [agent["interventions"] for agent in last] == trajectory.shield.interventions[-1].tolist()
     assert [agent["change"] for agent in last] == trajectory.shield.change[-1].tolist()
     assert max(agent["interventions"] for agent in last) > 0
+    read = read_log(tmp_path / "a.mcap")
+    np.testing.assert_array_equal(read.shield, from_trajectory(trajectory, SORLC()).shield)
+    np.testing.assert_array_equal(read.shield[..., 2:], trajectory.shield.breaches)
+    step = int(np.flatnonzero(np.diff(read.shield[:, :, 0].sum(axis=1)))[0]) + 1
+    stage = make_stage(read)
+    assert stage.shielded(step * scenario.mission_step + 1e-6) == np.flatnonzero(read.intervened(step)).tolist() != []
+    export_log(tmp_path / "a.mcap", tmp_path / "a.npz")
+    np.testing.assert_array_equal(np.load(tmp_path / "a.npz")["shield"], read.shield)
+
+
+def test_a_log_without_a_shield_says_that_nobody_was_changed(episode):
+    """An empty table, not a table of zeros."""
+    log = from_trajectory(episode("scripted", "sorlc"), SORLC())
+    assert log.shield.shape == (len(log.time), 0, 2 + len(ASSUMPTIONS))
+    assert log.intervened(3).shape == (0,)

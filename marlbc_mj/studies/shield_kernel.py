@@ -12,7 +12,7 @@ import numpy as np
 
 from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, braking, stopping_distance
 
-PUSHES = (-1.0, -0.5, 0.0, 0.5, 1.0)  # of u and of f, in parts of their limits
+PUSHES = (-1.0, 0.0, 1.0)  # of u and of f, in parts of their limits
 
 
 class KernelShares(NamedTuple):
