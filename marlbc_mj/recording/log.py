@@ -12,6 +12,10 @@ from marlbc_mj.engine.plan import make_mission, make_plan
 from marlbc_mj.engine.team import shield_counts
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import NO_POSE, Trajectory, body_poses
+from marlbc_mj.supervisors.communication import Hearing
+
+NO_HEARING = Hearing(np.zeros((1, 0, 0), dtype=np.bool_), np.zeros((1, 0, 0)))
+"""Of one mission step in which agents did not talk, or all heard everything at once."""
 
 NO_SHIELD_ROWS = np.zeros((0, 2 + len(ASSUMPTIONS)))
 """What a shield did in a team that has none."""
@@ -48,7 +52,8 @@ class EpisodeLog:
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,) [ms]
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
-
+    link: np.ndarray = field(default_factory=lambda: NO_HEARING.link)  # (M, N, N) bool, see Hearing; (M, 0, 0) without
+    age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) of what agents know of each other [s]
     shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) by the end of each mission step, columns
     # as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
 
@@ -140,6 +145,7 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         decision_ms=trajectory.decision_ms,
         pose=trajectory.pose,
         shield=shield_rows(trajectory.shield, len(position)),
+        **hearing_columns(trajectory.hearing, len(position)),
     )
 
 
@@ -148,6 +154,11 @@ def shield_rows(counts: ShieldCounts | None, steps: int) -> np.ndarray:
     if counts is None:
         return np.zeros((steps, *NO_SHIELD_ROWS.shape))
     return np.concatenate([counts.interventions[..., None], counts.change[..., None], counts.breaches], axis=-1)
+
+
+def hearing_columns(hearing: Hearing | None, steps: int) -> dict[str, np.ndarray]:
+    """``link`` and ``age`` of an :class:`EpisodeLog` of ``steps`` mission steps."""
+    return (hearing or Hearing(*(np.repeat(array, steps, axis=0) for array in NO_HEARING)))._asdict()
 
 
 def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

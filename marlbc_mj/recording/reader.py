@@ -26,9 +26,10 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
-from marlbc_mj.recording.log import EpisodeLog, shield_rows
+from marlbc_mj.recording.log import EpisodeLog, hearing_columns, shield_rows
 from marlbc_mj.recording.rerun_file import write_rerun
 from marlbc_mj.recording.writer import METADATA, MODEL
+from marlbc_mj.supervisors.communication import Hearing
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
 
@@ -96,6 +97,11 @@ def _check_log(log: EpisodeLog) -> None:
     shapes_of_shield = (steps, 0, shield.shape[-1]), (steps, agents, len(schemas.SHIELD.columns))
     if shield.shape not in shapes_of_shield or not (shield >= 0).all():
         raise ValueError(f"shield has shape {shield.shape}, or negative counts")
+    for name in ("link", "age"):
+        if getattr(log, name).shape not in ((steps, 0, 0), (steps, agents, agents)):
+            raise ValueError(f"{name} has shape {getattr(log, name).shape}")
+    if not (log.age >= 0).all():
+        raise ValueError("an age is negative, or not a number")
     if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
         raise ValueError(f"a command is none of the {len(log.commands)} that there are")
     if not all(isinstance(name, str) for name in log.commands):
@@ -275,10 +281,9 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
-    """Decoded messages of every required topic, the same number of each."""
-    recorded = {channel.topic for channel in _channels(reader)}
-    optional = [topic for topic in (schemas.POSE, schemas.SHIELD) if topic.name in recorded]
-    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *optional)}
+    """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
+    some = [topic for topic in (schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD) if topic.name in _topics_used(reader)]
+    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *some)}
     for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
         found[channel.topic].append(json.loads(message.data))
     counts = {name: len(messages) for name, messages in found.items()}
@@ -290,9 +295,13 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
     return found
 
 
-def _channels(reader: McapReader) -> list[Channel]:
+def _topics_used(reader: McapReader) -> set[str]:
+    """Topics with at least one message; a team whose supervisor says nothing leaves none on its communication."""
     summary = reader.get_summary()
-    return list(summary.channels.values()) if summary is not None else []
+    if summary is None or summary.statistics is None:
+        return set()
+    counts = summary.statistics.channel_message_counts
+    return {channel.topic for channel in summary.channels.values() if counts.get(channel.id, 0)}
 
 
 def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
@@ -320,12 +329,21 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
         "decision_ms": scalar("/metrics", "decision_ms"),
         "pose": agents(pose.name, *pose.columns) if pose.name in found else np.zeros((steps, 0, 7)),
         "shield": _shield_rows(found[shield.name]) if shield.name in found else shield_rows(None, steps),
+        **hearing_columns(_hearing(found), steps),
     }
 
 
 def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:
     """(M, N, 7) as EpisodeLog has them; columns that an older log lacks are 0."""
     return np.array([[[float(row.get(name, 0.0)) for name in schemas.SHIELD.columns] for row in m["agents"]] for m in messages])
+
+
+def _hearing(found: dict[str, list[dict[str, Any]]]) -> Hearing | None:
+    """Who heard whom, (M, N, N) each; None in a log without."""
+    if schemas.COMMUNICATION.name not in found:
+        return None
+    moments = [schemas.decode_hearing(message["agents"]) for message in found[schemas.COMMUNICATION.name]]
+    return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True)))
 
 
 def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
