@@ -30,7 +30,7 @@ REMEMBERED = 400  # substeps of the past that agents know their own states of, b
 class Mail(NamedTuple):
     """Messages and stamps of one team."""
 
-    count: int  # substeps since the mission began
+    now: int  # substeps since the mission began
     seed: int  # of what is lost
     latency: int  # [substeps]
     quantile: float  # a message is lost where a standard normal number is below
@@ -96,7 +96,7 @@ def exchange(numbers, view, mail):
     In a team's first substep all know all: a stamp that everyone shares.
     """
     agents, ring = view.p.shape[0], mail.memory.shape[0]
-    now, count = mail.count % ring, float(mail.count)
+    now, count = mail.now % ring, float(mail.now)
     first = mail.stamps[0, 1, NEWEST] == NEVER_STAMPED
     for i in range(agents):
         mail.memory[now, i, 0], mail.memory[now, i, 1], mail.memory[now, i, 2] = view.p[i, 0], view.p[i, 1], view.stopping[i]
@@ -118,19 +118,19 @@ def exchange(numbers, view, mail):
 @allocation_free
 def arrives(mail, i, j, agents):
     """Whether the message that ``j`` sent to ``i`` one latency ago arrives now."""
-    if mail.silent == j or mail.count - mail.latency < 0:
+    if mail.silent == j or mail.now - mail.latency < 0:
         return False
-    return mail.quantile == -np.inf or normal(mail.seed, mail.count, STREAM + i * agents + j) >= mail.quantile
+    return mail.quantile == -np.inf or normal(mail.seed, mail.now, STREAM + i * agents + j) >= mail.quantile
 
 
 @allocation_free
 def _take(numbers, view, mail, i, j):
     """Agent ``i`` receives the message that ``j`` sent one latency ago."""
     ring = mail.memory.shape[0]
-    sent = mail.count - mail.latency
+    sent = mail.now - mail.latency
     newest = mail.said[sent % ring, j, i]
     proposed, adopted = mail.planes[i, i, 0], mail.planes[i, i, 1]  # scratch: no agent keeps apart from itself
-    fits_newest = newest >= 0.0 and mail.count - newest < ring
+    fits_newest = newest >= 0.0 and mail.now - newest < ring
     if fits_newest:
         fill_plane(numbers, mail.memory[int(newest) % ring], i, j, adopted)
         fits_newest = is_inside(view, adopted, i)
