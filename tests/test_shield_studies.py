@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
+from marlbc_mj.controllers import PD
 from marlbc_mj.core.stopping import ForceBound
+from marlbc_mj.engine.world import World
+from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.studies.shield_kernel import exact_share, kernel_shares
 from marlbc_mj.studies.shield_missions import mission_of, report_missions, run_missions
 
@@ -30,6 +33,23 @@ def test_no_mission_fails_with_a_shield_and_some_do_without(family):
     assert (shielded.missions, shielded.failed, shielded.breaches.sum()) == (4, 0, 0.0)
     assert shielded.interventions > 0
     assert free.failed > 0
+
+
+def test_a_large_team_is_shielded_by_its_grids_as_by_trying_all_pairs():
+    """Bit for bit: grids of obstacles and team only say early that nothing is near."""
+    scenario = make_scenario("field", agents=48, formation="grid", obstacles=48, radius=(0.3, 0.6), gap=2.5, length=140.0)
+    worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
+    assert worlds[0].state.grid.shape[1] > 0
+    worlds[1].state = worlds[1].state._replace(grid=np.zeros((1, 0)))
+    worlds[1]._arguments = worlds[1]._make_arguments()
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        velocity = 15.0 * rng.normal(size=(1, 48, 2))
+        for world in worlds:
+            world.step(np.zeros((1, 48), dtype=np.int64), velocity)
+    for name in ("position", "velocity", "interventions", "force_change", "breaches"):
+        np.testing.assert_array_equal(getattr(worlds[0].state, name), getattr(worlds[1].state, name))
+    assert worlds[0].state.interventions.sum() > 0
 
 
 def test_the_report_bounds_the_rate_of_failures(capsys):
