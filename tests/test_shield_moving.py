@@ -44,7 +44,7 @@ def test_an_agent_at_rest_gives_way_to_an_obstacle_that_comes():
 
 
 def test_obstacles_that_could_move_but_do_not_change_nothing():
-    """The law for obstacles at rest is that for obstacles that move with velocity 0, up to where projections end: 3 s of attack, 2 mm."""
+    """One law: obstacles at rest are obstacles that move with velocity 0, up to where projections end (2 mm in 3 s of attack)."""
     scenario = corridor()
     moving = corridor(motions=(AT_REST,) * len(scenario.obstacles))
     shield = Shield(obstacle_speed=0.0, obstacle_acceleration=0.0)
