@@ -20,7 +20,7 @@ from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 
 COST_SIZES = (4, 16, 64)
 BURST_AGENT_STEPS = 4096  # agents x mission steps in one burst
-VARIANTS = {
+COST_VARIANTS = {
     "plain": ("null-space", False),
     "shield": ("null-space", True),
     "set-based": ("set-based", False),
@@ -70,13 +70,13 @@ def measure_costs(rounds: int, sizes: tuple[int, ...] = COST_SIZES) -> dict[int,
         set_based = replace(scenario, composition="set-based")
         near = {
             name: CostTeam(set_based if composition == "set-based" else scenario, shield)
-            for name, (composition, shield) in VARIANTS.items()
+            for name, (composition, shield) in COST_VARIANTS.items()
         }
-        far = {name: CostTeam(far_mission(agents), VARIANTS[name][1]) for name in ("plain", "shield")}
+        far = {name: CostTeam(far_mission(agents), COST_VARIANTS[name][1]) for name in ("plain", "shield")}
         teams = {**near, **{f"far, {name}": team for name, team in far.items()}}
         actions: dict[Any, Callable[[], None]] = {name: partial(team.advance) for name, team in teams.items()}
         taken = interleaved(actions, rounds)
-        ratios = {name: ratio(taken[name], taken["plain"]) for name in VARIANTS}
+        ratios = {name: ratio(taken[name], taken["plain"]) for name in COST_VARIANTS}
         ratios["far, shield"] = ratio(taken["far, shield"], taken["far, plain"])
         team = near["plain"]
         per_step = 1e6 * median(taken["plain"]) / (team.steps * team.world.worlds * agents)
@@ -91,7 +91,7 @@ def report_costs() -> None:
         ratios = ", ".join(f"{name} {value:.3f}" for name, value in cost["ratios"].items())
         print(f"{agents} agents: plain {cost['us']:.1f} us per agent and mission step; {ratios}; ", end="")
         print(f"shield changed {100 * cost['changed']:.2f} % of the substeps")
-    for name in VARIANTS:
+    for name in COST_VARIANTS:
         first, last = (costs[n]["us"] * costs[n]["ratios"][name] for n in (COST_SIZES[0], COST_SIZES[-1]))
         print(f"{name}: per agent {last / first:.3f} times from {COST_SIZES[0]} to {COST_SIZES[-1]} agents")
 

@@ -24,9 +24,9 @@ from marlbc_mj.core.shield import ASSUMPTIONS, Shield
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import FAMILIES, Scenario, held_out, make_scenario
 
-SPEED = 15.0  # of references that attack [m/s]
+ATTACK_SPEED = 15.0  # of references that attack [m/s]
 CHANGE = 20  # mission steps between two changes of mind
-BATCH = 16  # missions that run together
+TOGETHER = 16  # missions that run together
 CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
 
 
@@ -52,17 +52,17 @@ def hostile_velocities(world: World, targets: np.ndarray) -> np.ndarray:
     at, obstacles = world.state.position, world.state.obstacles[:, :, :2]
     ends = np.concatenate([obstacles, at], axis=1)
     way = np.take_along_axis(ends, targets[..., None], axis=1) - at
-    return np.asarray(SPEED * way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
+    return np.asarray(ATTACK_SPEED * way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
 
 
 def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | bool | None = True) -> Cell:
     """Missions of one scenario, each with its own draw; half of them attack, the others have orders at random."""
     cell, rng = Cell(breaches=np.zeros(len(ASSUMPTIONS))), np.random.default_rng(seed)
-    for first in range(0, missions, BATCH):
-        worlds = min(BATCH, missions - first)
+    for first in range(0, missions, TOGETHER):
+        worlds = min(TOGETHER, missions - first)
         world = World(scenario, PD(), worlds=worlds, record=True, shield=shield)
         world.reset(seed + first)
-        _run_batch(world, rng, attack=(first // BATCH) % 2 == 0, cell=cell)
+        _run_batch(world, rng, attack=(first // TOGETHER) % 2 == 0, cell=cell)
     return cell
 
 

@@ -16,15 +16,15 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario, make_scenario
 
-WINDOW = 8  # substeps over which a lag is told from a lasting error
+LAG_WINDOW = 8  # substeps over which a lag is told from a lasting error
 
 
 class ForceAnswer(NamedTuple):
     """m (v+ - v) / h - u of all substeps, friction against the motion left out."""
 
     worst: float  # in one substep [N]
-    lasting: float  # mean over WINDOW substeps [N]
-    slip: float  # greatest sum over up to WINDOW substeps beyond what lasts, as a velocity [m/s]
+    lasting: float  # mean over LAG_WINDOW substeps [N]
+    slip: float  # greatest sum over up to LAG_WINDOW substeps beyond what lasts, as a velocity [m/s]
 
 
 def alone(robot: str) -> Scenario:
@@ -54,9 +54,9 @@ def force_answer(robot: str, friction: float, steps: int, seed: int = 0) -> Forc
     error += taken * after / speed
     error = error[200:]  # the robot has come to rest on the ground by then
     sums = np.cumsum(np.concatenate([np.zeros((1, *error.shape[1:])), error]), axis=0)
-    mean = np.linalg.norm(sums[WINDOW:] - sums[:-WINDOW], axis=-1) / WINDOW
+    mean = np.linalg.norm(sums[LAG_WINDOW:] - sums[:-LAG_WINDOW], axis=-1) / LAG_WINDOW
     worst, lasting = float(np.linalg.norm(error, axis=-1).max()), float(mean.max())
-    slips = [np.linalg.norm(sums[n:] - sums[:-n], axis=-1).max() - n * lasting for n in range(1, WINDOW + 1)]
+    slips = [np.linalg.norm(sums[n:] - sums[:-n], axis=-1).max() - n * lasting for n in range(1, LAG_WINDOW + 1)]
     return ForceAnswer(worst, lasting, float(max(0.0, 0.5 * max(slips)) * h / mass))
 
 
@@ -93,7 +93,7 @@ def report_robots() -> None:
     for name in names or ["disc", "omni", "diff_drive", "crazyflie"]:
         robot = make_robot(name)
         answer = force_answer(name, robot.friction, steps)
-        said = f"besides u up to {answer.worst:.3g} N in a substep, {answer.lasting:.3g} N over {WINDOW} of them"
+        said = f"besides u up to {answer.worst:.3g} N in a substep, {answer.lasting:.3g} N over {LAG_WINDOW} of them"
         print(f"{name}: {said}, slip {1e3 * answer.slip:.3g} mm/s", flush=True)
         for controller in (PD(*robot.gains), PD(), SORLC()):
             print(f"{name}: within {tube_of(name, controller, steps):.4g} m of its reference, {controller}"[:110], flush=True)
