@@ -52,7 +52,7 @@ def is_held(path: Path) -> bool:
 
 
 @contextmanager
-def alone(path: Path, otherwise: str) -> Iterator[None]:
+def held_alone(path: Path, otherwise: str) -> Iterator[None]:
     """Hold the lock of a file, which is made, during the block; nothing where the system has none.
 
     Raises:
