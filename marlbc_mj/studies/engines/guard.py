@@ -25,10 +25,16 @@ def marked(token: str) -> Iterator[int]:
                 yield int(entry.parent.name)
 
 
+def end_marked(token: str) -> None:
+    """End all of these processes but this one."""
+    for process in marked(token):
+        if process != os.getpid():
+            with suppress(ProcessLookupError, PermissionError):
+                os.kill(process, signal.SIGKILL)
+
+
 if __name__ == "__main__":
     sys.stdin.read()
     for _ in range(3):  # a process that was just being started
         time.sleep(RAY_GRACE)
-        for process in marked(sys.argv[1]):
-            with suppress(ProcessLookupError, PermissionError):
-                os.kill(process, signal.SIGKILL)
+        end_marked(sys.argv[1])

@@ -116,6 +116,7 @@ def _guarded() -> Iterator[None]:
             yield
         finally:
             del os.environ[guard.TOKEN]
+            guard.end_marked(token)  # agents of a raylet that was killed
             guarding.terminate()
 
 
