@@ -14,7 +14,7 @@ from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
+from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, ask_supervisor, batched, carry_out, start_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
@@ -90,22 +90,23 @@ def run_episode(
         on_frame: called after every mission step, a log writer for example.
 
     Raises:
-        ConfigurationError: more than one world, or a decision of wrong shape or type.
-        SimulationError: the world diverged.
+        ConfigurationError: more than one world, one that keeps no substeps, or a decision of wrong shape or type.
+        SimulationError: the world diverged, or supervisor or law raised an error.
     """
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
     supervisor = batched(supervisor)
-    memory = supervisor.start(world.scenario, 1)
+    memory = start_supervisor(supervisor, world.scenario, 1)
     observation, done = world.reset(seed), False
     frames: list[Frame] = []
     while not done:
         began = perf_counter()
-        decision, memory = supervisor.decide(observation, memory)
+        decision, memory = ask_supervisor(supervisor, observation, memory)
         decision_ms = 1e3 * (perf_counter() - began)
         controller_state, pose = world.state.controller[0].copy(), body_poses(world)
         step = carry_out(world, decision)
-        assert step.record is not None, "run_episode needs World(record=True)"
+        if step.record is None:
+            raise ConfigurationError("run_episode needs a World that keeps every substep: World(..., record=True)")
         record = Record(*(rows[0] for rows in step.record))
         command, reward = step.observation.command[0], float(step.reward[0])
         shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))

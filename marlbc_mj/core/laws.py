@@ -62,24 +62,28 @@ from marlbc_mj.core.names import (
     refuse_undeclared,
     require_kind,
 )
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError
+from marlbc_mj.util.modules import blame
 
 
 def for_team(law: Law, signature: Any) -> Law:
     """The law for the Python path: on rows of float64, as the loop calls it; applied to every agent in turn, a behavior to one.
 
-    The function raises ConfigurationError where the law reads a name that it does not declare.
+    The function raises ConfigurationError where the law reads a name that it does not declare, and SimulationError where it
+    raises anything else.
     """
     team = on_rows(law, signature)
 
     def checked(*arguments: Any) -> Any:
         try:
             return team(*arguments)
-        except (AttributeError, KeyError) as error:
-            refuse_undeclared(law, error)
+        except MarlbcError:
             raise
+        except Exception as error:
+            refuse_undeclared(law, error)
+            raise SimulationError(f"law {name_of(law)!r} fails: {blame(error)}") from error
 
-    return checked if any(names.shapes for names in interface(law)[1:]) else team
+    return checked
 
 
 def _declare(function: Law, signature: Any, gains: Declared, state: Declared = ()) -> Law:
