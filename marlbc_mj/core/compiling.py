@@ -1,5 +1,6 @@
 """How laws and the helpers that they call are compiled: by numba, on first use, cached on disk."""
 
+import dis
 import os
 import zlib
 from collections.abc import Callable, Iterator
@@ -93,6 +94,25 @@ def _used(function: Law, seen: set[int]) -> Iterator[str]:
             yield from _used(value, seen)
         elif isinstance(value, _VALUES):
             yield f"{name} {value.tobytes().hex() if isinstance(value, np.ndarray) else value}"
+
+
+def raising_line(function: Law, seen: set[int]) -> str | None:
+    """``file.py, line 12`` of a ``raise`` or an ``assert`` in a function or in a compiled helper that it calls; None without.
+
+    Args:
+        function: compiled or plain.
+        seen: functions that have been looked at, by ``id``.
+    """
+    function = plain(function)
+    if id(function) in seen or not isinstance(function, FunctionType):
+        return None
+    seen.add(id(function))
+    code = function.__code__
+    for each in dis.get_instructions(code):
+        if each.opname == "RAISE_VARARGS" and each.positions is not None:
+            return f"{Path(code.co_filename).name}, line {each.positions.lineno}"
+    helpers = (function.__globals__.get(name) for name in code.co_names)
+    return next(filter(None, (raising_line(helper, seen) for helper in helpers if is_compiled(cast(Law, helper)))), None)
 
 
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:

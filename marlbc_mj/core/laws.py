@@ -33,7 +33,7 @@ import numba
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
-from marlbc_mj.core.compiling import Law, allocation_free, clip, compiled, inlined, is_compiled, plain, threaded
+from marlbc_mj.core.compiling import Law, allocation_free, clip, compiled, inlined, is_compiled, plain, raising_line, threaded
 from marlbc_mj.core.kinds import (
     BEHAVIOR,
     CONTROLLER,
@@ -163,12 +163,17 @@ def address(law: Law, signature: Any) -> int:
 
     Raises:
         ConfigurationError: the law is plain Python, was declared as another kind of law, reads a name that it does not declare,
-            or does not compile.
+            raises errors, which threads would lose, or does not compile.
     """
     name = name_of(law)
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
+    line = raising_line(law, set())
+    if line is not None:
+        raise ConfigurationError(
+            f"law {name!r} raises an error ({line}), which compiled code cannot; write NaN to an output instead: it ends the run"
+        )
     kind, entry = ON_ROWS[signature][0], cast(Any, law).entry
     try:
         law.compile(_arguments(interface(law)))

@@ -16,7 +16,8 @@ from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError
+from marlbc_mj.util.modules import blame, guarded
 from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.text import one_line
 
@@ -210,7 +211,7 @@ class World:
         sequence = np.stack([self._checked(row) for row in sequence])
         returns = np.zeros(self.worlds)
         run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
-        run(returns, sequence, self._orders_alone, self._arguments)
+        guarded(lambda: run(returns, sequence, self._orders_alone, self._arguments), "a compiled law", SimulationError)
         self.raise_if_diverged()
         return returns
 
@@ -227,13 +228,21 @@ class World:
     def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
         """:meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both contiguous: no checks, no
         copies; how many worlds failed.
+
+        Raises:
+            SimulationError: a law raised an error, an assignment of the wrong shape for example.
         """
         given = self._orders_alone if velocity is None else velocity
-        if self.native:
-            run = drivers.step_serial if self._serial() else drivers.step_parallel
-            return int(run(orders, given, self._arguments))
-        mission_step = laws.plain(loop.mission_step)
-        return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
+        try:
+            if self.native:
+                run = drivers.step_serial if self._serial() else drivers.step_parallel
+                return int(run(orders, given, self._arguments))
+            mission_step = laws.plain(loop.mission_step)
+            return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
+        except MarlbcError:
+            raise
+        except Exception as error:
+            raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)
