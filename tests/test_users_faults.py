@@ -1,5 +1,6 @@
 """Users' laws and supervisors that raise errors, or return something else than they should: one line with where and what."""
 
+import sys
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_a_law_that_fails_is_named(name):
 
 
 PARTS = {
-    "nothing": (None or 3, "is no controller: int lacks law"),
+    "nothing": (3, "is no controller: int lacks law"),
     "no law": (Mine(law=3), "its law is 3"),
     "gains that fail": (Mine(gains=broken), r"controller Mine: params\(\) fails: KeyError: 'stiffness'"),
     "gains that are texts": (Mine(gains=("a",)), "the gains of law 'law' must be numbers"),
@@ -145,7 +146,7 @@ ANSWERS = {
         Decider(broken),
         r"supervisor Decider: decide\(\) fails: KeyError: 'stiffness' \(test_users_faults.py, line \d+\)",
     ),
-    "leaves": (Decider(lambda: exit(5)), r"it calls sys.exit\(5\)"),
+    "leaves": (Decider(lambda: sys.exit(5)), r"it calls sys.exit\(5\)"),
     "fails at the start": (Decider(0, broken), r"supervisor Decider: start\(\) fails: KeyError"),
     "nothing": (Decider(None), r"must return \(orders, memory\), got NoneType"),
     "orders alone": (Decider(ORDERS), "got ndarray"),

@@ -13,7 +13,7 @@ from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
-_PACKAGE = Path(__file__).resolve().parents[1]
+_PACKAGE = Path(__file__).parents[1]
 Result = TypeVar("Result")
 
 
@@ -102,9 +102,7 @@ def blame(error: BaseException) -> str:
 
 def _is_users(file: str) -> bool:
     """Whether a file is neither Python's, nor of an installed package, nor of this one."""
-    inside = any(
-        Path(file).is_relative_to(folder) for folder in (sys.prefix, sys.base_prefix, _PACKAGE, _PACKAGE.parent / "tasks")
-    )
+    inside = any(Path(file).is_relative_to(folder) for folder in (sys.prefix, sys.base_prefix, _PACKAGE))
     return not inside and not file.startswith("<")
 
 
