@@ -123,13 +123,23 @@ def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
     try:
         law = numba.njit(cache=cache, **options)(function)
     except RuntimeError:
-        return cast(Law, numba.njit(**options)(function))
+        _unkept.append(numba.njit(**options)(function))
+        return cast(Law, _unkept[-1])
     if cache and is_compiled(law):
         index = law._cache._cache_file
         index._source_stamp = (index._source_stamp, *_stamp(function))
         law._cache.load_overload = _forgiving(law._cache.load_overload)
         law._cache.save_overload = _forgiving(law._cache.save_overload)
     return cast(Law, law)
+
+
+_unkept: list[Any] = []
+"""Functions whose compiled code has no place on disk."""
+
+
+def compiled_in_vain() -> bool:
+    """Whether something has been compiled that the next process must compile again: no folder for it can be written."""
+    return any(law.signatures for law in _unkept)
 
 
 def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:

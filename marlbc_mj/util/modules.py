@@ -36,9 +36,11 @@ def load_module(path: Path) -> ModuleType:
     """
     try:
         path = path.resolve()
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(f"cannot read {path}: it is not a file")
         content = path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+    except (OSError, RuntimeError) as error:  # a link that leads to itself is a RuntimeError
+        raise ConfigurationError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
     name, stamp = f"marlbc_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}", zlib.crc32(content)
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__marlbc_stamp__", None) == stamp:
