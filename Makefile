@@ -39,7 +39,7 @@ test: venv
 
 fuzz: venv
 	@$(BIN)/python tests/warm_cache.py
-	@$(BIN)/python -m tests.fuzz --out out/fuzz
+	@$(BIN)/python tests/fuzz --out out/fuzz
 
 lint: venv
 	@status=0; \

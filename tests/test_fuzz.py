@@ -13,7 +13,7 @@ LINUX = pytest.mark.skipif(sys.platform != "linux", reason="forks, and asks the 
 
 def fuzz(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-m", "tests.fuzz", *arguments],
+        [sys.executable, str(ROOT / "tests" / "fuzz"), *arguments],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
         capture_output=True,
@@ -34,9 +34,9 @@ def test_a_few_wrong_inputs_of_two_kinds(tmp_path):
 PLANTED = """
 import sys
 from pathlib import Path
-from tests.fuzz import forked
-from tests.fuzz.cases import Case
-from tests.fuzz.outside import Bait, Watch
+from fuzz import forked
+from fuzz.cases import Case
+from fuzz.outside import Bait, Watch
 
 out = Path(sys.argv[1])
 watch, bait = Watch(), Bait(out / "bait")
@@ -67,7 +67,7 @@ print(do(lambda: (__import__("subprocess").run(["cat", "../../bait/secret.stl"])
 
 @LINUX
 def test_planted_faults_are_found(tmp_path):
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
     command = [sys.executable, "-c", PLANTED, str(tmp_path / "out")]
     done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
