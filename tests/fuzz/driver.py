@@ -40,7 +40,8 @@ def main() -> int:
     arguments = parse()
     kinds = tuple(arguments.only or KINDS)
     out = Path(arguments.out or tempfile.mkdtemp(prefix="fuzz-")).resolve()
-    shutil.rmtree(out, ignore_errors=True)
+    for each in ("bait", "bases", "work", "failing"):
+        shutil.rmtree(out / each, ignore_errors=True)
     watch, bait = Watch(), Bait(out / "bait")
     bases = make_bases(out / "bases", out / "bait", kinds)
     print(f"failing cases: {out / 'failing'}; a whole row is `python tests/fuzz --only KIND --seed {arguments.seed}`", flush=True)

@@ -8,19 +8,16 @@ from pathlib import Path
 
 IN_OPEN, NONBLOCKING = 0x20, os.O_NONBLOCK
 SYSTEM = (
-    "/proc",
-    "/sys",
-    "/dev/null",
-    "/dev/urandom",
-    "/dev/full",
-    "/dev/shm",
-    "/usr",
-    "/lib",
-    "/lib64",
-    "/etc/localtime",
-    "/etc/os-release",
+    *("/proc", "/sys", "/dev/null", "/dev/urandom", "/dev/full", "/dev/shm", "/usr", "/lib", "/lib64"),
+    *("/etc/localtime", "/etc/os-release", "/etc/mime.types", "/etc/fonts", "/var/cache/fontconfig"),
 )
-SYSTEM_FILES = ("/etc/ld.so.cache", "/etc/nsswitch.conf", "/etc/passwd", "/etc/mime.types", "/etc/fonts", "/var/cache/fontconfig")
+"""What any program may open."""
+ROOT = Path(__file__).resolve().parents[2]
+INSTALLED = (
+    *(sys.prefix, sys.base_prefix),
+    *(str(ROOT / name) for name in ("marlbc_mj", "models", "tasks", "training", "tests")),
+    *(entry for entry in sys.path if entry and Path(entry).resolve() != ROOT),
+)
 
 
 class Watch:
@@ -33,8 +30,7 @@ class Watch:
 
     def start(self, allowed: list[str]) -> None:
         """Switch on; ``allowed`` are folders and files, besides the installation and the system's own."""
-        installed = {sys.prefix, sys.base_prefix, str(Path(__file__).parents[2]), *filter(None, sys.path)}
-        self.allowed = tuple(os.path.realpath(each) for each in [*allowed, *installed]) + SYSTEM
+        self.allowed = tuple(os.path.realpath(each) for each in [*allowed, *INSTALLED]) + SYSTEM
 
     def _hook(self, event: str, arguments: tuple[object, ...]) -> None:
         if event != "open" or not self.allowed or not isinstance(arguments[0], str | bytes):
