@@ -157,7 +157,7 @@ ANSWERS = {
     "too few": (Decider((ORDERS[:3], 0)), "shape"),
     "no order": (Decider((ORDERS + 99, 0)), "indices from 0 to"),
     "NaN": (Decider((Blend(ORDERS, np.full((4, 2), np.nan)), 0)), "velocity must be finite"),
-    "huge": (Decider((Blend(ORDERS, np.full((4, 2), 1e300)), 0)), "agent 1"),
+    "huge": (Decider((Blend(ORDERS, np.full((4, 2), 1e300)), 0)), "below 1e[+]09 m/s, got 1e[+]300 for world 0, agent 1"),
     "other velocities": (Decider((Blend(ORDERS, np.zeros(3)), 0)), "velocities must have shape"),
     "velocities that are texts": (Decider((Blend(ORDERS, np.full((4, 2), "x")), 0)), "velocity must be numbers"),
     "no supervisor": (3, "int lacks start, decide"),

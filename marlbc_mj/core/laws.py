@@ -80,7 +80,8 @@ def for_team(law: Law, signature: Any) -> Law:
         except MarlbcError:
             raise
         except Exception as error:
-            refuse_undeclared(law, error)
+            if isinstance(error, AttributeError):
+                refuse_undeclared(law, error)
             raise SimulationError(f"law {name_of(law)!r} fails: {blame(error)}") from error
 
     return checked

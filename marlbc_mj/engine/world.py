@@ -12,6 +12,7 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
+from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
@@ -260,10 +261,12 @@ class World:
         if velocity.shape != shape:
             raise ConfigurationError(f"velocity must have shape {shape} (worlds, agents, axes), got {velocity.shape}")
         velocity = np.ascontiguousarray(velocity, dtype=np.float64)
-        bad = np.argwhere(~np.isfinite(velocity))
+        bad = np.argwhere(~(np.abs(velocity) < DIVERGED))
         if len(bad):
             b, i, axis = bad[0].tolist()
-            raise ConfigurationError(f"velocity must be finite, got {velocity[b, i, axis]} for world {b}, agent {i + 1}")
+            found = float(velocity[b, i, axis])
+            rule = f"below {DIVERGED:g} m/s" if np.isfinite(found) else "finite"
+            raise ConfigurationError(f"velocity must be {rule}, got {found} for world {b}, agent {i + 1}")
         return velocity
 
     def _read_record(self) -> Record | None:

@@ -6,6 +6,7 @@ import select
 import shutil
 import signal
 import sys
+import tempfile
 import traceback
 from contextlib import suppress
 from pathlib import Path
@@ -132,6 +133,7 @@ def _enter(case: Case, folder: Path, watch: Watch) -> None:
     os.chdir(folder)
     (folder / "tmp").mkdir()
     os.environ.update(HOME=str(folder), TMPDIR=str(folder / "tmp"))
+    tempfile.tempdir = None  # or the parent's place for temporary files would be kept
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + ADDRESS_SPACE, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -40,7 +40,7 @@ CONTROLLERS = ("pd", "pd", "pd", "lqr", "sorlc")
 def make(rng: Random, bases: Bases) -> Case:
     """A run or an evaluation of one file."""
     content = text(rng).encode(errors="surrogatepass")
-    if rng.random() < 0.2:
+    if rng.random() < 0.15:
         content = damaged(rng, content)
     run = ["run", "cell.toml", "--duration", rng.choice(("0.5", "0.1")), "--supervisor", rng.choice(SUPERVISORS), "--out", "out"]
     argv = [*run, "--controller", rng.choice(CONTROLLERS), "--seed", str(rng.randrange(5))]
@@ -54,7 +54,7 @@ def text(rng: Random) -> str:
     family = rng.choice((*FAMILIES, "custom", "custom", "paper", "cruise"))
     lines = {"family": f'"{family}"', **(CUSTOM if family == "custom" else {})}
     known = [each.name for each in fields(Custom if family == "custom" else FAMILIES.get(family, Custom))]
-    for _ in range(rng.choice((0, 1, 1, 2, 3, 6))):
+    for _ in range(rng.choice((0, 1, 1, 1, 2, 4))):
         name = rng.choice(known) if rng.random() < 0.95 else rng.choice(TEXTS) or "x"
         lines[name] = value(rng)
     if rng.random() < 0.1:
@@ -78,7 +78,7 @@ PLAUSIBLE = ("0.1", "0.3", "0.02", "0.001", "4", "5", "8", "12", "40", "100", "2
 def tables(rng: Random) -> list[str]:
     """Lines of tables at the file's end."""
     lines = []
-    for name in rng.sample(list(TABLES), rng.choice((0, 0, 0, 1, 2))):
+    for name in rng.sample(list(TABLES), rng.choice((0, 0, 0, 0, 1))):
         lines.append(rng.choice((f"[{name}]", f"[{name}]", f"[{name}]", f"[[{name}]]", f"[{name}.x]")))
         for key in rng.sample(TABLES[name], rng.randrange(len(TABLES[name]) + 1)):
             kind = key == "kind" and rng.random() < 0.8

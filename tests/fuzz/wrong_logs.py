@@ -102,7 +102,8 @@ def change(rng: Random, parts: Parts, bait: str) -> Parts:
 
 def reworded(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[str, int, bytes]]:
     """Messages of one topic, or one of them, with something replaced."""
-    topic = rng.choice(sorted({topic for topic, _, data in messages if data.startswith(b"{")}))
+    topics = sorted({topic for topic, _, data in messages if data.startswith(b"{")})
+    topic = rng.choice(topics) if topics else ""
     share, seed = rng.choice((1.0, 0.1)), rng.random()
     out = []
     for at, time, data in messages:
@@ -133,7 +134,7 @@ def replaced(rng: Random, value: Any) -> Any:
 
 def reordered(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[str, int, bytes]]:
     """Messages shuffled, at other times, doubled, or without those of a topic."""
-    topic = rng.choice(messages)[0]
+    topic = rng.choice(messages)[0] if messages else ""
     match rng.randrange(5):
         case 0:
             return rng.sample(messages, len(messages))
