@@ -17,8 +17,8 @@ from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError
-from marlbc_mj.util.modules import blame, guarded
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.modules import blame
 from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.text import one_line
 
@@ -84,6 +84,7 @@ class World:
         self.data = [mujoco.MjData(self.plan.model) for _ in range(worlds)]
         self._record = team.make_record(self.plan, worlds, record)
         self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
+        self._returns = np.zeros(worlds)
         self._arguments = self._make_arguments()
         self.reset()
 
@@ -211,14 +212,21 @@ class World:
             raise ConfigurationError(f"orders must have shape (steps, worlds, agents), got {sequence.shape}")
         sequence = np.stack([self._checked(row) for row in sequence])
         returns = np.zeros(self.worlds)
-        run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
-        guarded(lambda: run(returns, sequence, self._orders_alone, self._arguments), "a compiled law", SimulationError)
+        self._play(returns, sequence, self._orders_alone)
         self.raise_if_diverged()
         return returns
 
-    def _serial(self) -> bool:
-        """Whether one thread does it all; otherwise numba has been told how many there are."""
-        return bool(self.worlds == 1 or not threads_usable(self.threads))
+    def _play(self, returns: np.ndarray, sequence: np.ndarray, given: np.ndarray) -> int:
+        """The compiled loop, on one thread or on several; how many worlds failed.
+
+        Raises:
+            SimulationError: a law raised an error, for an assignment of the wrong shape for example.
+        """
+        run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
+        try:
+            return int(run(returns, sequence, given, self._arguments))
+        except Exception as error:
+            raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
@@ -229,21 +237,12 @@ class World:
     def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
         """:meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both contiguous: no checks, no
         copies; how many worlds failed.
-
-        Raises:
-            SimulationError: a law raised an error, an assignment of the wrong shape for example.
         """
         given = self._orders_alone if velocity is None else velocity
-        try:
-            if self.native:
-                run = drivers.step_serial if self._serial() else drivers.step_parallel
-                return int(run(orders, given, self._arguments))
-            mission_step = laws.plain(loop.mission_step)
-            return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
-        except MarlbcError:
-            raise
-        except Exception as error:
-            raise SimulationError(f"a compiled law fails: {blame(error)}") from error
+        if self.native:
+            return self._play(self._returns, orders[np.newaxis], given)
+        mission_step = laws.plain(loop.mission_step)
+        return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)
