@@ -68,7 +68,8 @@ def parse() -> argparse.Namespace:
 def run_kind(
     name: str, arguments: argparse.Namespace, out: Path, watched: tuple[Watch, Bait], bases: Bases
 ) -> tuple[list[str], bool]:
-    """Cells of a kind's row, and whether it has a fault."""
+    """Cells of a kind's row, and whether it has a fault; the row so far is in a file, for whoever stops it."""
+    row: list[str] = []
     statuses, faults, memory, cpu = Counter[int](), Counter[str](), 0, 0.0
     count = KINDS[name].count if arguments.count is None else arguments.count
     for number in range(arguments.first, arguments.first + count):
@@ -80,8 +81,11 @@ def run_kind(
         faults.update(found)
         memory, cpu = max(memory, outcome.memory), max(cpu, outcome.cpu)
         (keep if found else remove)(folder, case, outcome, found)
-    cells = [name, count, *(statuses[status] for status in (0, 1, 2, 3)), *(faults[fault] for fault in FAULTS)]
-    return [*map(str, cells), f"{memory / 2**20:.0f}", f"{cpu:.1f}"], bool(faults)
+        done = number - arguments.first + 1
+        cells = [name, done, *(statuses[status] for status in (0, 1, 2, 3)), *(faults[fault] for fault in FAULTS)]
+        row = [*map(str, cells), f"{memory / 2**20:.0f}", f"{cpu:.1f}"]
+        (out / f"{name}.txt").write_text(" | ".join(row) + "\n")
+    return row, bool(faults)
 
 
 def keep(folder: Path, case: Case, outcome: Outcome, found: list[str]) -> None:
