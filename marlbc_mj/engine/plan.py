@@ -14,7 +14,7 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.core.shield import NO_SHIELD, Shield, ShieldNumbers, as_records
-from marlbc_mj.engine.assembly import agent_prefix, assemble
+from marlbc_mj.engine.assembly import agent_prefix, assemble, unfit
 from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
 from marlbc_mj.engine.loop import MissionRules, Native, Plant
@@ -115,7 +115,10 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     limit = scenario.force_limit if controller.limited else np.inf
     numbers = resolve(Shield() if shield is True else shield, scenario, limit) if shield else NO_SHIELD
     xml = assemble(scenario, limit)
-    model = mujoco.MjModel.from_xml_string(xml)
+    try:
+        model = mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        raise unfit(scenario, error) from error
     return Plan(
         scenario=scenario,
         controller=controller,

@@ -68,7 +68,9 @@ def _standard_text(path: Path, changed: int, size: int) -> str:
         try:
             embed(spec)
             spec.compile()
-            return _tidy(spec.to_xml())
+            text = _tidy(spec.to_xml())
+            mujoco.MjSpec.from_string(text).compile()
+            return text
         except (ValueError, mujoco.FatalError) as error:
             raise ConfigurationError(f"{path} cannot be made one text: {one_line(error)}") from error
 
