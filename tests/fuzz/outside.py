@@ -6,7 +6,7 @@ import struct
 import sys
 from pathlib import Path
 
-IN_OPEN, NONBLOCKING = 0x20, os.O_NONBLOCK
+IN_OPEN, IN_ISDIR, NONBLOCKING = 0x20, 0x40000000, os.O_NONBLOCK
 SYSTEM = (
     *("/proc", "/sys", "/dev/null", "/dev/urandom", "/dev/full", "/dev/shm", "/usr", "/lib", "/lib64"),
     *("/etc/localtime", "/etc/os-release", "/etc/mime.types", "/etc/fonts", "/var/cache/fontconfig"),
@@ -60,7 +60,8 @@ class Bait:
             return []
         names, at = [], 0
         while at < len(data):
-            _, _, _, length = struct.unpack_from("iIII", data, at)
-            names.append(data[at + 16 : at + 16 + length].rstrip(b"\0").decode() or "bait")
+            _, mask, _, length = struct.unpack_from("iIII", data, at)
+            if not mask & IN_ISDIR:  # whoever lists the folder, another program for example, reads none of its files
+                names.append(data[at + 16 : at + 16 + length].rstrip(b"\0").decode())
             at += 16 + length
         return names
