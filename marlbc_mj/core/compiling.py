@@ -111,8 +111,8 @@ def raising_line(function: Law, seen: set[int]) -> str | None:
     for each in dis.get_instructions(code):
         if each.opname == "RAISE_VARARGS" and each.positions is not None:
             return f"{Path(code.co_filename).name}, line {each.positions.lineno}"
-    helpers = (function.__globals__.get(name) for name in code.co_names)
-    return next(filter(None, (raising_line(helper, seen) for helper in helpers if is_compiled(cast(Law, helper)))), None)
+    used = (cast(Law, function.__globals__.get(name)) for name in code.co_names)
+    return next(filter(None, (raising_line(helper, seen) for helper in used if is_compiled(helper))), None)
 
 
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
