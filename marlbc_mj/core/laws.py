@@ -175,7 +175,7 @@ def address(law: Law, signature: Any) -> int:
         raise ConfigurationError(
             f"law {name!r} raises an error ({line}), which compiled code cannot; write NaN to an output instead: it ends the run"
         )
-    kind, entry = ON_ROWS[signature][0], cast(Any, law).entry
+    kind, entry = ON_ROWS[signature][0], _entry(law, signature)
     try:
         law.compile(_arguments(interface(law)))
         entry.compile(kind.args)
@@ -186,6 +186,13 @@ def address(law: Law, signature: Any) -> int:
         raise ConfigurationError(f"law {name!r} does not compile as {signature}: {_last_line(error)}") from error
     result = entry.get_compile_result(kind)
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
+def _entry(law: Law, signature: Any) -> Any:
+    """The team form of a law: made where the law is declared, and anew for one that came out of a pickle."""
+    if not hasattr(law, "entry"):
+        cast(Any, law).entry = allocation_free(on_rows(law, signature), cache=False)
+    return cast(Any, law).entry
 
 
 def _arguments(declared: Interface) -> tuple[Any, ...]:

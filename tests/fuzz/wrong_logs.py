@@ -108,7 +108,11 @@ def reworded(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[
     out = []
     for at, time, data in messages:
         if at == topic and data.startswith(b"{") and rng.random() < share:
-            data = json.dumps(replaced(Random(seed), json.loads(data))).encode() if rng.random() < 0.95 else b"\xff" + rng.randbytes(5)
+            data = (
+                json.dumps(replaced(Random(seed), json.loads(data))).encode()
+                if rng.random() < 0.95
+                else b"\xff" + rng.randbytes(5)
+            )
         out.append((at, time, data))
     return out
 
