@@ -4,6 +4,7 @@ import sys
 from dataclasses import dataclass, field
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -119,6 +120,7 @@ def helped(gains, state, p, v, p_r, v_r, drag, h, force_out):
     force_out[0] = helper(p[0]) * gains.limit
 
 
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
 @pytest.mark.parametrize("law", [asserting, helped])
 def test_a_compiled_law_cannot_raise(law):
     """Threads would lose it: it is refused before it flies, and told what to do."""

@@ -19,7 +19,7 @@ from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
 _PACKAGE = Path(__file__).parents[1]
-Result = TypeVar("Result")
+_Result = TypeVar("_Result")
 _PREFIX = "marlbc_user_"
 _LONGEST_PLACE = 160  # of a module's name: file names of the cache of compiled code hold it
 _MOST_BESIDE = 500
@@ -133,7 +133,7 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
                 del sys.modules[name]
 
 
-def guarded(call: Callable[[], Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> Result:
+def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:
     """What a user's code returns.
 
     Args:
