@@ -23,7 +23,7 @@ from marlbc_mj.cli.parsing import parse
 from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
-from marlbc_mj.cli.terminal import prepare_gl
+from marlbc_mj.cli.terminal import prepare_gl, suggest_cache
 from marlbc_mj.cli.training import TrainCommand
 
 Command = (
@@ -62,3 +62,4 @@ def main(arguments: list[str] | None = None) -> None:
         command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
         prepare_gl(strict=isinstance(command, VideoCommand))
         command.run()
+        suggest_cache()
