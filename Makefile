@@ -65,7 +65,7 @@ wheel: venv
 # The tool is installed here and not with the rest: only this target needs it.
 docs: venv
 	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings_handlers.python' 2>/dev/null || \
-		$(BIN)/python -m pip install --quiet -c constraints.txt -e '.[docs]'
+		$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir out/docs
 	@echo out/docs/index.html
 
@@ -99,5 +99,5 @@ venv:
 		rm -rf .venv; "$$python" -m venv .venv;; \
 	esac; \
 	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
-	rm -f $(STAMP); $(BIN)/python -m pip install --quiet -c constraints.txt -e '.[dev]'; \
+	rm -f $(STAMP); $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'; \
 	echo "$$wanted" > $(STAMP)
