@@ -1,0 +1,239 @@
+"""Suite v1: which missions there are, on which layouts, and the hash that names it.
+
+No number of any supervisor, controller or law was chosen on these layouts: seeds begin at 80000, and layouts are of the split
+that no training draws. A change of any mission, by a default of a scenario for example, changes the hash and is another suite.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+from marlbc_mj.core.disturbances import LinearDrag
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.robots import make_robot
+from marlbc_mj.scenarios import Perturbation, Scenario, held_out, make_scenario, standard_behaviors
+from marlbc_mj.scenarios.base import YOUNG
+from marlbc_mj.scenarios.robot_gate import AIR_DRAG
+from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.provenance import plain_data
+
+VERSION = "v1"
+FROZEN = ""
+"""Hash of the definition of this version."""
+FIRST_SEED = 80_000
+QUICK = 50
+"""Layouts of each mission in a quick run: the first of the whole suite's."""
+HASH_DIGITS = 9
+"""Significant digits of numbers in the definition: the last bits of a sine differ between machines."""
+SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
+TEAMS = {"circle": 8, "line": 6, "grid": 9, "wedge": 16}
+TEAM_FAMILIES = ("field", "forest", "gates")
+SUITE_ROBOTS = ("disc", "omni", "diff_drive", "crazyflie")
+
+
+class SuiteMission(NamedTuple):
+    """One scenario, and the seeds that draw its layouts."""
+
+    track: str
+    name: str
+    scenario: Scenario
+    seeds: tuple[int, ...]
+
+
+class Track(NamedTuple):
+    """Missions that belong together, and the law that flies them."""
+
+    name: str
+    summary: str
+    missions: Callable[[], list[SuiteMission]]
+    controller: str | None  # the one that supervisors are compared under; None: controllers are compared
+    supervisor: str | None = None  # the one that controllers are compared under
+
+
+def _paper() -> list[SuiteMission]:
+    return [*_case_study("paper")]
+
+
+def _control() -> list[SuiteMission]:
+    return [*_case_study("control")]
+
+
+def _case_study(track: str) -> list[SuiteMission]:
+    """The published mission, and draws around it."""
+    published = make_scenario("paper")
+    drawn = replace(published, perturbation=CASE_STUDY_PERTURBATION)
+    return [
+        SuiteMission(track, f"{track}-published", published, seed_range(1, FIRST_SEED)),
+        SuiteMission(track, f"{track}-draws", drawn, seed_range(201, FIRST_SEED)),
+    ]
+
+
+def _families() -> list[SuiteMission]:
+    built = {name: make_scenario(name, agents=4, formation="wedge") for name in SUITE_FAMILIES}
+    return [SuiteMission("families", name, _unseen(each), seed_range(1000, FIRST_SEED)) for name, each in built.items()]
+
+
+def _teams() -> list[SuiteMission]:
+    return [
+        SuiteMission("teams", f"{formation}{agents}-{family}", _team(family, formation, agents), seed_range(200, FIRST_SEED))
+        for formation, agents in (*TEAMS.items(), ("grid", 32))
+        for family in TEAM_FAMILIES
+    ]
+
+
+def _team(family: str, formation: str, agents: int) -> Scenario:
+    """A family for a team of this size: the way leaves as much room beside the formation as the team of four has."""
+    return _unseen(make_scenario(family, agents=agents, formation=formation, **_ROOM.get(agents, {})))
+
+
+_ROOM: dict[int, dict[str, Any]] = {}
+
+
+def _robots() -> list[SuiteMission]:
+    seeds = seed_range(200, FIRST_SEED)
+    gates = [SuiteMission("robots", f"gate-{robot}", gate_for(robot), seeds) for robot in SUITE_ROBOTS]
+    return [*gates, *(SuiteMission("robots", f"field-{robot}", field_for(robot), seeds) for robot in SUITE_ROBOTS)]
+
+
+def gate_for(robot: str) -> Scenario:
+    """The case study's gate at the robot's scale, with starts within 1 and obstacles within 0.5 of its length units."""
+    unit = make_robot(robot).length
+    return make_scenario("robot_gate", robot=robot, perturbation=Perturbation(unit, 0.5 * unit))
+
+
+def field_for(robot: str) -> Scenario:
+    """The field of discs at the robot's scale: lengths in its length units, speeds and gains that its limits allow.
+
+    Speed, gains and the distance at which avoidance begins are chosen as in :mod:`marlbc_mj.scenarios.robot_gate`.
+    """
+    body = make_robot(robot)
+    unit, speed = body.length, 0.4 * body.speed_limit
+    gain = 0.8 * body.acceleration_limit / body.speed_limit
+    avoid = unit + speed**2 / body.acceleration_limit + 0.3 * unit
+    scenario = make_scenario(
+        "field",
+        spacing=6.0 * unit,
+        column_spacing=3.0 * unit,
+        length=60.0 * unit,
+        speed=speed,
+        safe_distance=unit,
+        agent_distance=1.5 * unit,
+        formation_tolerance=0.5 * unit,
+        formation_gain=gain,
+        avoidance_gain=2.5 * gain,
+        radius=(0.5 * unit, 2.0 * unit),
+        margin=3.0 * unit,
+        gap=3.0 * unit,
+        disturbance=LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
+        **body.scale(),
+    )
+    slots, column = (tuple(map(tuple, rows.tolist())) for rows in scenario.formations)
+    behaviors = standard_behaviors(
+        slots,
+        column,
+        avoidance_gain=2.5 * gain,
+        formation_gain=gain,
+        safe_distance=avoid,
+        agent_distance=1.5 * unit,
+    )
+    return _unseen(replace(scenario, name=f"field-{robot}", behaviors=behaviors))
+
+
+def _unseen(scenario: Scenario) -> Scenario:
+    """The held-out layouts of a scenario that draws layouts; one that draws starts only is as new by its seeds."""
+    return scenario if scenario.layout is None else held_out(scenario)
+
+
+TRACKS = {
+    track.name: track
+    for track in (
+        Track("paper", "the published case study, and draws around it", _paper, "sorlc"),
+        Track("families", "missions drawn by seed, for a wedge of four", _families, "sorlc"),
+        Track("teams", "the same for other formations of 6 to 32", _teams, "sorlc"),
+        Track("robots", "a gate and a field, scaled to robots with contact, wheels and rotors", _robots, "pd"),
+        Track("control", "every controller under the schedule of the case study", _control, None, "scripted"),
+    )
+}
+"""All tracks by name."""
+
+
+@cache
+def missions_of(track: str) -> tuple[SuiteMission, ...]:
+    """All missions of a track.
+
+    Raises:
+        ConfigurationError: an unknown track.
+    """
+    if track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    return tuple(TRACKS[track].missions())
+
+
+def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layouts: int | None = None) -> list[SuiteMission]:
+    """Missions of the named tracks, all of them without names.
+
+    Args:
+        tracks: names; none: all.
+        names: of missions, to leave out others.
+        layouts: of each mission, the first so many.
+
+    Raises:
+        ConfigurationError: an unknown or repeated name, or fewer than one layout.
+    """
+    for kind, given in (("track", tracks), ("mission", names)):
+        if len(set(given)) != len(given):
+            raise ConfigurationError(f"a {kind} is named twice: {', '.join(given)}")
+    if layouts is not None and layouts < 1:
+        raise ConfigurationError(f"layouts must be at least 1, got {layouts}")
+    found = [mission for track in tracks or TRACKS for mission in missions_of(track)]
+    for name in names:
+        if name not in (mission.name for mission in found):
+            raise unknown("mission", name, (mission.name for mission in found))
+    return [mission._replace(seeds=mission.seeds[:layouts]) for mission in found if not names or mission.name in names]
+
+
+@cache
+def suite_hash() -> str:
+    """SHA-256 of the definition, as it is in this code."""
+    tracks = {
+        name: {
+            "controller": track.controller,
+            "supervisor": track.supervisor,
+            "missions": [
+                {"name": m.name, "seeds": [m.seeds[0], len(m.seeds)], "scenario": _canonical(m.scenario)}
+                for m in missions_of(name)
+            ],
+        }
+        for name, track in TRACKS.items()
+    }
+    text = json.dumps({"version": VERSION, "tracks": tracks}, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _canonical(scenario: Scenario) -> Any:
+    """A scenario as data, rounded, without fields that came later and do nothing at their defaults, and without prose."""
+    young = {f.name: f.default for f in scenario.__dataclass_fields__.values() if f.metadata == YOUNG}
+    left_out = {name for name, default in young.items() if getattr(scenario, name) == default} | {"description"}
+    data = {name: getattr(scenario, name) for name in scenario.__dataclass_fields__ if name not in left_out}
+    return _round(plain_data(data))
+
+
+def _round(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _round(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_round(entry) for entry in value]
+    return f"{value:.{HASH_DIGITS}g}" if isinstance(value, float) else value
+
+
+def check_frozen() -> None:
+    """Raise ConfigurationError where the code's definition is not the frozen one."""
+    if suite_hash() != FROZEN:
+        raise ConfigurationError(
+            f"suite {VERSION} is {FROZEN[:12]}, but this code's missions make {suite_hash()[:12]}: a default has changed; "
+            "restore it, or give the suite another version"
+        )
