@@ -77,9 +77,9 @@ class SuiteCommand:
 
         if self.page and self.source is None:
             raise ConfigurationError("--page needs --from: the folder whose results it shows")
-        check_frozen()
         layouts = QUICK if self.quick and self.layouts is None else self.layouts
-        missions = () if self.page else choose_missions(self.track, self.missions, layouts)
+        missions = [] if self.page else choose_missions(self.track, self.missions, layouts)
+        check_frozen(list(dict.fromkeys(mission.track for mission in missions)))
         choice = Choice(self.supervisors, self.controllers, self.compositions, self.shield, self.quick)
         others = None if self.source is None else read_suite(self.source)
         return SuiteStudy(tuple(missions), choice, others, self.clips)

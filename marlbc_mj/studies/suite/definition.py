@@ -16,22 +16,29 @@ from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Perturbation, Scenario, held_out, make_scenario, standard_behaviors
 from marlbc_mj.scenarios.base import YOUNG
+from marlbc_mj.scenarios.families import Field
 from marlbc_mj.scenarios.robot_gate import AIR_DRAG
 from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.provenance import plain_data
 
 VERSION = "v1"
-FROZEN = ""
-"""Hash of the definition of this version."""
+FROZEN = {"paper": "", "families": "", "teams": "", "robots": "", "control": ""}
+"""Hash of every track of this version."""
 FIRST_SEED = 80_000
 QUICK = 50
 """Layouts of each mission in a quick run: the first of the whole suite's."""
 HASH_DIGITS = 9
 """Significant digits of numbers in the definition: the last bits of a sine differ between machines."""
 SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
-TEAMS = {"circle": 8, "line": 6, "grid": 9, "wedge": 16}
+TEAMS = (("circle", 8), ("line", 6), ("grid", 9), ("wedge", 16), ("grid", 32))
 TEAM_FAMILIES = ("field", "forest", "gates")
+ROOM: dict[int, dict[str, Any]] = {16: {"length": 120.0, "files": 2}, 32: {"length": 120.0, "files": 4}}
+"""A longer way and a shorter column for large teams: in one file they would never be through before the end."""
+OPENING = {16: 8.0, 32: 14.0}
+"""Width of the gates that a column of several files passes [m]."""
+DISCS = 12 / 912.0
+"""Discs per square metre, as in the field of four agents."""
 SUITE_ROBOTS = ("disc", "omni", "diff_drive", "crazyflie")
 
 
@@ -80,17 +87,21 @@ def _families() -> list[SuiteMission]:
 def _teams() -> list[SuiteMission]:
     return [
         SuiteMission("teams", f"{formation}{agents}-{family}", _team(family, formation, agents), seed_range(200, FIRST_SEED))
-        for formation, agents in (*TEAMS.items(), ("grid", 32))
+        for formation, agents in TEAMS
         for family in TEAM_FAMILIES
     ]
 
 
 def _team(family: str, formation: str, agents: int) -> Scenario:
-    """A family for a team of this size: the way leaves as much room beside the formation as the team of four has."""
-    return _unseen(make_scenario(family, agents=agents, formation=formation, **_ROOM.get(agents, {})))
-
-
-_ROOM: dict[int, dict[str, Any]] = {}
+    """A family for a team of this size, with as many discs on a square metre as the team of four has."""
+    changes = {"agents": agents, "formation": formation, **ROOM.get(agents, {})}
+    if family == "field":
+        wide = Field(**changes)
+        area = (wide.way[1] - wide.way[0]) * 2.0 * (wide.reach + wide.margin)
+        changes["obstacles"] = round(DISCS * area)
+    if family == "gates" and agents in OPENING:
+        changes["width"] = OPENING[agents]
+    return _unseen(make_scenario(family, **changes))
 
 
 def _robots() -> list[SuiteMission]:
@@ -127,7 +138,7 @@ def field_for(robot: str) -> Scenario:
         avoidance_gain=2.5 * gain,
         radius=(0.5 * unit, 2.0 * unit),
         margin=3.0 * unit,
-        gap=3.0 * unit,
+        gap=max(4.0 * unit, 2.2 * avoid),
         disturbance=LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
         **body.scale(),
     )
@@ -196,21 +207,26 @@ def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layou
     return [mission._replace(seeds=mission.seeds[:layouts]) for mission in found if not names or mission.name in names]
 
 
-@cache
 def suite_hash() -> str:
-    """SHA-256 of the definition, as it is in this code."""
-    tracks = {
-        name: {
-            "controller": track.controller,
-            "supervisor": track.supervisor,
-            "missions": [
-                {"name": m.name, "seeds": [m.seeds[0], len(m.seeds)], "scenario": _canonical(m.scenario)}
-                for m in missions_of(name)
-            ],
-        }
-        for name, track in TRACKS.items()
-    }
-    text = json.dumps({"version": VERSION, "tracks": tracks}, sort_keys=True, separators=(",", ":"))
+    """The hash that names this version: of the hashes of its tracks."""
+    return _digest({"version": VERSION, "tracks": FROZEN})
+
+
+@cache
+def track_hash(name: str) -> str:
+    """Hash of a track, as it is in this code.
+
+    Raises:
+        ConfigurationError: an unknown track, or one that needs a package that is not installed.
+    """
+    missions = [
+        {"name": m.name, "seeds": [m.seeds[0], len(m.seeds)], "scenario": _canonical(m.scenario)} for m in missions_of(name)
+    ]
+    return _digest({"controller": TRACKS[name].controller, "supervisor": TRACKS[name].supervisor, "missions": missions})
+
+
+def _digest(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -230,10 +246,11 @@ def _round(value: Any) -> Any:
     return f"{value:.{HASH_DIGITS}g}" if isinstance(value, float) else value
 
 
-def check_frozen() -> None:
-    """Raise ConfigurationError where the code's definition is not the frozen one."""
-    if suite_hash() != FROZEN:
-        raise ConfigurationError(
-            f"suite {VERSION} is {FROZEN[:12]}, but this code's missions make {suite_hash()[:12]}: a default has changed; "
-            "restore it, or give the suite another version"
-        )
+def check_frozen(tracks: Sequence[str]) -> None:
+    """Raise ConfigurationError where a track of this code is not the frozen one."""
+    for name in tracks:
+        if track_hash(name) != FROZEN[name]:
+            raise ConfigurationError(
+                f"track {name} of suite {VERSION} is {FROZEN[name][:12]}, but this code's missions make {track_hash(name)[:12]}: "
+                "a default has changed; restore it, or give the suite another version"
+            )
