@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns
-from marlbc_mj.results.standings import behind, by_cost, by_return, improvement, notable_layouts, rank_methods
+from marlbc_mj.results.standings import behind, by_cost, by_return, improvement, median_interval, notable_layouts, rank_methods
 from marlbc_mj.util.errors import ConfigurationError
 
 A, B, C = Method("a", "x"), Method("b", "x"), Method("c", "x")
@@ -60,7 +60,7 @@ def test_a_method_that_did_not_fly_everything_has_no_rank() -> None:
     group = [flown(A, "one", [True]), flown(A, "two", [True]), flown(B, "one", [True])]
     first, second = rank_methods(group)
     assert (first.method, first.rank.value) == (A, 1.0)
-    assert second.method == B and math.isnan(second.rank.value) and second.summaries["one"].shares["success"].value == 1.0
+    assert second.method == B and math.isnan(second.rank.value) and set(second.flown) == {"one"}
 
 
 def test_only_common_layouts_are_compared() -> None:
@@ -103,3 +103,11 @@ def test_worst_and_median_are_runs_that_can_be_looked_at() -> None:
     assert (worst.kind, worst.run.seed, median.kind, median.run.seed) == ("worst", 1, "median", 2)
     assert worst.clip == "clips/t-a+x-worst.mp4"
     assert notable_layouts([MissionRuns("t", "one", A, runs[3:])]) == []
+
+
+def test_the_interval_of_a_median_is_that_of_the_sign_test() -> None:
+    """Of 50 values the 18th and the 33rd: 34 of the 51 possible counts below the median make up at least 95 %."""
+    assert median_interval(np.arange(1.0, 51.0)) == (25.5, 18.0, 33.0)
+    assert median_interval(np.array([3.0, 1.0, 2.0])) == (2.0, 1.0, 3.0)
+    alone, none = median_interval(np.array([4.0])), median_interval(np.zeros(0))
+    assert alone.value == 4.0 and math.isnan(alone.low) and math.isnan(none.value)

@@ -54,11 +54,12 @@ class SuiteCommand:
     def run(self) -> None:
         """Fly, then print the first tables and say where the page is."""
         from marlbc_mj.report.leaderboard import LEADERBOARD_PAGE
-        from marlbc_mj.studies.runner import run_study
+        from marlbc_mj.studies.runner import counting, run_study
 
         study = self.study()
         with progress_bars() as progress:
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=progress)
+            ended = counting(study.jobs(), lambda job: job.track, progress)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=progress, ended=ended)
         print(done.report.text)
         for problem in done.report.problems:
             print(f"marlbc: {problem}", file=sys.stderr)

@@ -8,13 +8,13 @@ import numpy as np
 
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.formats import percent, spans
-from marlbc_mj.report.leaderboard_cells import WIDTH, BoardColumn, BoardRow, Name, board_rows, name_of
+from marlbc_mj.report.leaderboard_cells import WIDTH, BoardColumn, BoardRow, Cell, Name, board_rows, name_of
 from marlbc_mj.report.page import origin_facts
 from marlbc_mj.report.table import Column, Table, to_markdown
 from marlbc_mj.report.tables import latex_document
 from marlbc_mj.report.templates import render
 from marlbc_mj.results.layout_runs import Method, MissionRuns
-from marlbc_mj.results.standings import Notable, Standing, by_cost, notable_layouts, rank_methods
+from marlbc_mj.results.standings import Notable, Standing, by_cost, finished, notable_layouts, rank_methods, share_of
 from marlbc_mj.results.statistics import Estimate
 
 LEADERBOARD_PAGE, LEADERBOARD_TEX = "leaderboard.html", "leaderboard.tex"
@@ -24,6 +24,11 @@ CONTROL_REFERENCE = "sorlc"
 """The controller that the chance of improvement is measured against."""
 CONTROL = "control"
 """The track that compares controllers."""
+_REFERENCE_NOTE = f"Reference: {REFERENCE} under the null-space composition."
+LEADING = 3
+"""Columns that every table begins with; in text they have their intervals."""
+MOST_COLUMNS = 12
+"""That a table on paper has."""
 
 
 class Board(NamedTuple):
@@ -36,10 +41,12 @@ class Board(NamedTuple):
     rows: tuple[BoardRow, ...]
 
     def table(self) -> Table:
-        """The same as text, for LaTeX and the terminal."""
-        heads = (Column("", "method"), *(Column("", column.text) for column in self.columns))
-        cells = tuple((_words(row.name), *(cell.text for cell in row.cells)) for row in self.rows)
-        return Table(f"board-{self.name}", f"{self.title}. {self.note}", heads, cells)
+        """The same as text, for LaTeX and the terminal; success on single missions is left out where it would not fit."""
+        wide = len(self.columns) > MOST_COLUMNS
+        kept = [k for k, column in enumerate(self.columns) if not (wide and column.mission)]
+        heads = (Column("", "method"), *(Column("", self.columns[k].text) for k in kept))
+        rows = tuple((_words(row.name), *(_text(row.cells[k], with_ends=k < LEADING) for k in kept)) for row in self.rows)
+        return Table(f"board-{self.name}", f"{self.title}. {self.note}", heads, rows)
 
 
 class Failure(NamedTuple):
@@ -84,7 +91,8 @@ def write_leaderboard(groups: Sequence[MissionRuns], facts: Mapping[str, Any], t
     text = render(
         "leaderboard.html",
         title=f"Leaderboard of suite {facts['suite']['version']}",
-        facts=_page_facts(groups, facts, tracks),
+        facts=_page_facts(groups, facts),
+        missions=_missions(groups, tracks),
         command=str(facts["command"]),
         boards=boards,
         width=WIDTH,
@@ -118,18 +126,18 @@ def _median(name: str) -> Callable[[Standing], Estimate]:
     """Mean over missions of a median, without an interval; missions on which no run finished are left out."""
 
     def read(standing: Standing) -> Estimate:
-        values = [summary.medians[name].value for summary in standing.summaries.values()]
-        finite = [value for value in values if np.isfinite(value)]
-        return Estimate(float(np.mean(finite)) if finite else np.nan, np.nan, np.nan)
+        columns = [finished(each, name) for each in standing.flown.values()]
+        medians = [float(np.median(column)) for column in columns if len(column)]
+        return Estimate(float(np.mean(medians)) if medians else np.nan, np.nan, np.nan)
 
     return read
 
 
-def _leading(count: int, reference: str) -> list[BoardColumn]:
+def _leading(count: int) -> list[BoardColumn]:
     """What every table begins with."""
     return [
         BoardColumn("mean rank", lambda standing: standing.rank, 2, -1, (1.0, max(2.0, float(count)))),
-        BoardColumn(f"better than {reference}", lambda standing: percent(standing.improvement), 0, 1, (0.0, 100.0), unit="%"),
+        BoardColumn("better than reference", lambda standing: percent(standing.improvement), 0, 1, (0.0, 100.0), unit="%"),
         BoardColumn("success", _share("success"), 1, 1, (0.0, 100.0), unit="%"),
     ]
 
@@ -149,11 +157,11 @@ def _overall_board(flown: Mapping[str, Sequence[MissionRuns]]) -> Board:
     standings = rank_methods([each for own in pooled.values() for each in own], Method(REFERENCE, ""), by_track=True)
     tracks = {name: {s.method: s for s in rank_methods(own)} for name, own in pooled.items()}
     columns = (
-        *_leading(len(standings), REFERENCE),
+        *_leading(len(standings)),
         *(BoardColumn(name, _on_track(own), 1, 1, (0.0, 100.0), unit="%") for name, own in tracks.items()),
         *_SAFETY_AND_COST,
     )
-    note = "Means over missions, every track with the same weight."
+    note = f"Means over missions, every track with the same weight. {_REFERENCE_NOTE}"
     return Board("supervisors", "Supervisors", note, columns, board_rows(standings, columns))
 
 
@@ -172,49 +180,46 @@ def _track_board(name: str, summary: str, own: Sequence[MissionRuns]) -> Board:
     standings = rank_methods(own, Method(REFERENCE, next(iter(laws))))
     missions = dict.fromkeys(each.mission for each in own)
     several = (BoardColumn(mission, _on_mission(mission), 0, 1, (0.0, 100.0), mission, "%") for mission in missions)
-    columns = (*_leading(len(standings), REFERENCE), *(several if len(missions) > 1 else ()), *_SAFETY_AND_COST)
-    note = f"Under {' and '.join(laws)}: {summary}."
+    columns = (*_leading(len(standings)), *(several if len(missions) > 1 else ()), *_SAFETY_AND_COST)
+    note = f"Under {' and '.join(laws)}: {summary}. {_REFERENCE_NOTE}"
     return Board(name, f"Supervisors: track {name}", note, columns, board_rows(standings, columns))
 
 
 def _on_mission(mission: str) -> Callable[[Standing], Estimate]:
     nothing = Estimate(np.nan, np.nan, np.nan)
-    return lambda standing: percent(standing.summaries[mission].shares["success"]) if mission in standing.summaries else nothing
+    return lambda standing: percent(share_of(standing.flown[mission], "success")) if mission in standing.flown else nothing
 
 
 def _control_board(summary: str, own: Sequence[MissionRuns]) -> Board:
     supervisor = own[0].method.supervisor
     standings = rank_methods(own, Method(supervisor, CONTROL_REFERENCE), merit=by_cost)
     columns = (
-        *_leading(len(standings), CONTROL_REFERENCE),
+        *_leading(len(standings)),
         BoardColumn("violation", _share("violated"), 1, -1, (0.0, 100.0), unit="%"),
         BoardColumn("cost", _median("cost_integral_sum"), None, -1),
         BoardColumn("effort", _median("effort_integral_sum"), None, -1, unit="N s"),
         BoardColumn("‖e_p‖", _median("rms_position_error_rms"), None, -1, unit="m"),
         BoardColumn("return", _median("return"), 0, 1),
     )
-    note = f"{summary.capitalize()}. Ranked by success, then by the control cost ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt of all agents."
+    ranked = "Ranked by success, then by the control cost ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt of all agents"
+    note = f"{summary.capitalize()}. {ranked}. Reference: {CONTROL_REFERENCE}."
     return Board("controllers", "Controllers", note, columns, board_rows(standings, columns, by_controller=True))
+
+
+def _text(cell: Cell, *, with_ends: bool) -> str:
+    return cell.text + (f" [{cell.ends.replace(' to ', ', ')}]" if cell.ends and with_ends else "")
 
 
 def _words(name: Name) -> str:
     return name.display + (f" ({name.facts})" if name.facts else "")
 
 
-def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any], tracks: Mapping[str, str]) -> list[tuple[str, str]]:
+def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list[tuple[str, str]]:
     """What the page says of the suite and of its rows, by name."""
     seeds = {run.seed for each in groups for run in each.runs}
-    flown = dict.fromkeys((each.track, each.mission) for each in groups)
     beside = facts.get("beside", ())
-    counts = {mission: max(len(each.runs) for each in groups if each.mission == mission) for _, mission in flown}
-    layouts = [
-        f"{name}: {', '.join(f'{mission} ({counts[mission]})' for track, mission in flown if track == name)}"
-        for name in tracks
-        if any(track == name for track, _ in flown)
-    ]
     return [
         ("Suite", f"{facts['suite']['version']}, {facts['suite']['hash'][:16]}"),
-        ("Missions (layouts)", "; ".join(layouts)),
         ("Seeds", f"{spans(sorted(seeds))}, on which nothing was tuned"),
         ("Runs", f"{sum(len(each.runs) for each in groups)} episodes of {len({each.method for each in groups})} methods"),
         ("Date", str(facts["date"])),
@@ -223,6 +228,18 @@ def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any], tracks:
         *origin_facts(facts),
         *(("Rows beside these", f"flown {other['date']} by {other['code']}: {other['command']}") for other in beside),
     ]
+
+
+def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Every track with its missions, and of how many layouts of each there are rows."""
+    counts: dict[tuple[str, str], int] = {}
+    for each in groups:
+        key = each.track, each.mission
+        counts[key] = max(counts.get(key, 0), len(each.runs))
+    lists = {
+        name: ", ".join(f"{mission} ({count})" for (track, mission), count in counts.items() if track == name) for name in tracks
+    }
+    return [(name, missions) for name, missions in lists.items() if missions]
 
 
 def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
@@ -238,7 +255,8 @@ def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
         looks = tuple(_look(one, folder) for one in notable if one.method == method)
         name = name_of(method)
         with_law = name._replace(facts=", ".join(part for part in (method.controller, name.facts) if part))
-        details.append(Detail(with_law, f"{failed} of {total} runs could not be finished", failures, looks))
+        words = f"{failed} of {total} runs could not be finished" if failed else f"all {total} runs were finished"
+        details.append(Detail(with_law, words, failures, looks))
     return details
 
 

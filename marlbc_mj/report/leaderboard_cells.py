@@ -81,7 +81,7 @@ def board_rows(
     grid = [[_cell(column, standing) for column in columns] for standing in standings]
     for k, column in enumerate(columns):
         values = [column.better * row[k].sort for row in grid if not math.isnan(row[k].sort)]
-        if column.better and len(values) > 1:
+        if column.better and 2 * values.count(max(values, default=0.0)) < len(values):  # the best of few, not one of many
             for row in grid:
                 row[k] = row[k]._replace(best=column.better * row[k].sort == max(values))
     places = [str(k) if not math.isnan(standing.rank.value) else DASH for k, standing in enumerate(standings, 1)]

@@ -13,7 +13,7 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
-DIGITS = 7
+DIGITS = 6
 """Significant digits of every number of a row. What is computed from rows is the same before and after a file."""
 LAYOUT_SCORES = (
     *("return", "violation_time_worst", "clearance_min_worst", "agent_distance_min", "end_error_worst"),

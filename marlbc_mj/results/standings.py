@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns
-from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, mean, median, rate
+from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, mean, rate
 from marlbc_mj.util.errors import ConfigurationError
 
 AHEAD = 1e12
@@ -39,7 +39,7 @@ class MissionSummary(NamedTuple):
 
     runs: int
     shares: Mapping[str, Estimate]  # of outcomes, with Wilson's interval
-    medians: Mapping[str, Estimate]  # over the runs that finished, with bootstrap intervals
+    medians: Mapping[str, Estimate]  # over the runs that finished
     failures: Mapping[str, int]  # reason: number of runs
 
 
@@ -50,7 +50,7 @@ class Standing(NamedTuple):
     rank: Estimate  # mean over missions of the mean rank over layouts: 1 is best; NaN where it did not fly all missions
     improvement: Estimate  # P(better than the reference), mean over missions
     shares: Mapping[str, Estimate]  # mean over missions of the share of each outcome
-    summaries: Mapping[str, MissionSummary]  # by mission
+    flown: Mapping[str, MissionRuns]  # by mission
     best: frozenset[str]  # missions on which no other method succeeds more often
     level: frozenset[str]  # missions on which nobody succeeds significantly more often: the best and those level with it
 
@@ -58,12 +58,36 @@ class Standing(NamedTuple):
 def summarize(each: MissionRuns) -> MissionSummary:
     """Shares, medians and failures."""
     runs = each.runs
-    finished = [run for run in runs if not run.failure]
-    shares = {kind: rate([bool(getattr(run, kind)) for run in runs]) for kind in OUTCOMES}
-    columns = {name: [run.score(name) for run in finished] for name in LAYOUT_SCORES}
-    columns |= {name: [float(getattr(run, name)) for run in finished] for name in ("switches", "decision_ms")}
-    medians = {name: bootstrap([np.array(column)], median) for name, column in columns.items()}
+    shares = {kind: share_of(each, kind) for kind in OUTCOMES}
+    medians = {name: median_interval(finished(each, name)) for name in (*LAYOUT_SCORES, "switches", "decision_ms")}
     return MissionSummary(len(runs), shares, medians, each.failures)
+
+
+def share_of(each: MissionRuns, kind: str) -> Estimate:
+    """Share of runs with an outcome, with Wilson's interval."""
+    return rate([bool(getattr(run, kind)) for run in each.runs])
+
+
+def finished(each: MissionRuns, name: str) -> np.ndarray:
+    """(n,) a score, the switches or the decision time of the runs that finished."""
+    read = LayoutRun.score if name in LAYOUT_SCORES else getattr
+    return np.array([read(run, name) for run in each.runs if not run.failure], dtype=float)
+
+
+def median_interval(values: np.ndarray) -> Estimate:
+    """Median, and the order statistics between which the true one lies with a probability of at least 95 %.
+
+    The interval of the sign test: exact for any distribution; where there are too few values, from the least to the greatest.
+    """
+    from scipy.stats import binom  # here, as it takes longer to import than most commands take to answer
+
+    count, ordered = len(values), np.sort(values)
+    if count == 0:
+        return Estimate(np.nan, np.nan, np.nan)
+    if count == 1:
+        return Estimate(float(values[0]), np.nan, np.nan)
+    cut = max(0, int(binom.ppf(0.5 * (1.0 - LEVEL), count, 0.5)) - 1)
+    return Estimate(float(np.median(ordered)), float(ordered[cut]), float(ordered[-1 - cut]))
 
 
 def rank_methods(
@@ -106,7 +130,7 @@ def _ranked(
             ranks[k],
             _improvement(matrices, weights, k, against),
             {kind: estimates[k] for kind, estimates in shares.items()},
-            {name: summarize(each) for name, each in table[method].items()},
+            table[method],
             *_places(matrices, k),
         )
         for k, method in enumerate(methods)
@@ -115,8 +139,7 @@ def _ranked(
 
 def _unranked(method: Method, flown: Mapping[str, MissionRuns]) -> Standing:
     nothing = Estimate(np.nan, np.nan, np.nan)
-    summaries = {name: summarize(each) for name, each in flown.items()}
-    return Standing(method, nothing, nothing, dict.fromkeys(OUTCOMES, nothing), summaries, frozenset(), frozenset())
+    return Standing(method, nothing, nothing, dict.fromkeys(OUTCOMES, nothing), flown, frozenset(), frozenset())
 
 
 class _Matrix(NamedTuple):
@@ -222,7 +245,7 @@ def _places(matrices: Mapping[str, _Matrix], k: int) -> tuple[frozenset[str], fr
             continue
         if shares[k] == shares[first]:
             best.add(name)
-        if not behind(success[k], success[first]):
+        if name in best or not behind(success[k], success[first]):
             level.add(name)
     return frozenset(best), frozenset(level)
 

@@ -23,7 +23,13 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.provenance import plain_data
 
 VERSION = "v1"
-FROZEN = {"paper": "", "families": "", "teams": "", "robots": "", "control": ""}
+FROZEN = {
+    "paper": "8583da59a3fae4282a2aca626a4caf9b78f6e0209cd332f260464707e7b435a1",
+    "families": "477b9d37d5402b57e899dfb6b13095abfb1d8f8175f32f2b50946c342b5ab3f0",
+    "teams": "7735ddccf44e63efc97043ba84e72059f092549bda7e7d30dba3f02dc8c5882f",
+    "robots": "be993e5f1cfcb9f21942653e48ed18c7dca22db76c5ed5ce8758ea0457fc5397",
+    "control": "64d576ce57c397d24861a51c3818d726de894449972e0fa313d9c9ea70eb7828",
+}
 """Hash of every track of this version."""
 FIRST_SEED = 80_000
 QUICK = 50
