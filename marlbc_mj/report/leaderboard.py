@@ -8,7 +8,7 @@ import numpy as np
 
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.formats import percent, spans
-from marlbc_mj.report.leaderboard_cells import WIDTH, BoardColumn, BoardRow, Cell, Name, board_rows, name_of
+from marlbc_mj.report.leaderboard_cells import WIDTH, BoardColumn, BoardRow, Cell, Name, board_rows, shown_name
 from marlbc_mj.report.page import origin_facts
 from marlbc_mj.report.table import Column, Table, to_markdown
 from marlbc_mj.report.tables import latex_document
@@ -18,13 +18,13 @@ from marlbc_mj.results.standings import Notable, Standing, by_cost, finished, no
 from marlbc_mj.results.statistics import Estimate
 
 LEADERBOARD_PAGE, LEADERBOARD_TEX = "leaderboard.html", "leaderboard.tex"
-REFERENCE = "fsams-hysteresis"
+SUPERVISOR_REFERENCE = "fsams-hysteresis"
 """The supervisor that the chance of improvement is measured against, under the null-space composition."""
 CONTROL_REFERENCE = "sorlc"
 """The controller that the chance of improvement is measured against."""
 CONTROL = "control"
 """The track that compares controllers."""
-_REFERENCE_NOTE = f"Reference: {REFERENCE} under the null-space composition."
+_REFERENCE_NOTE = f"Reference: {SUPERVISOR_REFERENCE} under the null-space composition."
 LEADING = 3
 """Columns that every table begins with; in text they have their intervals."""
 MOST_COLUMNS = 12
@@ -154,7 +154,7 @@ _SAFETY_AND_COST = (
 def _overall_board(flown: Mapping[str, Sequence[MissionRuns]]) -> Board:
     """Supervisors over all tracks, whatever law flies each; every track has the same weight."""
     pooled = {name: [_without_controller(each) for each in own] for name, own in flown.items()}
-    standings = rank_methods([each for own in pooled.values() for each in own], Method(REFERENCE, ""), by_track=True)
+    standings = rank_methods([each for own in pooled.values() for each in own], Method(SUPERVISOR_REFERENCE, ""), by_track=True)
     tracks = {name: {s.method: s for s in rank_methods(own)} for name, own in pooled.items()}
     columns = (
         *_leading(len(standings)),
@@ -177,7 +177,7 @@ def _on_track(own: Mapping[Method, Standing]) -> Callable[[Standing], Estimate]:
 
 def _track_board(name: str, summary: str, own: Sequence[MissionRuns]) -> Board:
     laws = dict.fromkeys(each.method.controller for each in own)
-    standings = rank_methods(own, Method(REFERENCE, next(iter(laws))))
+    standings = rank_methods(own, Method(SUPERVISOR_REFERENCE, next(iter(laws))))
     missions = dict.fromkeys(each.mission for each in own)
     several = (BoardColumn(mission, _on_mission(mission), 0, 1, (0.0, 100.0), mission, "%") for mission in missions)
     columns = (*_leading(len(standings)), *(several if len(missions) > 1 else ()), *_SAFETY_AND_COST)
@@ -253,7 +253,7 @@ def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
         )
         failed, total = sum(failure.runs for failure in failures), sum(len(each.runs) for each in own)
         looks = tuple(_look(one, folder) for one in notable if one.method == method)
-        name = name_of(method)
+        name = shown_name(method)
         with_law = name._replace(facts=", ".join(part for part in (method.controller, name.facts) if part))
         words = f"{failed} of {total} runs could not be finished" if failed else f"all {total} runs were finished"
         details.append(Detail(with_law, words, failures, looks))

@@ -14,7 +14,7 @@ WIDTH = 64
 """Of the drawing of an interval [CSS pixels]."""
 
 
-class Mark(NamedTuple):
+class IntervalMark(NamedTuple):
     """The drawing of an estimate: its interval and its value, in CSS pixels from the left."""
 
     low: float
@@ -28,7 +28,7 @@ class Cell(NamedTuple):
     text: str
     sort: float  # what the column is sorted by; NaN comes last
     ends: str = ""  # the interval in words
-    mark: Mark | None = None
+    mark: IntervalMark | None = None
     best: bool = False
     level: bool = False  # not significantly behind the best
 
@@ -67,7 +67,7 @@ class BoardColumn(NamedTuple):
         return self.head + (f" [{self.unit}]" if self.unit else "")
 
 
-def name_of(method: Method, *, by_controller: bool = False) -> Name:
+def shown_name(method: Method, *, by_controller: bool = False) -> Name:
     """The supervisor's name, or the controller's."""
     source = source_of(method.controller if by_controller else method.supervisor)
     facts = [*([] if by_controller else [method.composition]), *(["shield"] if method.shield else [])]
@@ -86,7 +86,7 @@ def board_rows(
                 row[k] = row[k]._replace(best=column.better * row[k].sort == max(values))
     places = [str(k) if not math.isnan(standing.rank.value) else DASH for k, standing in enumerate(standings, 1)]
     return tuple(
-        BoardRow(name_of(standing.method, by_controller=by_controller), place, tuple(cells))
+        BoardRow(shown_name(standing.method, by_controller=by_controller), place, tuple(cells))
         for standing, place, cells in zip(standings, places, grid, strict=True)
     )
 
@@ -105,10 +105,10 @@ def _number(value: float, digits: int | None) -> str:
     return significant(value) if digits is None else fixed(value, digits)
 
 
-def _mark(estimate: Estimate, span: tuple[float, float] | None) -> Mark | None:
+def _mark(estimate: Estimate, span: tuple[float, float] | None) -> IntervalMark | None:
     if span is None or math.isnan(estimate.low):
         return None
     first, last = span
     places = (WIDTH * min(1.0, max(0.0, (number - first) / (last - first))) for number in estimate)
     value, low, high = (round(place, 1) for place in places)
-    return Mark(low, value, high)
+    return IntervalMark(low, value, high)

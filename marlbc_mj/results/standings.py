@@ -14,7 +14,7 @@ from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, Miss
 from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, mean, rate
 from marlbc_mj.util.errors import ConfigurationError
 
-AHEAD = 1e12
+WORTH_OF_SUCCESS = 1e12
 """What success is worth in a merit: more than any return or cost."""
 Merit = Callable[[LayoutRun], float]
 """One number of a run, by whose order runs are compared: larger is better."""
@@ -22,12 +22,12 @@ Merit = Callable[[LayoutRun], float]
 
 def by_return(run: LayoutRun) -> float:
     """Success comes first, then the return; a run that failed comes last."""
-    return -np.inf if run.failure else AHEAD * run.success + run.score("return")
+    return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success + run.score("return")
 
 
 def by_cost(run: LayoutRun) -> float:
     """Success comes first, then a small control cost; a run that failed comes last."""
-    return -np.inf if run.failure else AHEAD * run.success - run.score("cost_integral_sum")
+    return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success - run.score("cost_integral_sum")
 
 
 OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened")

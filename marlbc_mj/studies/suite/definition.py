@@ -43,7 +43,7 @@ ROOM: dict[int, dict[str, Any]] = {16: {"length": 120.0, "files": 2}, 32: {"leng
 """A longer way and a shorter column for large teams: in one file they would never be through before the end."""
 OPENING = {16: 8.0, 32: 14.0}
 """Width of the gates that a column of several files passes [m]."""
-DISCS = 12 / 912.0
+DISC_DENSITY = 12 / 912.0
 """Discs per square metre, as in the field of four agents."""
 SUITE_ROBOTS = ("disc", "omni", "diff_drive", "crazyflie")
 
@@ -104,7 +104,7 @@ def _team(family: str, formation: str, agents: int) -> Scenario:
     if family == "field":
         wide = Field(**changes)
         area = (wide.way[1] - wide.way[0]) * 2.0 * (wide.reach + wide.margin)
-        changes["obstacles"] = round(DISCS * area)
+        changes["obstacles"] = round(DISC_DENSITY * area)
     if family == "gates" and agents in OPENING:
         changes["width"] = OPENING[agents]
     return _unseen(make_scenario(family, **changes))
