@@ -23,7 +23,7 @@ class SuiteCommand:
     """
 
     track: tuple[str, ...] = ()
-    """Tracks to fly; all by default."""
+    """Tracks to fly; all by default, paper, families and control with --quick."""
     missions: tuple[str, ...] = ()
     """Missions of these tracks to fly; all by default."""
     supervisors: tuple[str, ...] | None = None
@@ -71,7 +71,7 @@ class SuiteCommand:
         Raises:
             ConfigurationError: options that do not go together, unknown names, or results that cannot stand beside these.
         """
-        from marlbc_mj.studies.suite.definition import QUICK, check_frozen, choose_missions
+        from marlbc_mj.studies.suite.definition import QUICK, QUICK_TRACKS, check_frozen, choose_missions
         from marlbc_mj.studies.suite.entries import Choice
         from marlbc_mj.studies.suite.files import read_suite
         from marlbc_mj.studies.suite.study import SuiteStudy
@@ -79,7 +79,8 @@ class SuiteCommand:
         if self.page and self.source is None:
             raise ConfigurationError("--page needs --from: the folder whose results it shows")
         layouts = QUICK if self.quick and self.layouts is None else self.layouts
-        missions = [] if self.page else choose_missions(self.track, self.missions, layouts)
+        tracks = QUICK_TRACKS if self.quick and not self.track else self.track
+        missions = [] if self.page else choose_missions(tracks, self.missions, layouts)
         check_frozen(list(dict.fromkeys(mission.track for mission in missions)))
         choice = Choice(self.supervisors, self.controllers, self.compositions, self.shield, self.quick)
         others = None if self.source is None else read_suite(self.source)

@@ -34,6 +34,8 @@ FROZEN = {
 FIRST_SEED = 80_000
 QUICK = 50
 """Layouts of each mission in a quick run: the first of the whole suite's."""
+QUICK_TRACKS = ("paper", "families", "control")
+"""Tracks of a quick run where none are named: large teams and robots with wheels and rotors take most of the time."""
 HASH_DIGITS = 9
 """Significant digits of numbers in the definition: the last bits of a sine differ between machines."""
 SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
