@@ -29,6 +29,8 @@ NAMES = {
     "fixed": Source("Fixed priority", "Antonelli and Chiaverini 2006"),
     "set-based-rule": Source("Set-based rule", "after Moe et al. 2016"),
     "lookahead": Source("Look-ahead", "this project"),
+    "lookahead-distributed": Source("Look-ahead, distributed", "this project"),
+    "marlms-general": Source("MARLMS, general", "this project"),
     "rollout": Source("Rollout", "after Bertsekas 2021"),
     "orca": Source("ORCA", "van den Berg et al. 2011"),
     "cbf-qp": Source("CBF-QP", "Ames et al. 2019"),

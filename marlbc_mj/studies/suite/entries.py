@@ -17,7 +17,7 @@ SLOW = ("mpcms-mujoco",)
 """Supervisors that take minutes an episode and fly only where they are named."""
 OWN_VELOCITIES = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 """Supervisors whose velocities replace those of a composition, which makes no difference to them."""
-FOR_SET_BASED = ("fixed", "set-based-rule", "lookahead", "rollout")
+FOR_SET_BASED = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "marlms-general")
 """Supervisors that leave avoidance to the set-based composition."""
 
 
