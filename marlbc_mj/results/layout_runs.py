@@ -148,7 +148,8 @@ def _parsed(row: Sequence[str]) -> tuple[str, Method, LayoutRun]:
     """Mission, method and run of one line; ValueError for one that is torn."""
     cells = dict(zip(_HEADER, row, strict=True))
     method = Method(cells["supervisor"], cells["controller"], cells["composition"], bool(int(cells["shield"])))
-    flags = [bool(int(cells[name])) for name in _FLAGS]
-    numbers = [float(cells[name] or "nan") for name in ("switches", "decision_ms", *LAYOUT_SCORES)]
-    run = LayoutRun(int(cells["seed"]), cells["failure"], *flags, *numbers[:2], tuple(numbers[2:]))
+    flags = {name: bool(int(cells[name])) for name in _FLAGS}
+    switches, decision_ms, *scores = (float(cells[name] or "nan") for name in ("switches", "decision_ms", *LAYOUT_SCORES))
+    ended = (flags["reached"], flags["violated"], flags["struck"], flags["collided"], flags["intervened"])
+    run = LayoutRun(int(cells["seed"]), cells["failure"], *ended, switches, decision_ms, tuple(scores))
     return cells["mission"], method, run

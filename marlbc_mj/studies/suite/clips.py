@@ -1,7 +1,6 @@
 """Videos of the layouts to look at: for every method of a track its worst one and its median one."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from marlbc_mj.controllers import CONTROLLERS, make_controller
@@ -14,6 +13,7 @@ from marlbc_mj.results.standings import Notable, notable_layouts
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.studies.suite.definition import missions_of
 from marlbc_mj.studies.suite.entries import Entrant
+from marlbc_mj.studies.suite.flights import under
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import MarlbcError
 from marlbc_mj.util.progress import Progress, silent
@@ -62,4 +62,4 @@ def _render(one: Notable, entrant: Entrant | None, folder: Path) -> None:
 
 def _scenario(one: Notable) -> Scenario:
     mission = next(each for each in missions_of(one.track) if each.name == one.mission)
-    return replace(mission.scenario, composition=one.method.composition)
+    return under(mission.scenario, one.method.composition)

@@ -49,7 +49,7 @@ def entrants(track: str, choice: Choice) -> list[Entrant]:
     if own.controller is None:
         assert own.supervisor is not None
         chosen = _named("controller", choice.controllers, tuple(CONTROLLERS))
-        pairs = [(own.supervisor, controller, ("null-space",)) for controller in chosen]
+        pairs: list[tuple[str, str, tuple[str, ...]]] = [(own.supervisor, controller, ("null-space",)) for controller in chosen]
     else:
         skipped = SEARCHES if choice.quick else SLOW
         chosen = _named("supervisor", choice.supervisors, tuple(name for name in SUPERVISORS if name not in skipped))

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from marlbc_mj.results.layout_runs import LayoutRun, Method, layout_run
 from marlbc_mj.scenarios import Scenario
@@ -41,10 +41,20 @@ def suite_jobs(missions: Sequence[SuiteMission], choice: Choice) -> list[SuiteJo
     return [
         SuiteJob(mission.track, mission.name, composed[entrant.method.composition], entrant, seeds)
         for mission in missions
-        for composed in [{name: replace(mission.scenario, composition=name) for name in COMPOSITIONS}]
+        for composed in [{name: under(mission.scenario, name) for name in COMPOSITIONS}]
         for entrant in flown[mission.track]
         for seeds in _blocks(mission.seeds)
     ]
+
+
+def under(scenario: Scenario, composition: str) -> Scenario:
+    """The scenario under a composition of that name.
+
+    Raises:
+        ConfigurationError: there is none.
+    """
+    changes: dict[str, Any] = {"composition": composition}
+    return replace(scenario, **changes)
 
 
 def _blocks(seeds: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
