@@ -183,5 +183,24 @@ def test_rows_of_other_code_are_named(flown: Path, tmp_path: Path, capsys) -> No
     (tmp_path / "suite.json").write_text(json.dumps({**content, "code": "older"}))
     main(["suite", "--page", "--from", str(tmp_path), "--out", str(tmp_path / "out")])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "are of other code (older) than this" in line
+    assert "rows are of other code (older) than this" in line
     assert (tmp_path / "out" / LEADERBOARD_PAGE).exists()
+
+
+def test_clips_show_the_flights_of_the_rows(flown: Path, tmp_path: Path, monkeypatch) -> None:
+    """The worst and the median layout are flown again, and the page links to them; who never flew has none."""
+    logs = {}
+
+    def write(log, path, style, overwrite) -> None:
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(b"clip")
+        logs[path.name] = log
+
+    monkeypatch.setattr("marlbc_mj.studies.suite.clips.render_video", write)
+    main(["suite", "--page", "--from", str(flown), "--clips", "--out", str(tmp_path / "page")])
+    (fixed, _) = read_suite(flown).groups
+    returns = sorted(run.score("return") for run in fixed.runs)
+    assert list(logs) == [f"families-fixed+sorlc+set-based-{kind}.mp4" for kind in ("worst", "median")]
+    assert sorted(log.reward.sum() for log in logs.values()) == pytest.approx(returns)
+    page = (tmp_path / "page" / LEADERBOARD_PAGE).read_text()
+    assert page.count('href="clips/families-fixed%2Bsorlc%2Bset-based-') == 2

@@ -83,5 +83,6 @@ class SuiteCommand:
         missions = [] if self.page else choose_missions(tracks, self.missions, layouts)
         check_frozen(list(dict.fromkeys(mission.track for mission in missions)))
         choice = Choice(self.supervisors, self.controllers, self.compositions, self.shield, self.quick)
-        others = None if self.source is None else read_suite(self.source)
-        return SuiteStudy(tuple(missions), choice, others, self.clips)
+        if self.source is not None:
+            read_suite(self.source)  # what cannot stand beside these rows is refused before anything is flown
+        return SuiteStudy(tuple(missions), choice, self.source, self.clips)

@@ -8,7 +8,7 @@ import numpy as np
 
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.formats import percent, spans
-from marlbc_mj.report.leaderboard_cells import WIDTH, BoardColumn, BoardRow, Cell, Name, board_rows, shown_name
+from marlbc_mj.report.leaderboard_cells import WIDTH, BoardCell, BoardColumn, BoardRow, Name, board_rows, shown_name
 from marlbc_mj.report.page import origin_facts
 from marlbc_mj.report.table import Column, Table, to_markdown
 from marlbc_mj.report.tables import latex_document
@@ -206,7 +206,7 @@ def _control_board(summary: str, own: Sequence[MissionRuns]) -> Board:
     return Board("controllers", "Controllers", note, columns, board_rows(standings, columns, by_controller=True))
 
 
-def _text(cell: Cell, *, with_ends: bool) -> str:
+def _text(cell: BoardCell, *, with_ends: bool) -> str:
     return cell.text + (f" [{cell.ends.replace(' to ', ', ')}]" if cell.ends and with_ends else "")
 
 

@@ -22,7 +22,7 @@ class IntervalMark(NamedTuple):
     high: float
 
 
-class Cell(NamedTuple):
+class BoardCell(NamedTuple):
     """One number of one method."""
 
     text: str
@@ -47,7 +47,7 @@ class BoardRow(NamedTuple):
 
     name: Name
     place: str  # by mean rank; a dash where it did not fly everything
-    cells: tuple[Cell, ...]
+    cells: tuple[BoardCell, ...]
 
 
 class BoardColumn(NamedTuple):
@@ -91,14 +91,14 @@ def board_rows(
     )
 
 
-def _cell(column: BoardColumn, standing: Standing) -> Cell:
+def _cell(column: BoardColumn, standing: Standing) -> BoardCell:
     estimate = column.read(standing)
     if math.isnan(estimate.value):
-        return Cell(DASH, math.nan)
+        return BoardCell(DASH, math.nan)
     value, low, high = (_number(number, column.digits) for number in estimate)
     ends = "" if math.isnan(estimate.low) else f"{low} to {high}"
     level = bool(column.mission) and column.mission in standing.level
-    return Cell(value, estimate.value, ends, _mark(estimate, column.span), level=level)
+    return BoardCell(value, estimate.value, ends, _mark(estimate, column.span), level=level)
 
 
 def _number(value: float, digits: int | None) -> str:

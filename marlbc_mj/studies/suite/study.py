@@ -11,7 +11,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.suite.clips import render_clips
 from marlbc_mj.studies.suite.definition import TRACKS, SuiteMission
 from marlbc_mj.studies.suite.entries import Choice
-from marlbc_mj.studies.suite.files import SuiteResults, describe_suite, merge, suite_code, write_suite
+from marlbc_mj.studies.suite.files import SuiteResults, describe_suite, merge, read_suite, suite_code, write_suite
 from marlbc_mj.studies.suite.flights import SuiteJob, fly_layouts, suite_jobs
 from marlbc_mj.util.progress import Progress, silent
 
@@ -22,8 +22,8 @@ class SuiteStudy:
 
     missions: tuple[SuiteMission, ...]
     choice: Choice
-    others: SuiteResults | None = None
-    """Rows that stand beside those that are flown."""
+    beside: Path | None = None
+    """Folder of results whose rows stand beside those that are flown."""
     clips: bool = False
     """Whether the worst and the median layout of every method are rendered."""
 
@@ -34,16 +34,21 @@ class SuiteStudy:
         return fly_layouts(job)
 
     def gather(self, results: Sequence[tuple[LayoutRun, ...]]) -> SuiteResults:
-        """All rows of all jobs, and of the others; without jobs the others alone."""
-        if self.others is not None and not self.missions:
-            return self.others
+        """All rows of all jobs, and those beside them; without jobs these alone.
+
+        Raises:
+            ConfigurationError: results that cannot stand beside others, see :func:`~marlbc_mj.studies.suite.files.read_suite`.
+        """
+        others = None if self.beside is None else read_suite(self.beside)
+        if others is not None and not self.missions:
+            return others
         pairs = zip(self.jobs(), results, strict=True)
         groups = [
             MissionRuns(*key, tuple(run for _, block in blocks for run in block))
             for key, blocks in groupby(pairs, key=lambda pair: (pair[0].track, pair[0].mission, pair[0].method))
         ]
         own = SuiteResults(describe_suite(), tuple(groups))
-        return own if self.others is None else merge(own, self.others)
+        return own if others is None else merge(own, others)
 
     def report(self, results: Sequence[tuple[LayoutRun, ...]], out: Path | None, progress: Progress = silent) -> Report:
         gathered = self.gather(results)
@@ -53,13 +58,13 @@ class SuiteStudy:
         problems = render_clips(gathered.groups, flown, out, progress) if self.clips else []
         write_suite(gathered, out)
         text = write_leaderboard(gathered.groups, gathered.facts, track_summaries(), out)
-        return Report(text, (*problems, *self._strangeness()))
+        return Report(text, (*problems, *_strangeness(gathered)))
 
-    def _strangeness(self) -> tuple[str, ...]:
-        """One line where the others' rows are of other code than this."""
-        if self.others is None or self.others.facts["code"] == suite_code():
-            return ()
-        return (f"the rows of --from are of other code ({self.others.facts['code']}) than this ({suite_code()})",)
+
+def _strangeness(results: SuiteResults) -> list[str]:
+    """One line for every part of the results that is of other code than this."""
+    codes = dict.fromkeys(str(facts["code"]) for facts in (results.facts, *results.facts.get("beside", ())))
+    return [f"rows are of other code ({code}) than this ({suite_code()})" for code in codes if code != suite_code()]
 
 
 def track_summaries() -> dict[str, str]:
