@@ -27,7 +27,7 @@ FROZEN = {
     "paper": "8583da59a3fae4282a2aca626a4caf9b78f6e0209cd332f260464707e7b435a1",
     "families": "477b9d37d5402b57e899dfb6b13095abfb1d8f8175f32f2b50946c342b5ab3f0",
     "teams": "7735ddccf44e63efc97043ba84e72059f092549bda7e7d30dba3f02dc8c5882f",
-    "robots": "be993e5f1cfcb9f21942653e48ed18c7dca22db76c5ed5ce8758ea0457fc5397",
+    "robots": "2fe60ea1aea1be5168fe8aef5f44634dd90c217d876ed4f428e4f5632ad5d1b8",
     "control": "64d576ce57c397d24861a51c3818d726de894449972e0fa313d9c9ea70eb7828",
 }
 """Hash of every track of this version."""
@@ -144,7 +144,7 @@ def field_for(robot: str) -> Scenario:
         formation_tolerance=0.5 * unit,
         formation_gain=gain,
         avoidance_gain=2.5 * gain,
-        radius=(0.5 * unit, 2.0 * unit),
+        radius=(unit, unit),  # solid bodies have one
         margin=3.0 * unit,
         gap=max(4.0 * unit, 2.2 * avoid),
         disturbance=LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
