@@ -49,7 +49,10 @@ Command = (
     | Annotated[OracleCommand, subcommand("oracle")]
 )
 
-DESCRIPTION = "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper. Version: marlbc --version"
+DESCRIPTION = (
+    "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper. "
+    "Version: marlbc --version"
+)
 
 
 def main(arguments: list[str] | None = None) -> None:
