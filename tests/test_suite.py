@@ -11,7 +11,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.report.leaderboard import LEADERBOARD_PAGE
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns, read_layout_rows, write_layout_rows
 from marlbc_mj.studies.suite import definition
-from marlbc_mj.studies.suite.definition import FIRST_SEED, FROZEN, TRACKS, choose_missions, missions_of, suite_hash, track_hash
+from marlbc_mj.studies.suite.definition import SUITE_SEED, FROZEN, TRACKS, choose_missions, missions_of, suite_hash, track_hash
 from marlbc_mj.studies.suite.entries import Choice, entrants, meant_for
 from marlbc_mj.studies.suite.files import read_suite
 from marlbc_mj.studies.suite.flights import BLOCK, suite_jobs
@@ -28,7 +28,7 @@ def test_the_tracks_are_those_that_are_described() -> None:
     counts = {name: sorted({len(mission.seeds) for mission in missions_of(name)}) for name in TRACKS}
     assert counts == {"paper": [1, 201], "families": [1000], "teams": [200], "robots": [200], "control": [1, 201]}
     assert [len(missions_of(name)) for name in TRACKS] == [2, 6, 15, 8, 2]
-    assert all(mission.seeds[0] == FIRST_SEED for name in TRACKS for mission in missions_of(name))
+    assert all(mission.seeds[0] == SUITE_SEED for name in TRACKS for mission in missions_of(name))
     names = [mission.name for name in TRACKS for mission in missions_of(name)]
     assert len(set(names)) == len(names)
 
@@ -72,7 +72,7 @@ def test_a_quick_run_is_a_part_of_the_whole() -> None:
     quick = suite_jobs(choose_missions(["families"], ["field"], BLOCK), choice)
     whole = suite_jobs(choose_missions(["families"], ["field"]), choice)
     assert len(quick) == 1 and len(whole) == 1000 // BLOCK and quick[0] == whole[0]
-    assert [seed for job in whole for seed in job.seeds] == list(range(FIRST_SEED, FIRST_SEED + 1000))
+    assert [seed for job in whole for seed in job.seeds] == list(range(SUITE_SEED, SUITE_SEED + 1000))
 
 
 def test_rows_come_back_from_their_file(tmp_path: Path) -> None:
@@ -129,7 +129,7 @@ def test_a_run_leaves_rows_and_a_summary(flown: Path) -> None:
     content = json.loads((flown / "suite.json").read_text())
     assert content["suite"] == {"version": "v1", "hash": suite_hash()} and {"versions", "cpu", "code", "date"} <= set(content)
     mission = content["tracks"]["families"]["field"]
-    assert (mission["first_seed"], mission["layouts"]) == (FIRST_SEED, 2)
+    assert (mission["first_seed"], mission["layouts"]) == (SUITE_SEED, 2)
     fixed, learned = mission["methods"].values()
     assert fixed["shares"]["success"][0] in (0.0, 0.5, 1.0) and fixed["failures"] == {}
     assert learned["shares"]["violated"][0] == 1.0 and sum(learned["failures"].values()) == 2

@@ -11,7 +11,7 @@ from marlbc_mj.studies.suite.definition import TRACKS
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
-SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
+SUITE_SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
 """Supervisors that try out futures at every decision. A quick run leaves them out unless they are named."""
 SLOW = ("mpcms-mujoco",)
 """Supervisors that take minutes an episode and fly only where they are named."""
@@ -51,7 +51,7 @@ def entrants(track: str, choice: Choice) -> list[Entrant]:
         chosen = _named("controller", choice.controllers, tuple(CONTROLLERS))
         pairs: list[tuple[str, str, tuple[str, ...]]] = [(own.supervisor, controller, ("null-space",)) for controller in chosen]
     else:
-        skipped = SEARCHES if choice.quick else SLOW
+        skipped = SUITE_SEARCHES if choice.quick else SLOW
         chosen = _named("supervisor", choice.supervisors, tuple(name for name in SUPERVISORS if name not in skipped))
         pairs = [(name, own.controller, choice.compositions or meant_for(name)) for name in chosen]
     for name in choice.compositions or ():
