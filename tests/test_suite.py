@@ -11,7 +11,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.report.leaderboard import LEADERBOARD_PAGE
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns, read_layout_rows, write_layout_rows
 from marlbc_mj.studies.suite import definition
-from marlbc_mj.studies.suite.definition import SUITE_SEED, FROZEN, TRACKS, choose_missions, missions_of, suite_hash, track_hash
+from marlbc_mj.studies.suite.definition import FROZEN, SUITE_SEED, TRACKS, choose_missions, missions_of, suite_hash, track_hash
 from marlbc_mj.studies.suite.entries import Choice, entrants, meant_for
 from marlbc_mj.studies.suite.files import read_suite
 from marlbc_mj.studies.suite.flights import BLOCK, suite_jobs

@@ -23,12 +23,8 @@ from marlbc_mj.cli.parsing import parse
 from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
-<<<<<<< HEAD
 from marlbc_mj.cli.suite import SuiteCommand
-from marlbc_mj.cli.terminal import prepare_gl
-=======
 from marlbc_mj.cli.terminal import prepare_gl, suggest_cache
->>>>>>> main
 from marlbc_mj.cli.training import TrainCommand
 
 Command = (
