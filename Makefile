@@ -1,9 +1,9 @@
-# make test | fuzz | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
+# make test | kills | slurm-test | fuzz | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test fuzz lint wheel docs gallery clean
+.PHONY: help venv benchmark test kills slurm-test fuzz lint wheel docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -22,6 +22,8 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 help:
 	@echo 'make test        run the tests'
+	@echo 'make kills       kill every command at random moments and compare what is left, into out/kills (an hour or two)'
+	@echo 'make slurm-test  run a study on a SLURM that is set up for it on this machine (Debian, root)'
 	@echo 'make fuzz        thousands of wrong inputs; half an hour or more'
 	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
 	@echo 'make lint        ruff and mypy'
@@ -36,6 +38,13 @@ benchmark: venv
 test: venv
 	@$(BIN)/python tests/warm_cache.py
 	@$(BIN)/python -m pytest -n auto --dist worksteal
+
+kills: venv
+	@$(BIN)/python tests/kills.py --kills 50 --out out/kills
+	@$(BIN)/python tests/kills.py --kills 25 --out out/kills --engine ray --commands bench evaluate
+
+slurm-test: venv
+	@PYTHON=$(BIN)/python bash tests/slurm_test.sh
 
 fuzz: venv
 	@$(BIN)/python tests/warm_cache.py

@@ -6,12 +6,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from small_studies import Squares
 
 from marlbc_mj.scenarios import paper
 from marlbc_mj.studies.ablation import AblationStudy, select_questions
@@ -25,8 +25,7 @@ from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import MANIFEST
-from marlbc_mj.util.progress import silent
+from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST
 
 WORKERS = pytest.mark.parametrize("workers", [1, 2])
 
@@ -36,41 +35,6 @@ class Request:
     """A stop that may be asked for."""
 
     signal: int = 0
-
-
-@dataclass(frozen=True)
-class Squares:
-    """Squares of numbers; ``trouble`` is what happens instead at number 3."""
-
-    count: int = 4
-    trouble: str = ""
-
-    def jobs(self) -> list[int]:
-        return list(range(self.count))
-
-    def run(self, job: int, watch: Watch) -> int:
-        time.sleep(0.02 * (self.count - job))  # the first ends last
-        if job == 3 and self.trouble:
-            self.fail(watch)
-        if watch.folder is not None:
-            (watch.folder / f"{job}.txt").write_text(str(job))
-        for step in (1, 2):
-            watch.progress(f"job {job}", step, 2)
-        return job * job
-
-    def fail(self, watch: Watch) -> None:
-        if self.trouble == "death":
-            os._exit(9)
-        if self.trouble == "stop":
-            while not watch.stopping():
-                time.sleep(0.01)
-            raise Stopped
-        raise SimulationError(self.trouble)
-
-    def report(self, results: Sequence[int], out: Path | None, progress=silent) -> Report:
-        if out is not None:
-            (out / "sum.txt").write_text(str(sum(results)))
-        return Report(f"sum {sum(results)}", ("no picture",))
 
 
 @WORKERS
@@ -90,7 +54,7 @@ def test_results_are_in_the_order_of_the_jobs(workers: int) -> None:
 
 @WORKERS
 def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
-    """Large files of the jobs beside the report, or nothing at all."""
+    """Large files of the jobs beside the report, or nothing but what has ended, for the same study to go on with."""
     done = run_study(Squares(), tmp_path / "out", workers=workers)
     assert done.results == [0, 1, 4, 9] and done.report == Report("sum 14", ("no picture",))
     assert {path.name for path in (tmp_path / "out").iterdir()} == {MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4))}
@@ -98,14 +62,19 @@ def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
         run_study(Squares(trouble="it fell"), tmp_path / "other", workers=workers)
     with pytest.raises(ConfigurationError, match="is not empty"):
         run_study(Squares(), tmp_path / "out", workers=workers)
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    assert {path.relative_to(tmp_path).as_posix() for path in tmp_path.glob("*/*.*")} == {
+        *(f"out/{name}" for name in (MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4)))),
+        f"other/{JOBS_FOLDER}",
+    }
     assert run_study(Squares(), None, workers=workers).report.text == "sum 14"
 
 
-def test_a_dead_worker_is_an_error() -> None:
-    """And whoever saves as he goes is told that he may go on."""
+def test_a_dead_worker_is_an_error(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """After another try; and whoever saves as he goes is told that he may go on."""
+    monkeypatch.setattr("marlbc_mj.studies.engines.local.MOST_TRIES", 2)
     with pytest.raises(SimulationError, match=r"a worker process died \(out of memory\?\)$"):
         run_jobs(Squares(trouble="death"), workers=2)
+    assert "what it did is done again (1 so far)" in capsys.readouterr().err
     with pytest.raises(SimulationError, match="the same command goes on"):
         run_jobs(Squares(trouble="death"), workers=2, stop=Request())
 

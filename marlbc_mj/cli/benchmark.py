@@ -111,7 +111,9 @@ class BenchCommand:
     drag_range: tuple[float, float] | None = None
     """With --seeds, a draw from this range multiplies the disturbance: 0 2 by default, 5 5 for five times throughout."""
     workers: int = 1
-    """Processes that share the methods of --seeds."""
+    """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     video: Literal["first", "all", "none"] = "first"
     """Which methods get a video."""
     figures: bool = True
@@ -225,7 +227,9 @@ class EvaluateCommand:
     seed: int = 0
     """First seed."""
     workers: int = 1
-    """Processes that share the supervisors."""
+    """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     out: Path = Path("out/evaluation")
     """Folder of the results."""
     overwrite: bool = False
@@ -246,6 +250,7 @@ class EvaluateCommand:
             seeds=self.seeds,
             seed=self.seed,
             workers=self.workers,
+            engine=self.engine,
             overwrite=self.overwrite,
             shield=self.shield,
         )

@@ -71,6 +71,7 @@ def _end(said: str, status: int) -> None:
     if said:
         with suppress(OSError):
             print(said, file=sys.stderr, flush=True)
+    exec("")  # Python forgets a Ctrl-C that came while a text was executed, and ends with the status below instead of by a signal
     sys.exit(status)
 
 

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -66,6 +67,10 @@ class AblationCommand:
     """Studies to run: basis, sweep, sorlc, reference, avoidance, substep; all of them by default."""
     out: Path | None = None
     """Folder for ablation.md, ablation.csv and index.html."""
+    workers: int = 1
+    """Processes that share the jobs, or tasks of a SLURM array."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     overwrite: bool = False
     """Replace what is in the output folder."""
 
@@ -75,7 +80,9 @@ class AblationCommand:
 
         questions = select_questions(self.study)
         with progress_bars() as progress:
-            done = run_ablation(questions, self.out, overwrite=self.overwrite, progress=progress)
+            done = run_ablation(
+                questions, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, progress=progress
+            )
         print(done.report.text)
         if self.out is not None:
             print(f"{self.out / 'index.html'} shows it all")

@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
 
@@ -43,6 +43,10 @@ class RobotGateCommand:
     """Folder of gate.md, gate.json, PNG and MP4."""
     clips: bool = True
     """Draw stills and clips."""
+    workers: int = 1
+    """Processes that share the jobs, or tasks of a SLURM array."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     overwrite: bool = False
     """Replace what is in the output folder."""
 
@@ -62,6 +66,8 @@ class RobotGateCommand:
                 controller=self.controller,
                 clips=self.clips,
                 overwrite=self.overwrite,
+                workers=self.workers,
+                engine=self.engine,
                 progress=progress,
             )
         print(done.report.text)

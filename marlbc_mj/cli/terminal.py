@@ -4,11 +4,13 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from time import monotonic
 from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.progress import Progress
 
+SELDOM = 60.0  # where there is no terminal [s]
 LEAST_WIDTH = 112  # least width of the table of results [characters]
 
 
@@ -45,7 +47,7 @@ def suggest_cache() -> None:
 
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
-    """A bar per stage, with rate and time left, on a terminal; silent elsewhere."""
+    """A bar per stage, with rate and time left, on a terminal; elsewhere a line now and then of work that takes minutes."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -58,17 +60,38 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True)
-    with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
+    if not console.is_terminal:
+        yield seldom()
+        return
+    with Progress(*columns, console=console) as bars:
         tasks: dict[str, Any] = {}
 
         def update(what: str, done: float, total: float) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total, rate="")
+                tasks[what] = bars.add_task(what, total=total, completed=int(done), rate="")  # what was done before has no rate
             task = bars.tasks[tasks[what]]
             rate = f"{task.finished_speed or task.speed or 0.0:.3g} /s"
             bars.update(tasks[what], completed=done, total=total, rate=rate)
 
         yield update
+
+
+def seldom(every: float = SELDOM) -> Progress:
+    """A line on the stage that is told of, with its rate and the time left, at most every so many seconds."""
+    began: dict[str, tuple[float, float]] = {}
+    last = monotonic()
+
+    def tell(what: str, done: float, total: float) -> None:
+        nonlocal last
+        now = monotonic()
+        start, before = began.setdefault(what, (now, done))
+        if now < last + every or done <= before:
+            return
+        last = now
+        rate = (done - before) / (now - start)
+        print(f"{what}: {done:g} of {total:g}, {rate:.3g} /s, {(total - done) / rate:.0f} s left", file=sys.stderr, flush=True)
+
+    return tell
 
 
 def progress_lines(before: str = "") -> Progress:

@@ -14,6 +14,7 @@ from marlbc_mj.report.bundle import write_report
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.episodes import EpisodeJob, fly, fly_or_fail, name_method, prepare
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
@@ -37,7 +38,8 @@ class BenchConfig:
     video: Literal["first", "all", "none"] = "first"
     overwrite: bool = False
     seeds: int | None = None  # this many draws around the scenario, from ``seed`` on, instead of one
-    workers: int = 1  # processes that share the methods of ``seeds``
+    workers: int = 1  # processes that share the jobs
+    engine: EngineName = "local"  # where jobs run, see marlbc_mj.studies.engines
     shield: bool = False  # give agents a shield, see marlbc_mj.core.shield
     against: str | None = None  # with ``seeds``: the method that others are compared with; None: the first
 
@@ -101,6 +103,10 @@ class BenchStudy:
     def run(self, job: EpisodeJob, watch: Watch) -> Result:
         return fly_or_fail(job, watch.folder if self.config.logs else None, watch.progress)
 
+    def describe(self, job: EpisodeJob) -> tuple[EpisodeJob, bool]:
+        """What a job's result and files depend on."""
+        return job, self.config.logs
+
     def report(self, results: Sequence[Result], out: Path | None, progress: Progress = silent) -> Report:
         if out is None:
             return Report()
@@ -121,7 +127,14 @@ def run_bench(
     Raises:
         ConfigurationError: a setting or the output folder; nothing is written then.
     """
-    done = run_study(BenchStudy(scenario, config), out, overwrite=config.overwrite, progress=progress or silent)
+    done = run_study(
+        BenchStudy(scenario, config),
+        out,
+        overwrite=config.overwrite,
+        workers=config.workers,
+        engine=config.engine,
+        progress=progress or silent,
+    )
     return done.results, list(done.report.problems)
 
 

@@ -102,7 +102,14 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
     """
     seeds = seed_range(config.seeds or 0, config.seed)
     study = DrawsStudy(perturbed(scenario), tuple(config.methods), seeds, config.against, config)
-    done = run_study(study, out, overwrite=config.overwrite, workers=config.workers, progress=progress or silent)
+    done = run_study(
+        study,
+        out,
+        overwrite=config.overwrite,
+        workers=config.workers,
+        engine=config.engine,
+        progress=progress or silent,
+    )
     return study.gather(done.results)
 
 

@@ -8,6 +8,7 @@ from marlbc_mj.results.summary import method_key
 from marlbc_mj.scenarios import Scenario, held_out
 from marlbc_mj.studies.bench import BenchConfig
 from marlbc_mj.studies.draws import run_bench_seeds
+from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.supervisors import UNLEARNED
 from marlbc_mj.util.progress import Progress
 
@@ -31,6 +32,7 @@ def evaluation(
     seeds: int = 200,
     seed: int = 0,
     workers: int = 1,
+    engine: EngineName = "local",
     overwrite: bool = False,
     shield: bool = False,
 ) -> BenchConfig:
@@ -47,6 +49,7 @@ def evaluation(
         seed=seed,
         seeds=seeds,
         workers=workers,
+        engine=engine,
         overwrite=overwrite,
         shield=shield,
         against=method_key(against, controller),

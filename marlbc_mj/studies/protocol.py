@@ -1,8 +1,9 @@
 """What a study is: independent jobs, each a pure function of its configuration, and a report made from their results.
 
-A job is data: everything that its result depends on, and picklable, so that it can run in this process, in another one or on
-another machine, in any order. A result is data too. Only large files, logs and checkpoints, go into a folder beside it.
-:mod:`marlbc_mj.studies.runner` runs the jobs of any study.
+A job is data: everything that its result depends on, so that it can run in this process, in another one or on another machine, in
+any order, and so that a result that is there already is found again. A result is data too. Data are None, numbers, texts, paths,
+arrays, and lists, tuples, dicts, dataclasses and named tuples of data, see :mod:`marlbc_mj.studies.codec`. Only large files, logs
+and checkpoints, go into a folder beside it. :mod:`marlbc_mj.studies.runner` runs the jobs of any study.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +36,7 @@ class Watch(NamedTuple):
     stopping: Callable[[], bool] = never
     """Whether the job should save itself and raise :class:`Stopped`; one that cannot need not ask."""
     folder: Path | None = None
-    """Where large files go; None: nowhere."""
+    """Where the job's large files go, under names that no other job of the study uses; empty at first. None: nowhere."""
 
 
 class Report(NamedTuple):
@@ -61,6 +62,9 @@ class Study(Protocol[JobT, ResultT]):
     def run(self, job: JobT, watch: Watch) -> ResultT:
         """The job's result. A failure that belongs in the report is a result; any other is raised and ends the study."""
         ...
+
+    # A study whose results or files depend on more than the job, a setting of its own for example, has a further method
+    # ``describe(job)``, which returns all of it as data, the job among it; a result is found again only by the same.
 
     def report(self, results: Sequence[ResultT], out: Path | None, progress: Progress = silent) -> Report:
         """Write what the study leaves into ``out``, where that is given, and say what came out."""

@@ -20,10 +20,11 @@ from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import ROBOTS, Robot, make_robot
 from marlbc_mj.robots.motors import posed
 from marlbc_mj.scenarios.robot_gate import robot_gate
+from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, counting, run_study
 from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import SimulationError, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 
@@ -92,7 +93,10 @@ class GateStudy:
         ]
 
     def run(self, job: GateJob, watch: Watch) -> GateRow:
-        row, trajectory = fly_gate(job.robot, job.supervisor, job.controller)
+        try:
+            row, trajectory = fly_gate(job.robot, job.supervisor, job.controller)
+        except SimulationError as error:
+            return _failed_row(job, str(error))
         if job.shown and watch.folder is not None:
             show(trajectory, GATE_CONTROLLERS[job.controller](make_robot(job.robot)), watch.folder, Path(job.robot).stem)
         return row
@@ -126,6 +130,12 @@ def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateR
     names = (supervisor, controller)
     trajectory = run_episode(world, GATE_SUPERVISORS[supervisor](body), names=names, on_frame=watch)
     return _row(robot, supervisor, trajectory, world, sum(touches)), trajectory
+
+
+def _failed_row(job: GateJob, reason: str) -> GateRow:
+    """The row of an episode that could not be finished."""
+    nan = float("nan")
+    return GateRow(job.robot, job.supervisor, nan, nan, nan, 0, nan, nan, nan, (), nan, None, None, reason)
 
 
 def touching(world: World) -> bool:
@@ -209,17 +219,18 @@ def run_gates(
     controller: str = "pd",
     clips: bool = True,
     overwrite: bool = False,
+    workers: int = 1,
+    engine: EngineName = "local",
     progress: Progress = silent,
 ) -> Conclusion[GateRow]:
     """Fly every robot under every supervisor, and leave gate.md, gate.json, and stills and clips of the first supervisor.
 
     Raises:
         ConfigurationError: an unknown name, a missing package, or a folder that cannot be written.
-        SimulationError: a world diverged.
     """
     study = GateStudy(tuple(robots), tuple(supervisors), controller, clips)
     ended = counting(study.jobs(), lambda job: "gate", progress)
-    return run_study(study, out, overwrite=overwrite, progress=progress, ended=ended)
+    return run_study(study, out, overwrite=overwrite, workers=workers, engine=engine, progress=progress, ended=ended)
 
 
 def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str) -> None:

@@ -1,29 +1,40 @@
-"""The one runner of all studies: job by job in this process, or in worker processes of this machine.
+"""The one runner of all studies: it finds what is done already, has an engine run the rest, and makes the report.
 
-Another engine is one more generator like :func:`_alone` and :func:`_pooled`: it yields the place of a job with its result, as
-they end.
+A study is a list of jobs, each a pure function of its configuration (:mod:`~marlbc_mj.studies.protocol`).
+
+**Addresses.** A job's key is a hash of its configuration and of the code that runs it (:mod:`~marlbc_mj.studies.addresses`).
+Under one key there is one result, whoever computes it, where and when. So whether a job is done is one look-up, a longer study
+takes over the results of a shorter one, and a changed setting or source finds nothing instead of something wrong.
+
+**Storage.** Each result is appended to a pack under its key (:mod:`~marlbc_mj.studies.packs`), a file for as many results as
+256 MiB hold. A record that is whole is the mark that its job is done. A torn one, of a process that was killed or a disk that was
+full, is cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`).
+Large files of a job lie in a folder of its own until it ends, then get its key as their name in one rename. Only the process of
+the study writes packs, and it holds the lock of the folder: a second run is refused.
+
+**The folder.** ``OUT/.jobs`` holds all this while a run has not ended (:mod:`~marlbc_mj.studies.store`). The report is made from
+all results in another folder, which replaces OUT in one rename; only then is the run finished and ``.jobs`` gone. What OUT held
+before, with ``--overwrite``, stays until then. So the same command, at any time, either goes on, or is told that OUT is finished.
+
+**Engines** move work and keep nothing: processes of this machine, Ray's tasks, SLURM's arrays
+(:mod:`~marlbc_mj.studies.engines`). They yield results as they come, in any order; the report has them in the order of the jobs.
+An engine tries a job again whose worker died. A job that raises ends the study, after what runs beside it has been stored.
 """
 
-import os
-import signal
 from collections import Counter
-from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import closing, contextmanager, nullcontext
-from functools import partial
-from multiprocessing import get_context, parent_process
-from multiprocessing.queues import SimpleQueue
-from multiprocessing.synchronize import Event
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple
 
-from marlbc_mj.studies.protocol import JobT, Report, ResultT, Stopped, Study, Watch
-from marlbc_mj.util.errors import ConfigurationError, SimulationError
-from marlbc_mj.util.files import staged_folder
-from marlbc_mj.util.progress import Progress, silent
-
-POLL = 0.2  # between two looks at the workers [s]
+from marlbc_mj.studies.addresses import Addresses, code_version
+from marlbc_mj.studies.engines import Task, Work, make_engine
+from marlbc_mj.studies.engines.base import Ears, StopRequest
+from marlbc_mj.studies.protocol import JobT, Report, ResultT, Stopped, Study
+from marlbc_mj.studies.store import RunStore, open_store
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import JOBS_FOLDER, staged_folder
+from marlbc_mj.util.progress import Progress, note, silent
 
 
 class Conclusion(NamedTuple, Generic[ResultT]):
@@ -34,10 +45,13 @@ class Conclusion(NamedTuple, Generic[ResultT]):
     report: Report
 
 
-class StopRequest(Protocol):
-    """Whether somebody asked the study to stop: the number of the signal, or 0."""
+class Means(NamedTuple):
+    """What runs the jobs; no result depends on it."""
 
-    signal: int
+    workers: int = 1
+    """Processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array."""
+    engine: str = "local"
+    """A key of ENGINES."""
 
 
 def run_study(
@@ -46,65 +60,78 @@ def run_study(
     *,
     overwrite: bool = False,
     workers: int = 1,
+    engine: str = "local",
     progress: Progress = silent,
     ended: Callable[[JobT, ResultT], None] | None = None,
 ) -> Conclusion[ResultT]:
-    """Run all jobs and write the report into ``out``, which appears whole or not at all; None: nothing is written.
+    """Run all jobs that are not done, and write the report into ``out``, whole or not at all; None: nothing is written.
 
-    Args: those of :func:`run_jobs`.
+    What is done is kept in ``out``, whatever stops this, and the same call goes on from there.
+
+    Args:
+        study: whose jobs are run.
+        out: folder of the report.
+        overwrite: whether ``out`` may hold a finished report, which is replaced at the end, or results that are of no use here.
+        workers: processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array.
+        engine: where jobs run, a key of ENGINES.
+        progress: called with what a job tells, where the engine passes that on, and with how many jobs are done.
+        ended: called with a job and its result as soon as it ends, also of those that were done.
 
     Raises:
-        ConfigurationError: a setting, or ``out`` cannot be written; nothing is left then.
-        SimulationError: of a job, or a worker process died.
+        ConfigurationError: a setting, ``out`` cannot be written or is in use, or the engine cannot be used.
+        SimulationError: of a job, or a worker died again and again.
     """
-    with nullcontext() if out is None else staged_folder(out, overwrite=overwrite) as folder:
-        results = run_jobs(study, folder=folder, workers=workers, progress=progress, ended=ended)
-        report = study.report(results, folder, progress)
+    if out is None:
+        results = run_jobs(study, workers=workers, engine=engine, progress=progress, ended=ended)
+        return Conclusion(results, study.report(results, None, progress))
+    jobs = study.jobs()
+    addresses = Addresses(study)
+    keys = [addresses.key(job) for job in jobs]
+    with open_store(out, overwrite=overwrite) as store:
+        _begin(store, study, keys, out, overwrite)
+        try:
+            results = _Run(study, jobs, keys, store, ended).results(Means(workers, engine), Ears(progress))
+            store.close()
+            with staged_folder(out, overwrite=overwrite) as folder:
+                store.place_files(dict.fromkeys(keys), folder)
+                report = study.report(results, folder, progress)
+        except BaseException:
+            if store.kept:
+                done = sum(key in store.kept for key in keys)
+                note(f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; the same command goes on")
+            raise
     return Conclusion(results, report)
 
 
 def run_jobs(
     study: Study[JobT, ResultT],
     *,
-    folder: Path | None = None,
     workers: int = 1,
+    engine: str = "local",
     progress: Progress = silent,
     ended: Callable[[JobT, ResultT], None] | None = None,
     stop: StopRequest | None = None,
 ) -> list[ResultT]:
-    """Results of all jobs, in the order of the jobs.
+    """Results of all jobs, in the order of the jobs; nothing is stored.
 
     Args:
         study: whose jobs are run.
-        folder: where the jobs put large files.
-        workers: processes that share the jobs; with one, all run in this process.
-        progress: called with what a job tells, whichever process it runs in.
-        ended: called with a job and its result as soon as it ends.
+        workers: see :func:`run_study`.
+        engine: see :func:`run_study`.
+        progress: see :func:`run_study`.
+        ended: see :func:`run_study`.
         stop: for jobs that save themselves: asked between them and, where a job asks, within; None: Ctrl-C interrupts at once.
 
     Raises:
         ConfigurationError: fewer than one worker, or of a job.
-        SimulationError: of a job, or a worker process died.
+        SimulationError: of a job, or a worker died again and again.
         Stopped: ``stop`` was set; what had begun is saved.
     """
-    if workers < 1:
-        raise ConfigurationError(f"workers must be at least 1, got {workers}")
     jobs = study.jobs()
-    engine = _alone if workers == 1 else partial(_pooled, workers=workers)
-    results: dict[int, ResultT] = {}
-    try:
-        with closing(engine(study, jobs, folder, progress, stop)) as finished:
-            for place, result in finished:
-                results[place] = result
-                if ended is not None:
-                    ended(jobs[place], result)
-    except BrokenProcessPool as error:
-        if stop is None or not stop.signal:
-            again = "; the same command goes on" if stop is not None else ""
-            raise SimulationError(f"a worker process died (out of memory?){again}") from error
+    results = _Run(study, jobs, [""] * len(jobs), None, ended).results(Means(workers, engine), Ears(progress, stop))
     if stop is not None and stop.signal:
         raise Stopped(stop.signal)
-    return [results[place] for place in sorted(results)]
+    return results
 
 
 def counting(jobs: Sequence[JobT], stage: Callable[[JobT], str], progress: Progress) -> Callable[[JobT, object], None]:
@@ -119,135 +146,83 @@ def counting(jobs: Sequence[JobT], stage: Callable[[JobT], str], progress: Progr
     return tell
 
 
-def _alone(
-    study: Study[JobT, ResultT], jobs: Sequence[JobT], folder: Path | None, progress: Progress, stop: StopRequest | None
-) -> Generator[tuple[int, ResultT]]:
-    """Every job in turn. One that is stopped yields nothing; those behind it are asked as well, since some may be done."""
-    watch = Watch(progress, lambda: stop is not None and bool(stop.signal), folder)
-    for place, job in enumerate(jobs):
-        try:
-            yield place, study.run(job, watch)
-        except Stopped as stopped:
-            if stop is None:
-                raise
-            stop.signal = stop.signal or stopped.signal
+class _Run(NamedTuple):
+    """The jobs of one study, their keys, and where results are kept."""
+
+    study: Study[Any, Any]
+    jobs: Sequence[Any]
+    keys: Sequence[str]
+    store: RunStore | None
+    ended: Callable[[Any, Any], None] | None
+
+    def results(self, means: Means, ears: Ears) -> list[Any]:
+        """Results in the order of the jobs; fewer where the study was stopped."""
+        engine = make_engine(means.engine, means.workers)
+        found = {place: self.store.result(key) for place, key in self._found()} if self.store is not None else {}
+        for place, result in found.items():
+            self._tell(place, result)
+        tasks = [Task(place, self.keys[place], job) for place, job in enumerate(self.jobs) if place not in found]
+        count = _Count(len(self.jobs), len(found), ears.progress if self.store is not None and means != Means() else silent)
+        ears.retried = count.retried
+        work = Work(self.study) if self.store is None else Work(self.study, self.store.files, self.store.engine)
+        with closing(engine.map(work, tasks, ears)) as finished:
+            for place, result in finished:
+                if self.store is not None:
+                    self.store.keep(self.keys[place], result)
+                found[place] = result
+                self._tell(place, result)
+                count.ended()
+        return [found[place] for place in sorted(found)]
+
+    def _found(self) -> list[tuple[int, str]]:
+        """Places and keys of the jobs that are done."""
+        assert self.store is not None
+        return [(place, key) for place, key in enumerate(self.keys) if key in self.store.kept]
+
+    def _tell(self, place: int, result: Any) -> None:
+        if self.ended is not None:
+            self.ended(self.jobs[place], result)
 
 
-def _pooled(
-    study: Study[JobT, ResultT],
-    jobs: Sequence[JobT],
-    folder: Path | None,
-    progress: Progress,
-    stop: StopRequest | None,
-    *,
-    workers: int,
-) -> Generator[tuple[int, ResultT]]:
-    """Jobs in worker processes. After an error those that run are asked to save themselves, and awaited."""
-    context = get_context("spawn")
-    stopping, told = context.Event(), context.SimpleQueue()
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, _begin_worker, (told, stopping, folder, stop is not None)) as pool:
-        with _ctrl_c_later():
-            places = {pool.submit(_work, study, job): place for place, job in enumerate(jobs)}
-        waiting = set(places)
-        try:
-            while waiting:
-                done, waiting = wait(waiting, POLL, FIRST_COMPLETED)
-                _pass_on(told, progress)
-                if stop is not None and stop.signal:
-                    stopping.set()
-                yield from ((places[future], future.result()) for future in done if not _was_stopped(future))
-        finally:
-            stopping.set()
-            _drain(waiting, told, progress)
+class _Count:
+    """Tells how many jobs are done, and how often a worker died."""
+
+    def __init__(self, total: int, done: int, progress: Progress) -> None:
+        self.total, self.done, self.again, self.progress = total, done, 0, progress
+        progress("jobs", done, total)
+
+    def ended(self) -> None:
+        """One more job is done."""
+        self.done += 1
+        self.progress("jobs", self.done, self.total)
+
+    def retried(self, reason: str) -> None:
+        """A worker died, and what it did is done again."""
+        self.again += 1
+        note(f"{reason}; what it did is done again ({self.again} so far)")
 
 
-@contextmanager
-def _ctrl_c_later() -> Iterator[None]:
-    """Hold Ctrl-C back while workers are started, which inherit that: during their imports it would be a traceback each."""
-    _mask("SIG_BLOCK")
-    try:
-        yield
-    finally:
-        _mask("SIG_UNBLOCK")
+def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Path, overwrite: bool) -> None:
+    """Say what of an unfinished run is used and what is not.
 
-
-@contextmanager
-def _ctrl_c_now() -> Iterator[None]:
-    """Let Ctrl-C through, also one that came before; in a worker it is held back outside, where jobs are unpacked."""
-    _mask("SIG_UNBLOCK")
-    try:
-        yield
-    finally:
-        _mask("SIG_BLOCK")
-
-
-def _mask(how: str) -> None:
-    """Change what this thread, and what it starts, takes of Ctrl-C, where there are masks."""
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(getattr(signal, how), {signal.SIGINT})
-
-
-def _was_stopped(future: Future[Any]) -> bool:
-    return isinstance(future.exception(), Stopped)
-
-
-def _drain(waiting: set[Future[Any]], told: "SimpleQueue[Any]", progress: Progress) -> None:
-    """Wait for jobs that have begun, and listen to them meanwhile: a worker whose pipe is full would never end."""
-    waiting = {future for future in waiting if not future.cancel()}
-    while waiting:
-        _, waiting = wait(waiting, POLL)
-        _pass_on(told, progress)
-
-
-def _pass_on(told: "SimpleQueue[Any]", progress: Progress) -> None:
-    """Tell here what the workers have told since."""
-    while not told.empty():
-        progress(*told.get())
-
-
-class _Worker(NamedTuple):
-    """What a worker process knows besides its jobs."""
-
-    watch: Watch
-    stopping: Event  # shared by the study's process and all workers
-    saving: bool  # whether jobs save themselves
-
-
-_worker: _Worker | None = None
-
-
-def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, folder: Path | None, saving: bool) -> None:
-    """What a worker's jobs tell goes to the study's process.
-
-    Ctrl-C reaches the whole group of processes: where jobs save themselves, a worker leaves it to the study, which asks it to
-    stop.
+    Raises:
+        ConfigurationError: nothing of it is of use here, and it may not be removed.
     """
-    global _worker
-    watch = Watch(lambda *step: told.put(step), lambda: stopping.is_set() or _orphaned(), folder)
-    _worker = _Worker(watch, stopping, saving)
-    if saving:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
-
-
-def _work(study: Study[JobT, ResultT], job: JobT) -> ResultT:
-    """A job in a worker. Jobs that do not save themselves do not begin once the study ends, also those that are queued here.
-
-    Without its study, which was killed perhaps, the worker ends.
-    """
-    assert _worker is not None
-    try:
-        with _ctrl_c_now():
-            if not _worker.saving and _worker.watch.stopping():
-                raise Stopped
-            return study.run(job, _worker.watch)
-    except KeyboardInterrupt:
-        _worker.stopping.set()
-        raise
-    finally:
-        if _orphaned():
-            os._exit(1)
-
-
-def _orphaned() -> bool:
-    parent = parent_process()
-    return parent is not None and not parent.is_alive()
+    before = store.about()
+    wanted = set(keys)
+    used = len(wanted & store.kept.keys())
+    others = len(store.kept) - used
+    if others:
+        changed = before.get("code") != code_version()
+        why = f"other code ({before.get('code')})" if changed else "another configuration"
+        unused = f"{others} results of {why}"
+        if not used and not overwrite:
+            raise ConfigurationError(
+                f"{out} holds an unfinished run, {unused}, of which nothing can be used here; choose another or add --overwrite"
+            )
+        note(f"{unused} in {out / JOBS_FOLDER} cannot be used here")
+    if not used:
+        store.drop()
+    else:
+        note(f"going on with the unfinished run in {out}: {used} of {len(wanted)} jobs are done")
+    store.begin({"study": type(study).__name__, "code": code_version(), "jobs": len(keys)})

@@ -30,7 +30,7 @@ from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
-from marlbc_mj.util.provenance import provenance
+from marlbc_mj.util.provenance import cpu, provenance
 
 SIZES = (4, 8, 16, 32, 64, 128, 256)
 SCALED_SUPERVISORS = ("fsams", "fms", "layered")
@@ -97,6 +97,10 @@ class ScaleStudy:
 
     def run(self, job: ScaleJob, watch: Watch) -> dict[str, Any]:
         return SCALE_PARTS[job.part](job.rounds, watch.progress)
+
+    def describe(self, job: ScaleJob) -> tuple[ScaleJob, str]:
+        """A figure is one of this processor."""
+        return job, cpu()
 
     def gather(self, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
         """The figures of all jobs as the file has them."""

@@ -18,6 +18,8 @@ PARTIAL = ".partial-"
 """Part of the name of an incomplete file or folder, before the number of the process that writes it and a random token."""
 REPLACED = ".old-"
 """Part of the name of a folder that is being replaced, before the same."""
+JOBS_FOLDER = ".jobs"
+"""Folder, in an output folder, of what a run that has not ended keeps; not counted as content, and replaced with the rest."""
 MANIFEST = ".marlbc-files.json"
 """Names of all files that :func:`staged_folder` wrote into a folder: the only ones that ``overwrite`` removes."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -39,12 +41,8 @@ def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             it is a file, or cannot be written.
         NoSpaceError: the disk is full.
     """
-    target = out.resolve()
     check_folder(out, overwrite=overwrite)
-    place = target if _stays(target) else target.parent
-    with writing(out):
-        place.mkdir(parents=True, exist_ok=True)
-        _remove_orphans(target, place)
+    target, place = remove_orphans(out)
     staging = place / f"{target.name or 'out'}{PARTIAL}{_token()}"
     with _begun(out, staging, Path.mkdir):
         try:
@@ -62,8 +60,13 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
     with writing(out):
         if out.is_file():
             raise ConfigurationError(f"output folder {out} is a file")
-        if out.is_dir() and not overwrite and any(PARTIAL not in path.name for path in out.iterdir()):
+        if out.is_dir() and not overwrite and any(not _counts_not(path.name) for path in out.iterdir()):
             raise ConfigurationError(f"output folder {out} is not empty; choose another or add --overwrite")
+
+
+def _counts_not(name: str) -> bool:
+    """Whether what has this name in an output folder is something unfinished of this program's."""
+    return PARTIAL in name or name == JOBS_FOLDER
 
 
 @contextmanager
@@ -113,8 +116,24 @@ def _stays(folder: Path) -> bool:
     return folder.is_dir() and (folder.is_mount() or folder.samefile(Path.cwd()))
 
 
+def remove_orphans(out: Path) -> tuple[Path, Path]:
+    """Remove what killed processes left of ``out``, and bring back a folder that one was about to replace.
+
+    Returns:
+        ``out`` without links, and the folder in which it is made, which is there now.
+
+    Raises:
+        ConfigurationError: the system refuses.
+    """
+    target = out.resolve()
+    place = target if _stays(target) else target.parent
+    with writing(out):
+        place.mkdir(parents=True, exist_ok=True)
+        _remove_orphans(target, place)
+    return target, place
+
+
 def _remove_orphans(target: Path, place: Path) -> None:
-    """Remove what killed processes left of ``target`` in ``place``, and bring back a folder that one was about to replace."""
     name = target.name or "out"
     for path in sorted(place.iterdir()):
         if not path.name.startswith((f"{name}{PARTIAL}", f"{name}{REPLACED}")) or not path.is_dir() or is_held(path):
@@ -144,8 +163,9 @@ def _put_in_place(out: Path, target: Path, staging: Path, overwrite: bool) -> No
 
 
 def _files(folder: Path) -> list[str]:
-    """Names of all files below ``folder``, relative to it."""
-    return sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+    """Names of all files below ``folder``, relative to it, but those of an unfinished run."""
+    found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
+    return sorted(path.relative_to(folder).as_posix() for path in found if not path.is_relative_to(folder / JOBS_FOLDER))
 
 
 def _written_before(folder: Path) -> set[str]:
@@ -174,8 +194,10 @@ def _swap(target: Path, staging: Path, ours: set[str]) -> None:
     for name in _files(target):
         if name not in ours:
             (staging / name).parent.mkdir(parents=True, exist_ok=True)
-            _duplicate(target / name, staging / name)
+            duplicate(target / name, staging / name)
     for folder in (path for path in target.rglob("*") if path.is_dir() and not path.is_symlink() and not any(path.iterdir())):
+        if folder.is_relative_to(target / JOBS_FOLDER):
+            continue
         (staging / folder.relative_to(target)).mkdir(parents=True, exist_ok=True)
     old = target.with_name(f"{target.name}{REPLACED}{_token()}")
     with held(target):
@@ -184,7 +206,7 @@ def _swap(target: Path, staging: Path, ours: set[str]) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def _duplicate(source: Path, target: Path) -> None:
+def duplicate(source: Path, target: Path) -> None:
     """A second name of the same file, a copy where the file system has no such thing."""
     try:
         os.link(source, target, follow_symlinks=False)
@@ -203,6 +225,7 @@ def _move_into(out: Path, target: Path, staging: Path, ours: set[str]) -> None:
         (target / name).parent.mkdir(parents=True, exist_ok=True)
         (staging / name).rename(target / name)
     shutil.rmtree(staging)
+    shutil.rmtree(target / JOBS_FOLDER, ignore_errors=True)
 
 
 def _sync(path: Path) -> None:

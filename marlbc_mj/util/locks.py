@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from marlbc_mj.util.errors import ConfigurationError
+
 if sys.platform != "win32":
     import fcntl
 
@@ -45,5 +47,33 @@ def is_held(path: Path) -> bool:
         return True
     else:
         return False
+    finally:
+        os.close(descriptor)
+
+
+@contextmanager
+def held_alone(path: Path, otherwise: str) -> Iterator[None]:
+    """Hold the lock of a file, which is made, during the block; nothing where the system has none.
+
+    Raises:
+        ConfigurationError: ``otherwise``; another process holds it, or has removed the file meanwhile.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    try:
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except FileNotFoundError:
+        raise ConfigurationError(otherwise) from None
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ConfigurationError(otherwise) from None
+        except OSError:  # a file system without locks
+            pass
+        if not path.exists() or not os.path.samestat(os.fstat(descriptor), path.stat()):
+            raise ConfigurationError(otherwise)
+        yield
     finally:
         os.close(descriptor)

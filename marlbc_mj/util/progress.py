@@ -1,5 +1,6 @@
 """How work that takes long tells how far it is: one shape for bars, lines and tests."""
 
+import sys
 from collections.abc import Callable
 
 Progress = Callable[[str, float, float], None]
@@ -8,3 +9,8 @@ Progress = Callable[[str, float, float], None]
 
 def silent(what: str, done: float, total: float) -> None:
     """The progress that nobody watches."""
+
+
+def note(line: str) -> None:
+    """Say something that the user should know and did not ask for, in one line on standard error."""
+    print(f"marlbc: {line}", file=sys.stderr, flush=True)

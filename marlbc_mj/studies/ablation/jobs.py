@@ -8,6 +8,7 @@ from typing import NamedTuple
 from marlbc_mj.report.table import to_markdown
 from marlbc_mj.studies.ablation.cases import AblationRow, Case, Measured, Question, compare_rows, measure_case
 from marlbc_mj.studies.ablation.page import ablation_table, write_ablation_page
+from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, counting, run_study
 from marlbc_mj.util.progress import Progress, silent
@@ -51,7 +52,13 @@ class AblationStudy:
 
 
 def run_ablation(
-    questions: Sequence[Question], out: Path | None = None, *, overwrite: bool = False, progress: Progress = silent
+    questions: Sequence[Question],
+    out: Path | None = None,
+    *,
+    overwrite: bool = False,
+    workers: int = 1,
+    engine: EngineName = "local",
+    progress: Progress = silent,
 ) -> Conclusion[Measured]:
     """Run the questions' cases; leaves ablation.md, ablation.csv and index.html in ``out``.
 
@@ -60,4 +67,4 @@ def run_ablation(
     """
     study = AblationStudy(tuple(questions))
     ended = counting(study.jobs(), lambda job: job.question, progress)
-    return run_study(study, out, overwrite=overwrite, ended=ended)
+    return run_study(study, out, overwrite=overwrite, workers=workers, engine=engine, ended=ended)

@@ -1,0 +1,137 @@
+"""Jobs as tasks of Ray: on the cluster that ``RAY_ADDRESS`` names, else in worker processes that are started here.
+
+Ray tries a task again whose worker or node died. Jobs whose study leaves large files need a folder that all nodes see.
+"""
+
+import os
+import pickle
+import secrets
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from importlib import import_module
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from marlbc_mj.studies.engines import guard
+from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
+from marlbc_mj.studies.protocol import JobT, ResultT
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.text import one_line
+
+TASKS_AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
+ADDRESS = "RAY_ADDRESS"
+
+
+class RayTasks:
+    """Ray's tasks, one CPU each.
+
+    Args:
+        workers: CPUs of a Ray that is started for the study; a cluster has its own number.
+
+    Raises:
+        ConfigurationError: Ray is not installed.
+    """
+
+    def __init__(self, workers: int) -> None:
+        self.workers = workers
+        try:
+            self.ray: Any = import_module("ray")
+        except ImportError as error:
+            raise ConfigurationError("the engine ray needs Ray: pip install 'marlbc-mj[ray]'") from error
+
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+        if ears.stop is not None:
+            raise ConfigurationError("jobs that save themselves run on this machine only; leave out --engine ray")
+        with nullcontext() if os.environ.get(ADDRESS) else _guarded(), self._connected():
+            yield from self._finished(work, tasks)
+
+    def _finished(self, work: Work[JobT, ResultT], tasks: Sequence[Task]) -> Generator[tuple[int, ResultT]]:
+        ray = self.ray
+        remote = ray.remote(num_cpus=1, max_retries=MOST_TRIES - 1)(_attempt)
+        shared = ray.put(_Shared(pickle.dumps(work), os.getcwd(), tuple(sys.path)))
+        ahead = (1 + TASKS_AHEAD) * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        left = list(reversed(tasks))
+        places: dict[Any, int] = {}
+        try:
+            while left or places:
+                while left and len(places) < ahead:
+                    task = left.pop()
+                    places[remote.remote(shared, pickle.dumps(task))] = task.place
+                done, _ = ray.wait(list(places), num_returns=1)
+                for each in done:
+                    yield places.pop(each), self._outcome(each).unpack()
+        finally:
+            for each in places:
+                with suppress(Exception):
+                    ray.cancel(each, force=True)
+
+    def _outcome(self, reference: Any) -> Outcome:
+        exceptions = self.ray.exceptions
+        try:
+            found: Outcome = pickle.loads(self.ray.get(reference))  # so that arrays can be written to, as elsewhere
+        except (exceptions.RayTaskError, exceptions.RaySystemError) as error:
+            raise SimulationError(f"a task of Ray failed: {one_line(str(error)[-300:])}") from error
+        except exceptions.RayError as error:
+            said = f"a worker of Ray died {MOST_TRIES} times on the same job"
+            raise SimulationError(f"{said}: {one_line(str(error)[:300])}") from error
+        return found
+
+    @contextmanager
+    def _connected(self) -> Iterator[None]:
+        """Ray during the block; its handler of SIGTERM would replace ours.
+
+        Raises:
+            ConfigurationError: the cluster cannot be reached.
+        """
+        main = threading.current_thread() is threading.main_thread()
+        before = signal.getsignal(signal.SIGTERM) if main else None
+        ray, address = self.ray, os.environ.get(ADDRESS)
+        where: dict[str, Any] = {"address": address} if address else {"address": "local", "num_cpus": self.workers}
+        if not address:
+            where["include_dashboard"] = False
+        try:
+            ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
+        except Exception as error:
+            raise ConfigurationError(f"no Ray at {address or 'this machine'}: {one_line(error)}") from error
+        try:
+            if before is not None:
+                signal.signal(signal.SIGTERM, before)
+            yield
+        finally:
+            ray.shutdown()
+
+
+@contextmanager
+def _guarded() -> Iterator[None]:
+    """A process that ends the Ray that is started in the block, should this one be killed."""
+    token = secrets.token_hex(8)
+    command = [sys.executable, "-m", guard.__name__, token]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as guarding:
+        os.environ[guard.TOKEN] = token
+        try:
+            yield
+        finally:
+            del os.environ[guard.TOKEN]
+            guard.end_marked(token)  # agents of a raylet that was killed
+            guarding.terminate()
+
+
+class _Shared(NamedTuple):
+    """What all tasks have in common."""
+
+    work: bytes  # pickled: it can be read only where the search path is the study's
+    folder: str
+    path: tuple[str, ...]
+
+
+def _attempt(shared: _Shared, pickled: bytes) -> bytes:
+    """A job on a worker, in the folder and with the search path of the study's process where those are there, too."""
+    if Path(shared.folder).is_dir():
+        os.chdir(shared.folder)
+    sys.path += [entry for entry in shared.path if entry not in sys.path]
+    work: Work[Any, Any] = pickle.loads(shared.work)
+    return pickle.dumps(attempt(work.visible(), pickle.loads(pickled)))

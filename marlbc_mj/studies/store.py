@@ -1,0 +1,153 @@
+"""The folder of a run that has not ended: results by key, and large files of the jobs, in ``OUT/.jobs``.
+
+    OUT/.jobs/run.json             study, code version and number of jobs of the command that wrote last
+    OUT/.jobs/lock                 locked by the process that runs the study
+    OUT/.jobs/results-NNNNNN.pack  results by key, see packs; a record that is whole is the mark that a job is done
+    OUT/.jobs/files/KEY/           large files of a job, renamed to this when the job ended
+    OUT/.jobs/files/.begun-*/      those of a job that runs
+    OUT/.jobs/engine/              what an engine needs of the shared folder
+
+The report is made elsewhere and replaces OUT, with all of this, in one rename.
+"""
+
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.studies import codec
+from marlbc_mj.studies.packs import PackWriter, entries, next_pack, packs
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import JOBS_FOLDER, check_folder, duplicate, remove_orphans, write_json, writing
+from marlbc_mj.util.locks import held_alone
+
+STORE_SCHEMA = 1
+_BEGUN = ".begun-"
+_RUN, _LOCK, _FILES, _ENGINE = "run.json", "lock", "files", "engine"
+
+
+class RunStore:
+    """Results and large files of one unfinished run; made by :func:`open_store`."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.files = folder / _FILES
+        self.engine = folder / _ENGINE
+        self.kept = {entry.key: entry for pack in packs(folder) for entry in entries(pack)}
+        """Where the result of a key is."""
+        self._writer: PackWriter | None = None
+
+    def result(self, key: str) -> Any:
+        """A stored result."""
+        return codec.from_bytes(self.kept[key].payload())
+
+    def keep(self, key: str, result: Any) -> None:
+        """Store a result.
+
+        Raises:
+            NoSpaceError: the disk is full.
+            ConfigurationError: the result is no data.
+        """
+        if self._writer is None or self._writer.full:
+            self.close()
+            self._writer = PackWriter(next_pack(self.folder))
+        self.kept[key] = self._writer.add(key, codec.to_bytes(result))
+
+    def drop(self) -> None:
+        """Remove all results and files."""
+        self.close()
+        self.kept.clear()
+        for pack in packs(self.folder):
+            pack.unlink()
+        shutil.rmtree(self.files, ignore_errors=True)
+
+    def close(self) -> None:
+        """Flush what was stored to the disk."""
+        if self._writer is not None:
+            self._writer.close()
+            self._writer = None
+
+    def begin(self, about: Mapping[str, Any]) -> None:
+        """Write what this run is, and remove what killed workers left."""
+        with writing(self.folder):
+            self.files.mkdir(exist_ok=True)
+            for path in self.files.glob(f"{_BEGUN}*"):
+                shutil.rmtree(path, ignore_errors=True)
+        write_json(self.folder / _RUN, {"schema": STORE_SCHEMA, **about})
+
+    def about(self) -> dict[str, Any]:
+        """What the last run here was; empty where none has begun.
+
+        Raises:
+            ConfigurationError: the folder was written by something else, or by another version.
+        """
+        path = self.folder / _RUN
+        if not path.exists():
+            return {}
+        with suppress(OSError, ValueError):
+            found = json.loads(path.read_text(encoding="utf-8"))
+            if isinstance(found, dict) and found.get("schema") == STORE_SCHEMA:
+                return found
+        raise ConfigurationError(f"{path} is of another version of marlbc, or of something else; remove {self.folder}")
+
+    def place_files(self, keys: Mapping[str, Any], out: Path) -> None:
+        """Give the large files of the jobs of these keys a place in ``out``, each its own name; they stay here, too."""
+        with writing(out):
+            for folder in (self.files / key for key in keys if (self.files / key).is_dir()):
+                for path in sorted(each for each in folder.rglob("*") if not each.is_dir()):
+                    target = out / path.relative_to(folder)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    target.unlink(missing_ok=True)
+                    duplicate(path, target)
+
+
+@contextmanager
+def job_folder(files: Path | None, key: str) -> Iterator[Path | None]:
+    """A folder for the large files of one job, in any process: under the job's key once the block has ended without an error."""
+    if files is None:
+        yield None
+        return
+    begun = files / f"{_BEGUN}{os.getpid()}-{secrets.token_hex(4)}"
+    with writing(begun):
+        begun.mkdir()
+    try:
+        yield begun
+        with writing(begun):
+            if not any(begun.iterdir()):
+                begun.rmdir()
+                return
+            shutil.rmtree(files / key, ignore_errors=True)
+            begun.rename(files / key)
+    except BaseException:
+        shutil.rmtree(begun, ignore_errors=True)
+        raise
+
+
+@contextmanager
+def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
+    """The store of the run in ``out``, for this process alone; one in which nothing was kept is removed at the end.
+
+    Raises:
+        ConfigurationError: ``out`` holds something that may not be replaced, is a file, cannot be written, or another process
+            runs a study there.
+    """
+    remove_orphans(out)
+    check_folder(out, overwrite=overwrite)
+    folder, made = out / JOBS_FOLDER, not out.exists()
+    with writing(out):
+        folder.mkdir(parents=True, exist_ok=True)
+    with held_alone(folder / _LOCK, f"{out} is being written by another process; wait for it or choose another folder"):
+        store = RunStore(folder)
+        try:
+            yield store
+        finally:
+            store.close()
+            if not store.kept and folder.is_dir():
+                shutil.rmtree(folder, ignore_errors=True)
+                if made:
+                    with suppress(OSError):
+                        out.rmdir()

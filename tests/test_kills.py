@@ -1,0 +1,41 @@
+"""One SIGKILL, as ``make kills`` gives hundreds, and that its checks see what is wrong."""
+
+import random
+from pathlib import Path
+
+import kills
+import pytest
+
+
+def test_a_killed_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two workers; what is left in the end is that of a run without a kill."""
+    monkeypatch.setattr(kills, "_strike", lambda process, whom, rng: process.kill())
+    killer = kills.Killer(tmp_path, "local", 2)
+    (tmp_path / "digests-whole.json").write_text("3.0")
+    assert killer.finish("digests", tmp_path / "digests-whole")[0] == 0
+    said = killer.kill("digests", FirstResult())
+    assert said["faults"] == [] and said["kills"] == 1 and 0 < said["kept"][0] < 40
+
+
+class FirstResult(random.Random):
+    """One kill, soon after the first result."""
+
+    def choice(self, choices):
+        return 1 if 1 in choices else choices[0]
+
+    def uniform(self, low: float, high: float) -> float:
+        return low
+
+
+def test_what_is_wrong_is_seen(tmp_path: Path) -> None:
+    """Half a file, another number, and one file more; times may differ."""
+    whole, other = tmp_path / "whole", tmp_path / "other"
+    for folder, text in ((whole, '{"a": 1, "wall_s": 2}'), (other, '{"a": 1, "wall_s": 3}')):
+        folder.mkdir()
+        (folder / "a.json").write_text(text)
+    assert kills.differences(whole, other) == [] == kills.torn(other)
+    (other / "a.json").write_text('{"a": 2')
+    (other / "b.txt").write_text("")
+    assert [fault.split(":")[0] for fault in kills.torn(other)] == ["a.json is torn", "b.txt is torn"]
+    (other / "a.json").write_text('{"a": 2}')
+    assert kills.differences(whole, other) == ["b.txt is in one only", "a.json differs"]

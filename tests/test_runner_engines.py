@@ -1,0 +1,137 @@
+"""Engines: the same results to the last bit, failures and retries, on Ray's and submitit's processes of this machine."""
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_studies import Roots, Squares
+
+from marlbc_mj.studies import runner
+from marlbc_mj.studies.engines import make_engine
+from marlbc_mj.studies.engines.base import Ears, Engine, Task, Work
+from marlbc_mj.studies.engines.slurm_arrays import SlurmArray
+from marlbc_mj.studies.runner import run_jobs, run_study
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture
+def whole(tmp_path: Path) -> dict[str, bytes]:
+    """What a study in this process leaves."""
+    run_study(Roots(), tmp_path / "whole")
+    return files(tmp_path / "whole")
+
+
+@pytest.fixture
+def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[Engine], None]:
+    """Has studies use an engine, whatever they ask for."""
+    return lambda engine: monkeypatch.setattr(runner, "make_engine", lambda name, workers: engine)
+
+
+def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> None:
+    """What had ended when a job failed is kept, and the rest follows."""
+    with pytest.raises(SimulationError, match="it fell"):
+        run_study(Roots(trouble="it fell", once=once), out, engine="ray")
+    said = []
+    done = run_study(Roots(once=once), out, engine="ray", progress=lambda *step: said.append(step))
+    assert files(out) == whole and all(each.flags.writeable for each in done.results)
+    assert said[0][0] == "jobs" and 0 < said[0][1] < 5 and said[-1] == ("jobs", 5, 5)
+    assert once.exists() and [path.name for path in out.parent.glob("out*")] == ["out"]
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
+    """Two local workers, of which one is killed in mid-job: the job is done again, and another fails after that."""
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    handler = signal.getsignal(signal.SIGTERM)
+    use(make_engine("ray", 2))
+    goes_on_after_an_error(tmp_path / "out", whole, tmp_path / "once")
+    assert signal.getsignal(signal.SIGTERM) == handler and (tmp_path / "once").read_text() == "again"
+
+
+def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
+    """Its processes on this machine stand for an array of two tasks; one is killed, and what it has left is submitted again."""
+    monkeypatch.setattr("marlbc_mj.studies.engines.slurm_arrays.ALIVE_EVERY", 0.2)
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
+    use(SlurmArray(2, "local"))
+    run_study(Roots(once=tmp_path / "once"), tmp_path / "killed")
+    assert files(tmp_path / "killed") == whole and (tmp_path / "once").read_text() == "again"
+    goes_on_after_an_error(tmp_path / "out", whole, tmp_path / "once")
+
+
+def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Results that came after the end of the study are found by the next run; only what failed is submitted again."""
+    from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
+
+    tasks = [Task(k, f"{k:064x}", k) for k in range(5)]
+    work = Work(Roots(), None, tmp_path)
+    ArrayShare(replace(work, study=Roots(trouble="it fell")), tuple(tasks), tmp_path / "0-0.pack")()
+    engine = SlurmArray(2, "local")
+    submitted: list[Task] = []
+
+    def submit(work: Work, tasks: list[Task], scratch: Path, tries: int) -> list[object]:
+        submitted.extend(tasks)
+        ArrayShare(work, tuple(tasks), scratch / "0-0.pack")()
+        return []
+
+    monkeypatch.setattr(engine, "_submit", submit)
+    found = dict(engine.map(work, tasks, Ears()))
+    assert (
+        [task.place for task in submitted] == [3]
+        and sorted(found) == list(range(5))
+        and found[4].tobytes() == np.sqrt(np.arange(4.0, 7.0)).tobytes()
+    )
+
+
+def test_a_share_goes_on_where_it_was_killed(tmp_path: Path) -> None:
+    """As SLURM requeues it: a torn result is made again, the others are not."""
+    from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
+    from marlbc_mj.studies.packs import entries
+
+    share = ArrayShare(Work(Roots(), None, tmp_path), tuple(Task(k, f"{k:064x}", k) for k in range(3)), tmp_path / "0.pack")
+    share()
+    whole = share.pack.read_bytes()
+    os.truncate(share.pack, len(whole) - 3)
+    share()
+    assert share.pack.read_bytes() == whole and len(list(entries(share.pack))) == 3
+
+
+def test_an_error_that_is_not_ours_is_one_line(tmp_path: Path) -> None:
+    """From where it cannot be raised through."""
+    from marlbc_mj.studies.engines.base import attempt
+
+    outcome = attempt(Work(Roots(trouble="error")), Task(3, "", 3))
+    with pytest.raises(SimulationError, match=r"a job failed: ZeroDivisionError: nothing to divide \(small_studies.py, line"):
+        outcome.unpack()
+
+
+@pytest.mark.parametrize(
+    ("name", "missing", "said"),
+    [
+        ("ray", "ray", r"needs Ray: pip install 'marlbc-mj\[ray\]'"),
+        ("slurm", "submitit", r"needs submitit: pip install 'marlbc-mj\[slurm\]'"),
+    ],
+)
+def test_an_engine_that_is_not_installed(monkeypatch: pytest.MonkeyPatch, name: str, missing: str, said: str) -> None:
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(ConfigurationError, match=said):
+        run_jobs(Squares(), engine=name)
+
+
+def test_an_engine_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No such name, no SLURM, no worker."""
+    monkeypatch.setattr("shutil.which", lambda _: None)
+    with pytest.raises(ConfigurationError, match="no SLURM here: there is no command sbatch"):
+        run_jobs(Squares(), engine="slurm")
+    with pytest.raises(ConfigurationError, match="unknown engine 'dask'; choose from: local, ray, slurm"):
+        run_jobs(Squares(), engine="dask")
+    with pytest.raises(ConfigurationError, match="workers must be at least 1, got 0"):
+        run_jobs(Squares(), engine="ray", workers=0)
