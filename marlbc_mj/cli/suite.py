@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import arg
 
@@ -46,6 +46,8 @@ class SuiteCommand:
     """Render the worst and the median layout of every method."""
     workers: int = 1
     """Processes that share the work; decision times are best measured with one."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     out: Path = Path("out/suite")
     """Folder of suite.json, a CSV file per track, leaderboard.html and leaderboard.tex."""
     overwrite: bool = False
@@ -59,7 +61,15 @@ class SuiteCommand:
         study = self.study()
         with progress_bars() as progress:
             ended = counting(study.jobs(), lambda job: job.track, progress)
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=progress, ended=ended)
+            done = run_study(
+                study,
+                self.out,
+                overwrite=self.overwrite,
+                workers=self.workers,
+                engine=self.engine,
+                progress=progress,
+                ended=ended,
+            )
         print(done.report.text)
         for problem in done.report.problems:
             print(f"marlbc: {problem}", file=sys.stderr)

@@ -11,10 +11,11 @@ from marlbc_mj.results.layout_runs import MissionRuns, read_layout_rows, write_l
 from marlbc_mj.results.standings import MissionSummary, summarize
 from marlbc_mj.results.statistics import Estimate
 from marlbc_mj.results.summary import json_numbers
+from marlbc_mj.studies.addresses import code_version
 from marlbc_mj.studies.suite.definition import TRACKS, VERSION, suite_hash
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
-from marlbc_mj.util.provenance import git_revision, provenance
+from marlbc_mj.util.provenance import provenance
 
 FORM = 1
 """Version of the form of suite.json."""
@@ -36,14 +37,9 @@ def describe_suite() -> dict[str, Any]:
         "suite": {"version": VERSION, "hash": suite_hash()},
         "command": " ".join(["marlbc", *sys.argv[1:]]),
         "date": datetime.now(UTC).date().isoformat(),
-        "code": suite_code(),
+        "code": code_version(),
         **provenance(),
     }
-
-
-def suite_code() -> str:
-    """Version of all that results depend on."""
-    return git_revision()
 
 
 def write_suite(results: SuiteResults, folder: Path) -> None:

@@ -7,11 +7,12 @@ from pathlib import Path
 
 from marlbc_mj.report.leaderboard import write_leaderboard
 from marlbc_mj.results.layout_runs import LayoutRun, MissionRuns
+from marlbc_mj.studies.addresses import code_version
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.suite.clips import render_clips
 from marlbc_mj.studies.suite.definition import TRACKS, SuiteMission
 from marlbc_mj.studies.suite.entries import Choice
-from marlbc_mj.studies.suite.files import SuiteResults, describe_suite, merge, read_suite, suite_code, write_suite
+from marlbc_mj.studies.suite.files import SuiteResults, describe_suite, merge, read_suite, write_suite
 from marlbc_mj.studies.suite.flights import SuiteJob, fly_layouts, suite_jobs
 from marlbc_mj.util.progress import Progress, silent
 
@@ -64,7 +65,7 @@ class SuiteStudy:
 def _strangeness(results: SuiteResults) -> list[str]:
     """One line for every part of the results that is of other code than this."""
     codes = dict.fromkeys(str(facts["code"]) for facts in (results.facts, *results.facts.get("beside", ())))
-    return [f"rows are of other code ({code}) than this ({suite_code()})" for code in codes if code != suite_code()]
+    return [f"rows are of other code ({code}) than this ({code_version()})" for code in codes if code != code_version()]
 
 
 def track_summaries() -> dict[str, str]:
