@@ -23,6 +23,7 @@ from marlbc_mj.cli.parsing import parse
 from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
+from marlbc_mj.cli.suite import SuiteCommand
 from marlbc_mj.cli.terminal import prepare_gl, suggest_cache
 from marlbc_mj.cli.training import TrainCommand
 
@@ -30,6 +31,7 @@ Command = (
     Annotated[BenchCommand, subcommand("bench")]
     | Annotated[RunCommand, subcommand("run")]
     | Annotated[EvaluateCommand, subcommand("evaluate")]
+    | Annotated[SuiteCommand, subcommand("suite")]
     | Annotated[TrainCommand, subcommand("train")]
     | Annotated[ShipCommand, subcommand("ship")]
     | Annotated[ExportCommand, subcommand("export")]

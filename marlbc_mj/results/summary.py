@@ -55,10 +55,10 @@ class Result:
 
 def method_key(supervisor: str, controller: str) -> str:
     """The name of a method in summaries and files: ``scripted+sorlc``; of what a user's file has, without its folder."""
-    return f"{_word(supervisor)}+{_word(controller)}"
+    return f"{short_name(supervisor)}+{short_name(controller)}"
 
 
-def _word(name: str) -> str:
+def short_name(name: str) -> str:
     """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
     file, _, attribute = name.rpartition(":")
     if file:

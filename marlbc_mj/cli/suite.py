@@ -1,0 +1,98 @@
+"""``marlbc suite``: supervisors and controllers on a fixed set of missions, and the leaderboard."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import arg
+
+from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.util.errors import ConfigurationError
+
+if TYPE_CHECKING:
+    from marlbc_mj.studies.suite.study import SuiteStudy
+
+
+@dataclass(frozen=True)
+class SuiteCommand:
+    """Fly supervisors and controllers on a fixed set of missions, and write a leaderboard.
+
+    Tracks: paper, families, teams, robots and control. Every supervisor flies under the compositions that it is meant for;
+    control compares controllers under one schedule. The whole suite takes days of one core: begin with --quick.
+    """
+
+    track: tuple[str, ...] = ()
+    """Tracks to fly; all by default, paper, families and control with --quick."""
+    missions: tuple[str, ...] = ()
+    """Missions of these tracks to fly; all by default."""
+    supervisors: tuple[str, ...] | None = None
+    """Supervisors to fly, FILE.py:NAME, or paths of checkpoints; all but mpcms-mujoco by default, and no search with --quick."""
+    controllers: tuple[str, ...] | None = None
+    """Controllers of the track control, or FILE.py:NAME; all by default."""
+    compositions: tuple[str, ...] | None = None
+    """Compositions for every supervisor: null-space, set-based; by default those that each is meant for."""
+    shield: bool = False
+    """Fly every method with a shield as well."""
+    quick: bool = False
+    """The first 50 layouts of every mission, without supervisors that search."""
+    layouts: int | None = None
+    """The first so many layouts of every mission."""
+    source: Annotated[Path | None, arg(name="from")] = None
+    """Folder of results of the suite whose rows stand beside those that are flown."""
+    page: bool = False
+    """Fly nothing: write the page of the results in --from."""
+    clips: bool = False
+    """Render the worst and the median layout of every method."""
+    workers: int = 1
+    """Processes that share the work; decision times are best measured with one."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    out: Path = Path("out/suite")
+    """Folder of suite.json, a CSV file per track, leaderboard.html and leaderboard.tex."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+
+    def run(self) -> None:
+        """Fly, then print the first tables and say where the page is."""
+        from marlbc_mj.report.leaderboard import LEADERBOARD_PAGE
+        from marlbc_mj.studies.runner import counting, run_study
+
+        study = self.study()
+        with progress_bars() as progress:
+            ended = counting(study.jobs(), lambda job: job.track, progress)
+            done = run_study(
+                study,
+                self.out,
+                overwrite=self.overwrite,
+                workers=self.workers,
+                engine=self.engine,
+                progress=progress,
+                ended=ended,
+            )
+        print(done.report.text)
+        for problem in done.report.problems:
+            print(f"marlbc: {problem}", file=sys.stderr)
+        print(f"{self.out / LEADERBOARD_PAGE} shows it all")
+
+    def study(self) -> "SuiteStudy":
+        """What is to be flown.
+
+        Raises:
+            ConfigurationError: options that do not go together, unknown names, or results that cannot stand beside these.
+        """
+        from marlbc_mj.studies.suite.definition import QUICK, QUICK_TRACKS, check_frozen, choose_missions
+        from marlbc_mj.studies.suite.entries import Choice
+        from marlbc_mj.studies.suite.files import read_suite
+        from marlbc_mj.studies.suite.study import SuiteStudy
+
+        if self.page and self.source is None:
+            raise ConfigurationError("--page needs --from: the folder whose results it shows")
+        layouts = QUICK if self.quick and self.layouts is None else self.layouts
+        tracks = QUICK_TRACKS if self.quick and not self.track else self.track
+        missions = [] if self.page else choose_missions(tracks, self.missions, layouts)
+        check_frozen(list(dict.fromkeys(mission.track for mission in missions)))
+        choice = Choice(self.supervisors, self.controllers, self.compositions, self.shield, self.quick)
+        if self.source is not None:
+            read_suite(self.source)  # what cannot stand beside these rows is refused before anything is flown
+        return SuiteStudy(tuple(missions), choice, self.source, self.clips)

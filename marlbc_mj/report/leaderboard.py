@@ -1,0 +1,273 @@
+"""leaderboard.html and leaderboard.tex: supervisors and controllers of the suite, ranked, in tables of their own."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.report import paper_values
+from marlbc_mj.report.formats import percent, spans
+from marlbc_mj.report.leaderboard_cells import WIDTH, BoardCell, BoardColumn, BoardRow, Name, board_rows, shown_name
+from marlbc_mj.report.page import origin_facts
+from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.report.tables import latex_document
+from marlbc_mj.report.templates import render
+from marlbc_mj.results.layout_runs import Method, MissionRuns
+from marlbc_mj.results.standings import Notable, Standing, by_cost, finished, notable_layouts, rank_methods, share_of
+from marlbc_mj.results.statistics import Estimate
+
+LEADERBOARD_PAGE, LEADERBOARD_TEX = "leaderboard.html", "leaderboard.tex"
+SUPERVISOR_REFERENCE = "fsams-hysteresis"
+"""The supervisor that the chance of improvement is measured against, under the null-space composition."""
+CONTROL_REFERENCE = "sorlc"
+"""The controller that the chance of improvement is measured against."""
+CONTROL = "control"
+"""The track that compares controllers."""
+_REFERENCE_NOTE = f"Reference: {SUPERVISOR_REFERENCE} under the null-space composition."
+LEADING = 3
+"""Columns that every table begins with; in text they have their intervals."""
+MOST_COLUMNS = 12
+"""That a table on paper has."""
+
+
+class Board(NamedTuple):
+    """One sortable table."""
+
+    name: str
+    title: str
+    note: str
+    columns: tuple[BoardColumn, ...]
+    rows: tuple[BoardRow, ...]
+
+    def table(self) -> Table:
+        """The same as text, for LaTeX and the terminal; success on single missions is left out where it would not fit."""
+        wide = len(self.columns) > MOST_COLUMNS
+        kept = [k for k, column in enumerate(self.columns) if not (wide and column.mission)]
+        heads = (Column("", "method"), *(Column("", self.columns[k].text) for k in kept))
+        rows = tuple((_words(row.name), *(_text(row.cells[k], with_ends=k < LEADING) for k in kept)) for row in self.rows)
+        return Table(f"board-{self.name}", f"{self.title}. {self.note}", heads, rows)
+
+
+class Failure(NamedTuple):
+    """Why runs of a method failed on a mission."""
+
+    mission: str
+    reason: str
+    runs: int
+    of: int
+
+
+class Look(NamedTuple):
+    """A layout worth a look."""
+
+    track: str
+    kind: str  # ``worst`` or ``median``
+    mission: str
+    seed: int
+    ended: str  # in words
+    clip: str  # its address; empty: not rendered
+
+
+class Detail(NamedTuple):
+    """What is one click away of a method."""
+
+    name: Name
+    facts: str
+    failures: tuple[Failure, ...]
+    looks: tuple[Look, ...]
+
+
+def write_leaderboard(groups: Sequence[MissionRuns], facts: Mapping[str, Any], tracks: Mapping[str, str], folder: Path) -> str:
+    """Write the page and the LaTeX tables; returns the first tables as Markdown.
+
+    Args:
+        groups: every method on every mission that it flew.
+        facts: where the rows come from, as suite.json has them.
+        tracks: one line about every track, by name, in the order in which they are shown.
+        folder: where the files go, and where clips are looked for.
+    """
+    boards = make_boards(groups, tracks)
+    text = render(
+        "leaderboard.html",
+        title=f"Leaderboard of suite {facts['suite']['version']}",
+        facts=_page_facts(groups, facts),
+        missions=_missions(groups, tracks),
+        command=str(facts["command"]),
+        boards=boards,
+        width=WIDTH,
+        details=_details(groups, folder),
+        citation=paper_values.CITATION,
+        doi=paper_values.DOI,
+    )
+    (folder / LEADERBOARD_PAGE).write_text(text, encoding="utf-8")
+    tables = [board.table() for board in boards]
+    (folder / LEADERBOARD_TEX).write_text(latex_document(tables), encoding="utf-8")
+    shown = [table for table in tables if table.name in ("board-supervisors", "board-controllers")]
+    return "\n".join(map(to_markdown, shown or tables))
+
+
+def make_boards(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[Board]:
+    """All tables: supervisors over all tracks, controllers, then supervisors on each track."""
+    by_track = {name: [each for each in groups if each.track == name] for name in tracks}
+    flown = {name: own for name, own in by_track.items() if own}
+    control = flown.pop(CONTROL, [])
+    each = {name: _track_board(name, tracks[name], own) for name, own in flown.items()}
+    boards = [_overall_board(flown)] if len(flown) > 1 else []
+    boards += [_control_board(tracks[CONTROL], control)] if control else []
+    return [*boards, *each.values()]
+
+
+def _share(kind: str) -> Callable[[Standing], Estimate]:
+    return lambda standing: percent(standing.shares[kind])
+
+
+def _median(name: str) -> Callable[[Standing], Estimate]:
+    """Mean over missions of a median, without an interval; missions on which no run finished are left out."""
+
+    def read(standing: Standing) -> Estimate:
+        columns = [finished(each, name) for each in standing.flown.values()]
+        medians = [float(np.median(column)) for column in columns if len(column)]
+        return Estimate(float(np.mean(medians)) if medians else np.nan, np.nan, np.nan)
+
+    return read
+
+
+def _leading(count: int) -> list[BoardColumn]:
+    """What every table begins with."""
+    return [
+        BoardColumn("mean rank", lambda standing: standing.rank, 2, -1, (1.0, max(2.0, float(count)))),
+        BoardColumn("better than reference", lambda standing: percent(standing.improvement), 0, 1, (0.0, 100.0), unit="%"),
+        BoardColumn("success", _share("success"), 1, 1, (0.0, 100.0), unit="%"),
+    ]
+
+
+_SAFETY_AND_COST = (
+    BoardColumn("violation", _share("violated"), 1, -1, (0.0, 100.0), unit="%"),
+    BoardColumn("struck", _share("struck"), 1, -1, (0.0, 100.0), unit="%"),
+    BoardColumn("collided", _share("collided"), 1, -1, (0.0, 100.0), unit="%"),
+    BoardColumn("switches", _median("switches"), 1, 0),
+    BoardColumn("decision", _median("decision_ms"), None, 0, unit="ms"),
+)
+
+
+def _overall_board(flown: Mapping[str, Sequence[MissionRuns]]) -> Board:
+    """Supervisors over all tracks, whatever law flies each; every track has the same weight."""
+    pooled = {name: [_without_controller(each) for each in own] for name, own in flown.items()}
+    standings = rank_methods([each for own in pooled.values() for each in own], Method(SUPERVISOR_REFERENCE, ""), by_track=True)
+    tracks = {name: {s.method: s for s in rank_methods(own)} for name, own in pooled.items()}
+    columns = (
+        *_leading(len(standings)),
+        *(BoardColumn(name, _on_track(own), 1, 1, (0.0, 100.0), unit="%") for name, own in tracks.items()),
+        *_SAFETY_AND_COST,
+    )
+    note = f"Means over missions, every track with the same weight. {_REFERENCE_NOTE}"
+    return Board("supervisors", "Supervisors", note, columns, board_rows(standings, columns))
+
+
+def _without_controller(each: MissionRuns) -> MissionRuns:
+    return each._replace(method=each.method._replace(controller=""))
+
+
+def _on_track(own: Mapping[Method, Standing]) -> Callable[[Standing], Estimate]:
+    """The success on one track of a method."""
+    nothing = Estimate(np.nan, np.nan, np.nan)
+    return lambda standing: percent(own[standing.method].shares["success"]) if standing.method in own else nothing
+
+
+def _track_board(name: str, summary: str, own: Sequence[MissionRuns]) -> Board:
+    laws = dict.fromkeys(each.method.controller for each in own)
+    standings = rank_methods(own, Method(SUPERVISOR_REFERENCE, next(iter(laws))))
+    missions = dict.fromkeys(each.mission for each in own)
+    several = (BoardColumn(mission, _on_mission(mission), 0, 1, (0.0, 100.0), mission, "%") for mission in missions)
+    columns = (*_leading(len(standings)), *(several if len(missions) > 1 else ()), *_SAFETY_AND_COST)
+    note = f"Under {' and '.join(laws)}: {summary}. {_REFERENCE_NOTE}"
+    return Board(name, f"Supervisors: track {name}", note, columns, board_rows(standings, columns))
+
+
+def _on_mission(mission: str) -> Callable[[Standing], Estimate]:
+    nothing = Estimate(np.nan, np.nan, np.nan)
+    return lambda standing: percent(share_of(standing.flown[mission], "success")) if mission in standing.flown else nothing
+
+
+def _control_board(summary: str, own: Sequence[MissionRuns]) -> Board:
+    supervisor = own[0].method.supervisor
+    standings = rank_methods(own, Method(supervisor, CONTROL_REFERENCE), merit=by_cost)
+    columns = (
+        *_leading(len(standings)),
+        BoardColumn("violation", _share("violated"), 1, -1, (0.0, 100.0), unit="%"),
+        BoardColumn("cost", _median("cost_integral_sum"), None, -1),
+        BoardColumn("effort", _median("effort_integral_sum"), None, -1, unit="N s"),
+        BoardColumn("‖e_p‖", _median("rms_position_error_rms"), None, -1, unit="m"),
+        BoardColumn("return", _median("return"), 0, 1),
+    )
+    ranked = "Ranked by success, then by the control cost ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt of all agents"
+    note = f"{summary.capitalize()}. {ranked}. Reference: {CONTROL_REFERENCE}."
+    return Board("controllers", "Controllers", note, columns, board_rows(standings, columns, by_controller=True))
+
+
+def _text(cell: BoardCell, *, with_ends: bool) -> str:
+    return cell.text + (f" [{cell.ends.replace(' to ', ', ')}]" if cell.ends and with_ends else "")
+
+
+def _words(name: Name) -> str:
+    return name.display + (f" ({name.facts})" if name.facts else "")
+
+
+def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What the page says of the suite and of its rows, by name."""
+    seeds = {run.seed for each in groups for run in each.runs}
+    beside = facts.get("beside", ())
+    return [
+        ("Suite", f"{facts['suite']['version']}, {facts['suite']['hash'][:16]}"),
+        ("Seeds", f"{spans(sorted(seeds))}, on which nothing was tuned"),
+        ("Runs", f"{sum(len(each.runs) for each in groups)} episodes of {len({each.method for each in groups})} methods"),
+        ("Date", str(facts["date"])),
+        ("Processor", str(facts["cpu"])),
+        ("Code", str(facts["code"])),
+        *origin_facts(facts),
+        *(("Rows beside these", f"flown {other['date']} by {other['code']}: {other['command']}") for other in beside),
+    ]
+
+
+def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[tuple[str, str]]:
+    """Every track with its missions, and of how many layouts of each there are rows."""
+    counts: dict[tuple[str, str], int] = {}
+    for each in groups:
+        key = each.track, each.mission
+        counts[key] = max(counts.get(key, 0), len(each.runs))
+    lists = {
+        name: ", ".join(f"{mission} ({count})" for (track, mission), count in counts.items() if track == name) for name in tracks
+    }
+    return [(name, missions) for name, missions in lists.items() if missions]
+
+
+def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
+    """Failures and layouts worth a look, method by method."""
+    notable = notable_layouts(groups)
+    details = []
+    for method in dict.fromkeys(each.method for each in groups):
+        own = [each for each in groups if each.method == method]
+        failures = tuple(
+            Failure(each.mission, reason, count, len(each.runs)) for each in own for reason, count in each.failures.items()
+        )
+        failed, total = sum(failure.runs for failure in failures), sum(len(each.runs) for each in own)
+        looks = tuple(_look(one, folder) for one in notable if one.method == method)
+        name = shown_name(method)
+        with_law = name._replace(facts=", ".join(part for part in (method.controller, name.facts) if part))
+        words = f"{failed} of {total} runs could not be finished" if failed else f"all {total} runs were finished"
+        details.append(Detail(with_law, words, failures, looks))
+    return details
+
+
+def _look(one: Notable, folder: Path) -> Look:
+    run = one.run
+    faults = {
+        "not in formation at the end": not run.reached,
+        "violation": run.violated,
+        "struck an obstacle": run.struck,
+        "agents collided": run.collided,
+    }
+    ended = ", ".join(words for words, holds in faults.items() if holds) or "success"
+    clip = one.clip if (folder / one.clip).is_file() else ""
+    return Look(one.track, one.kind, one.mission, run.seed, f"{ended}, return {run.score('return'):.0f}", clip)

@@ -1,0 +1,114 @@
+"""Cells of a leaderboard's tables: a number, its interval as a small drawing, and whether it is the best of its column."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+from marlbc_mj.report.formats import DASH, fixed, significant
+from marlbc_mj.report.method_names import source_of
+from marlbc_mj.results.layout_runs import Method
+from marlbc_mj.results.standings import Standing
+from marlbc_mj.results.statistics import Estimate
+
+WIDTH = 64
+"""Of the drawing of an interval [CSS pixels]."""
+
+
+class IntervalMark(NamedTuple):
+    """The drawing of an estimate: its interval and its value, in CSS pixels from the left."""
+
+    low: float
+    value: float
+    high: float
+
+
+class BoardCell(NamedTuple):
+    """One number of one method."""
+
+    text: str
+    sort: float  # what the column is sorted by; NaN comes last
+    ends: str = ""  # the interval in words
+    mark: IntervalMark | None = None
+    best: bool = False
+    level: bool = False  # not significantly behind the best
+
+
+class Name(NamedTuple):
+    """A method in words."""
+
+    display: str
+    citation: str
+    facts: str  # composition and shield
+    key: str  # in files
+
+
+class BoardRow(NamedTuple):
+    """One method."""
+
+    name: Name
+    place: str  # by mean rank; a dash where it did not fly everything
+    cells: tuple[BoardCell, ...]
+
+
+class BoardColumn(NamedTuple):
+    """What a column shows of a standing."""
+
+    head: str
+    read: Callable[[Standing], Estimate]
+    digits: int | None = None  # decimals; None: three significant digits
+    better: int = 1  # 1: larger is better, -1: smaller is, 0: neither
+    span: tuple[float, float] | None = None  # of the drawing; None: no drawing
+    mission: str = ""  # of a column that shows the success on one mission
+    unit: str = ""
+
+    @property
+    def text(self) -> str:
+        """The head with its unit."""
+        return self.head + (f" [{self.unit}]" if self.unit else "")
+
+
+def shown_name(method: Method, *, by_controller: bool = False) -> Name:
+    """The supervisor's name, or the controller's."""
+    source = source_of(method.controller if by_controller else method.supervisor)
+    facts = [*([] if by_controller else [method.composition]), *(["shield"] if method.shield else [])]
+    return Name(source.display, source.citation, ", ".join(facts), method.key)
+
+
+def board_rows(
+    standings: Sequence[Standing], columns: Sequence[BoardColumn], *, by_controller: bool = False
+) -> tuple[BoardRow, ...]:
+    """All rows, in the order of the standings; the best of each column is marked."""
+    grid = [[_cell(column, standing) for column in columns] for standing in standings]
+    for k, column in enumerate(columns):
+        values = [column.better * row[k].sort for row in grid if not math.isnan(row[k].sort)]
+        if column.better and 2 * values.count(max(values, default=0.0)) < len(values):  # the best of few, not one of many
+            for row in grid:
+                row[k] = row[k]._replace(best=column.better * row[k].sort == max(values))
+    places = [str(k) if not math.isnan(standing.rank.value) else DASH for k, standing in enumerate(standings, 1)]
+    return tuple(
+        BoardRow(shown_name(standing.method, by_controller=by_controller), place, tuple(cells))
+        for standing, place, cells in zip(standings, places, grid, strict=True)
+    )
+
+
+def _cell(column: BoardColumn, standing: Standing) -> BoardCell:
+    estimate = column.read(standing)
+    if math.isnan(estimate.value):
+        return BoardCell(DASH, math.nan)
+    value, low, high = (_number(number, column.digits) for number in estimate)
+    ends = "" if math.isnan(estimate.low) else f"{low} to {high}"
+    level = bool(column.mission) and column.mission in standing.level
+    return BoardCell(value, estimate.value, ends, _mark(estimate, column.span), level=level)
+
+
+def _number(value: float, digits: int | None) -> str:
+    return significant(value) if digits is None else fixed(value, digits)
+
+
+def _mark(estimate: Estimate, span: tuple[float, float] | None) -> IntervalMark | None:
+    if span is None or math.isnan(estimate.low):
+        return None
+    first, last = span
+    places = (WIDTH * min(1.0, max(0.0, (number - first) / (last - first))) for number in estimate)
+    value, low, high = (round(place, 1) for place in places)
+    return IntervalMark(low, value, high)

@@ -1,0 +1,155 @@
+"""Methods on the layouts of missions: a row per layout, as a CSV file holds it."""
+
+import csv
+import math
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from marlbc_mj.results.metrics import Metrics
+from marlbc_mj.results.outcomes import FAILED_MISSION, MissionOutcome, intervened, outcome
+from marlbc_mj.results.scores import SCORES
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.text import one_line
+
+DIGITS = 6
+"""Significant digits of every number of a row. What is computed from rows is the same before and after a file."""
+LAYOUT_SCORES = (
+    *("return", "violation_time_worst", "clearance_min_worst", "agent_distance_min", "end_error_worst"),
+    *("effort_integral_sum", "cost_integral_sum", "rms_position_error_rms", "intervention_share_mean"),
+)
+"""Names of the scores that a row keeps."""
+
+
+class Method(NamedTuple):
+    """What flies a mission: who decides, which law drives, how orders are composed, and whether a shield watches."""
+
+    supervisor: str
+    controller: str
+    composition: str = "null-space"
+    shield: bool = False
+
+    @property
+    def key(self) -> str:
+        """The method's name in files: ``fsams+sorlc``, ``fsams+sorlc+set-based+shield``."""
+        others = [*([] if self.composition == "null-space" else [self.composition]), *(["shield"] if self.shield else [])]
+        return "+".join([self.supervisor, self.controller, *others])
+
+
+class LayoutRun(NamedTuple):
+    """One method on one layout. Numbers are NaN where the run failed, which counts against its method in every respect."""
+
+    seed: int
+    failure: str  # why the run could not be finished; empty: it was
+    reached: bool
+    violated: bool
+    struck: bool
+    collided: bool
+    intervened: bool  # whether a shield changed a force
+    switches: float  # of all agents together
+    decision_ms: float  # median of a mission step, all agents [ms]
+    scores: tuple[float, ...]  # LAYOUT_SCORES, in SI units
+
+    @property
+    def success(self) -> bool:
+        """See :attr:`MissionOutcome.success`."""
+        return MissionOutcome(self.reached, self.violated, self.struck, self.collided).success
+
+    def score(self, name: str) -> float:
+        """One of :data:`LAYOUT_SCORES` by name."""
+        return self.scores[LAYOUT_SCORES.index(name)]
+
+
+class MissionRuns(NamedTuple):
+    """One method on the layouts of one mission."""
+
+    track: str
+    mission: str
+    method: Method
+    runs: tuple[LayoutRun, ...]
+
+    @property
+    def failures(self) -> dict[str, int]:
+        """How many runs failed, by reason."""
+        reasons = [run.failure for run in self.runs if run.failure]
+        return {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
+
+
+def layout_run(seed: int, metrics: Metrics | None, scenario: Scenario, failure: str | None = None) -> LayoutRun:
+    """The row of an episode, from its metrics, or from the reason why there are none."""
+    ended = FAILED_MISSION if metrics is None else outcome(metrics, scenario)
+    if metrics is None:
+        numbers = [math.nan] * (2 + len(LAYOUT_SCORES))
+    else:
+        switches = float(sum(agent["switches"] for agent in metrics["agents"]))
+        numbers = [switches, metrics["team"]["decision_ms_median"], *(SCORES[name].read(metrics) for name in LAYOUT_SCORES)]
+    switches, decision_ms, *scores = map(_rounded, numbers)
+    reason = one_line(failure) if metrics is None else ""
+    return LayoutRun(seed, reason, *ended, intervened(metrics), switches, decision_ms, tuple(scores))
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+_FLAGS = ("reached", "violated", "struck", "collided", "intervened")
+_HEADER = (
+    *("mission", "supervisor", "controller", "composition", "shield", "seed", "success", *_FLAGS, "switches", *LAYOUT_SCORES),
+    *("decision_ms", "failure"),
+)
+
+
+def write_layout_rows(group: Iterable[MissionRuns], path: Path) -> Path:
+    """Write a CSV file with one row per method, mission and layout; numbers of a failed run are empty."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_HEADER)
+        for each in group:
+            method = (each.mission, *each.method[:3], int(each.method.shield))
+            writer.writerows([*method, *_cells(run)] for run in each.runs)
+    return path
+
+
+def _cells(run: LayoutRun) -> list[Any]:
+    flags = [int(getattr(run, name)) for name in _FLAGS]
+    numbers = [_text(value) for value in (run.switches, *run.scores, run.decision_ms)]
+    return [run.seed, int(run.success), *flags, *numbers, run.failure]
+
+
+def _text(value: float) -> str:
+    return "" if math.isnan(value) else f"{value:.{DIGITS}g}"
+
+
+def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
+    """What :func:`write_layout_rows` wrote, in its order.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or is another kind of file; names the row.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            header, *rows = csv.reader(file)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(f"cannot read {path}: {one_line(error)}") from error
+    if tuple(header) != _HEADER:
+        raise ConfigurationError(f"{path} is no file of layouts: its columns are {', '.join(header)}")
+    found: dict[tuple[str, Method], list[LayoutRun]] = {}
+    for line, row in enumerate(rows, 2):
+        try:
+            mission, method, run = _parsed(row)
+        except ValueError as error:
+            raise ConfigurationError(f"{path}, line {line}: {one_line(error)}") from error
+        found.setdefault((mission, method), []).append(run)
+    return [MissionRuns(track, mission, method, tuple(runs)) for (mission, method), runs in found.items()]
+
+
+def _parsed(row: Sequence[str]) -> tuple[str, Method, LayoutRun]:
+    """Mission, method and run of one line; ValueError for one that is torn."""
+    cells = dict(zip(_HEADER, row, strict=True))
+    method = Method(cells["supervisor"], cells["controller"], cells["composition"], bool(int(cells["shield"])))
+    flags = {name: bool(int(cells[name])) for name in _FLAGS}
+    switches, decision_ms, *scores = (float(cells[name] or "nan") for name in ("switches", "decision_ms", *LAYOUT_SCORES))
+    ended = (flags["reached"], flags["violated"], flags["struck"], flags["collided"], flags["intervened"])
+    run = LayoutRun(int(cells["seed"]), cells["failure"], *ended, switches, decision_ms, tuple(scores))
+    return cells["mission"], method, run

@@ -1,0 +1,286 @@
+"""How methods compare on missions whose layouts are common to all: mean rank, chance of improvement, and who is best where.
+
+After Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), whose definition of the
+probability of improvement this is. Layouts are drawn with replacement, the same ones for all methods, within each mission.
+"""
+
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns
+from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, mean, rate
+from marlbc_mj.util.errors import ConfigurationError
+
+WORTH_OF_SUCCESS = 1e12
+"""What success is worth in a merit: more than any return or cost."""
+Merit = Callable[[LayoutRun], float]
+"""One number of a run, by whose order runs are compared: larger is better."""
+
+
+def by_return(run: LayoutRun) -> float:
+    """Success comes first, then the return; a run that failed comes last."""
+    return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success + run.score("return")
+
+
+def by_cost(run: LayoutRun) -> float:
+    """Success comes first, then a small control cost; a run that failed comes last."""
+    return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success - run.score("cost_integral_sum")
+
+
+OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened")
+"""What may be true of a run."""
+
+
+class MissionSummary(NamedTuple):
+    """One method on one mission."""
+
+    runs: int
+    shares: Mapping[str, Estimate]  # of outcomes, with Wilson's interval
+    medians: Mapping[str, Estimate]  # over the runs that finished
+    failures: Mapping[str, int]  # reason: number of runs
+
+
+class Standing(NamedTuple):
+    """One method among others on a group of missions."""
+
+    method: Method
+    rank: Estimate  # mean over missions of the mean rank over layouts: 1 is best; NaN where it did not fly all missions
+    improvement: Estimate  # P(better than the reference), mean over missions
+    shares: Mapping[str, Estimate]  # mean over missions of the share of each outcome
+    flown: Mapping[str, MissionRuns]  # by mission
+    best: frozenset[str]  # missions on which no other method succeeds more often
+    level: frozenset[str]  # missions on which nobody succeeds significantly more often: the best and those level with it
+
+
+def summarize(each: MissionRuns) -> MissionSummary:
+    """Shares, medians and failures."""
+    runs = each.runs
+    shares = {kind: share_of(each, kind) for kind in OUTCOMES}
+    medians = {name: median_interval(finished(each, name)) for name in (*LAYOUT_SCORES, "switches", "decision_ms")}
+    return MissionSummary(len(runs), shares, medians, each.failures)
+
+
+def share_of(each: MissionRuns, kind: str) -> Estimate:
+    """Share of runs with an outcome, with Wilson's interval."""
+    return rate([bool(getattr(run, kind)) for run in each.runs])
+
+
+def finished(each: MissionRuns, name: str) -> np.ndarray:
+    """(n,) a score, the switches or the decision time of the runs that finished."""
+    read = LayoutRun.score if name in LAYOUT_SCORES else getattr
+    return np.array([read(run, name) for run in each.runs if not run.failure], dtype=float)
+
+
+def median_interval(values: np.ndarray) -> Estimate:
+    """Median, and the order statistics between which the true one lies with a probability of at least 95 %.
+
+    The interval of the sign test: exact for any distribution; where there are too few values, from the least to the greatest.
+    """
+    from scipy.stats import binom  # here, as it takes longer to import than most commands take to answer
+
+    count, ordered = len(values), np.sort(values)
+    if count == 0:
+        return Estimate(np.nan, np.nan, np.nan)
+    if count == 1:
+        return Estimate(float(values[0]), np.nan, np.nan)
+    cut = max(0, int(binom.ppf(0.5 * (1.0 - LEVEL), count, 0.5)) - 1)
+    return Estimate(float(np.median(ordered)), float(ordered[cut]), float(ordered[-1 - cut]))
+
+
+def rank_methods(
+    group: Sequence[MissionRuns], reference: Method | None = None, *, merit: Merit = by_return, by_track: bool = False
+) -> list[Standing]:
+    """Standings of all methods, the best mean rank first; those that did not fly all missions come last, without a rank.
+
+    Args:
+        group: every method on every mission.
+        reference: the method that the chance of improvement is measured against; None, or one that is not there: the best.
+        merit: by which two runs on one layout are compared.
+        by_track: every track has the same weight, instead of every mission.
+    """
+    table: dict[Method, dict[str, MissionRuns]] = defaultdict(dict)
+    for each in group:
+        table[each.method][each.mission] = each
+    tracks = {each.mission: each.track for each in group}
+    complete = [method for method, flown in table.items() if len(flown) == len(tracks)]
+    rows = _ranked(complete, table, _weights(tracks, by_track), reference, merit) if complete else []
+    others = [_unranked(method, flown) for method, flown in table.items() if method not in complete]
+    return [*sorted(rows, key=lambda row: row.rank.value), *others]
+
+
+def _ranked(
+    methods: Sequence[Method],
+    table: Mapping[Method, Mapping[str, MissionRuns]],
+    weights: Mapping[str, float],
+    reference: Method | None,
+    merit: Merit,
+) -> list[Standing]:
+    """Standings of methods that flew all missions, in their order."""
+    matrices = {name: _matrix([table[method][name] for method in methods], merit) for name in weights}
+    ranks = _weighted(matrices, weights, lambda matrix: _ranks(matrix.merit))
+    shares = {kind: _weighted(matrices, weights, _share(k)) for k, kind in enumerate(OUTCOMES)}
+    first = min(range(len(methods)), key=lambda k: ranks[k].value)
+    against = methods.index(reference) if reference in methods else first
+    return [
+        Standing(
+            method,
+            ranks[k],
+            _improvement(matrices, weights, k, against),
+            {kind: estimates[k] for kind, estimates in shares.items()},
+            table[method],
+            *_places(matrices, k),
+        )
+        for k, method in enumerate(methods)
+    ]
+
+
+def _unranked(method: Method, flown: Mapping[str, MissionRuns]) -> Standing:
+    nothing = Estimate(np.nan, np.nan, np.nan)
+    return Standing(method, nothing, nothing, dict.fromkeys(OUTCOMES, nothing), flown, frozenset(), frozenset())
+
+
+class _Matrix(NamedTuple):
+    """K methods on the n layouts of one mission that all of them flew."""
+
+    merit: np.ndarray  # (K, n)
+    outcomes: np.ndarray  # (OUTCOMES, K, n) bool
+    drawn: np.ndarray  # (R, n) weight of every layout in every bootstrap sample; rows sum to 1
+
+
+def _weights(tracks: Mapping[str, str], by_track: bool) -> dict[str, float]:
+    """Weight of each mission; they sum to 1."""
+    names = list(tracks.values())
+    raw = {mission: 1.0 / names.count(track) if by_track else 1.0 for mission, track in tracks.items()}
+    return {mission: weight / sum(raw.values()) for mission, weight in raw.items()}
+
+
+def _matrix(rows: Sequence[MissionRuns], merit: Merit) -> _Matrix:
+    common = set.intersection(*({run.seed for run in each.runs} for each in rows))
+    if not common:
+        raise ConfigurationError(f"no layout of {rows[0].mission} was flown by all methods")
+    chosen = [sorted((run for run in each.runs if run.seed in common), key=_seed_of) for each in rows]
+    merits = np.array([[merit(run) for run in runs] for runs in chosen])
+    outcomes = np.array([[[getattr(run, kind) for run in runs] for runs in chosen] for kind in OUTCOMES], dtype=bool)
+    return _Matrix(merits, outcomes, _draws(len(common)))
+
+
+def _seed_of(run: LayoutRun) -> int:
+    return run.seed
+
+
+def _draws(n: int) -> np.ndarray:
+    """(R, n) weights of bootstrap samples of n layouts."""
+    return np.random.default_rng(0).multinomial(n, np.full(n, 1.0 / n), size=RESAMPLES) / n
+
+
+def _ranks(merit: np.ndarray) -> np.ndarray:
+    """(K, n) rank of every method on every layout, 1 for the best; those that are equal share the mean of their ranks."""
+    from scipy.stats import rankdata  # here, as it takes longer to import than most commands take to answer
+
+    return np.asarray(rankdata(-merit, axis=0))
+
+
+def _share(kind: int) -> Callable[[_Matrix], np.ndarray]:
+    return lambda matrix: matrix.outcomes[kind].astype(float)
+
+
+def _weighted(
+    matrices: Mapping[str, _Matrix], weights: Mapping[str, float], values: Callable[[_Matrix], np.ndarray]
+) -> list[Estimate]:
+    """For each of K methods the weighted mean over missions of its mean (K, n) value over layouts, with its interval."""
+    totals, samples = [], []
+    for name, matrix in matrices.items():
+        value = values(matrix)
+        totals.append(weights[name] * value.mean(axis=1))
+        samples.append(weights[name] * (matrix.drawn @ value.T))
+    return [_estimate(*pair) for pair in zip(np.sum(totals, axis=0), np.sum(samples, axis=0).T, strict=True)]
+
+
+def _estimate(value: float, samples: np.ndarray) -> Estimate:
+    """A value and the percentile interval of its bootstrap samples."""
+    samples = np.sort(samples)
+    cut = round(len(samples) * (1.0 - LEVEL) / 2.0)
+    return Estimate(float(value), float(samples[cut]), float(samples[-1 - cut]))
+
+
+def _improvement(matrices: Mapping[str, _Matrix], weights: Mapping[str, float], k: int, against: int) -> Estimate:
+    """Mean over missions of :func:`improvement` of method k over method ``against``."""
+    pairs = {name: improvement(m.merit[k], m.merit[against], m.drawn) for name, m in matrices.items()}
+    value = sum(weights[name] * chance for name, (chance, _) in pairs.items())
+    return _estimate(value, np.sum([weights[name] * samples for name, (_, samples) in pairs.items()], axis=0))
+
+
+def improvement(x: np.ndarray, y: np.ndarray, drawn: np.ndarray) -> tuple[float, np.ndarray]:
+    """P(X > Y) + P(X = Y) / 2 over all pairs of runs (Mann and Whitney's U by n²), and its bootstrap samples.
+
+    Args:
+        x: (n,) merits of one method.
+        y: (n,) merits of the other on the same layouts.
+        drawn: (R, n) weights of the layouts in R samples.
+
+    Returns:
+        The probability, and (R,) probabilities of the samples.
+    """
+    order = np.argsort(y)
+    below, upto = (np.searchsorted(y[order], x, side) for side in ("left", "right"))
+
+    def chance(weights: np.ndarray) -> np.ndarray:
+        share = np.concatenate([np.zeros((len(weights), 1)), np.cumsum(weights[:, order], axis=1)], axis=1)
+        return np.asarray((weights * 0.5 * (share[:, below] + share[:, upto])).sum(axis=1))
+
+    return float(chance(np.full((1, len(x)), 1.0 / len(x)))[0]), chance(drawn)
+
+
+def _places(matrices: Mapping[str, _Matrix], k: int) -> tuple[frozenset[str], frozenset[str]]:
+    """Missions on which method k succeeds most often, and those where it is not significantly behind (paired bootstrap)."""
+    best, level = set(), set()
+    for name, matrix in matrices.items():
+        success = matrix.outcomes[OUTCOMES.index("success")]
+        shares = success.mean(axis=1)
+        first = int(np.argmax(shares))
+        if shares[first] == 0.0:
+            continue
+        if shares[k] == shares[first]:
+            best.add(name)
+        if name in best or not behind(success[k], success[first]):
+            level.add(name)
+    return frozenset(best), frozenset(level)
+
+
+def behind(x: np.ndarray, y: np.ndarray) -> bool:
+    """Whether x (n,) succeeds significantly less often than y on the same layouts: the 95 % interval of y - x is above 0."""
+    gap = bootstrap([np.asarray(y, dtype=float) - np.asarray(x, dtype=float)], mean)
+    return bool(gap.value > 0.0 and (np.isnan(gap.low) or gap.low > 0.0))
+
+
+class Notable(NamedTuple):
+    """One layout of a method that is worth a look."""
+
+    track: str
+    mission: str
+    method: Method
+    kind: str  # ``worst`` or ``median``
+    run: LayoutRun
+
+    @property
+    def clip(self) -> str:
+        """Path of its video, relative to the page."""
+        return f"clips/{self.track}-{self.method.key}-{self.kind}.mp4"
+
+
+def notable_layouts(group: Sequence[MissionRuns]) -> list[Notable]:
+    """The worst and the median layout of every method in every track, by success and then by return.
+
+    They are chosen among the runs that were finished: there is nothing to see of a method that could not start.
+    """
+    found = []
+    for track, method in dict.fromkeys((each.track, each.method) for each in group):
+        own = [each for each in group if (each.track, each.method) == (track, method)]
+        finished = [(each.mission, run) for each in own for run in each.runs if not run.failure]
+        finished.sort(key=lambda pair: by_return(pair[1]))
+        places = {"worst": 0, "median": len(finished) // 2} if finished else {}
+        found += [Notable(track, finished[place][0], method, kind, finished[place][1]) for kind, place in places.items()]
+    return found

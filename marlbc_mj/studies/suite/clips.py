@@ -1,0 +1,65 @@
+"""Videos of the layouts to look at: for every method of a track its worst one and its median one."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from marlbc_mj.controllers import CONTROLLERS, make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.recording.log import from_trajectory
+from marlbc_mj.recording.video import VideoStyle, render_video
+from marlbc_mj.results.layout_runs import Method, MissionRuns
+from marlbc_mj.results.standings import Notable, notable_layouts
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.studies.suite.definition import missions_of
+from marlbc_mj.studies.suite.entries import Entrant
+from marlbc_mj.studies.suite.flights import under
+from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
+from marlbc_mj.util.errors import MarlbcError
+from marlbc_mj.util.progress import Progress, silent
+
+CLIP_STYLE = VideoStyle(speed=8.0, width=640, height=360)
+
+
+def render_clips(
+    groups: Sequence[MissionRuns], flown: Mapping[Method, Entrant], folder: Path, progress: Progress = silent
+) -> list[str]:
+    """Fly the worst and the median layout of every method again and render them; what could not be rendered, a line each.
+
+    Args:
+        groups: all rows.
+        flown: how methods are made that a user's files define.
+        folder: of the page; clips go into ``clips`` below it.
+        progress: told how many clips are done.
+    """
+    problems, chosen = [], notable_layouts(groups)
+    for done, one in enumerate(chosen):
+        progress("clips", done, len(chosen))
+        try:
+            _render(one, flown.get(one.method) or _registered(one.method), folder)
+        except MarlbcError as error:
+            problems.append(f"no clip of {one.method.key} on {one.mission}: {error}")
+    progress("clips", len(chosen), len(chosen))
+    return list(dict.fromkeys(problems))
+
+
+def _registered(method: Method) -> Entrant | None:
+    """How a method is made by its names; None where they are no names of this package."""
+    known = method.supervisor in SUPERVISORS and method.controller in CONTROLLERS
+    return Entrant(method.supervisor, method.controller, method) if known else None
+
+
+def _render(one: Notable, entrant: Entrant | None, folder: Path) -> None:
+    """Write one clip; a method whose file is not known has none."""
+    if entrant is None:
+        return
+    law = make_controller(entrant.controller)
+    world = World(_scenario(one), law, record=True, shield=one.method.shield)
+    supervisor = make_supervisor(entrant.supervisor, entrant.controller)
+    trajectory = run_episode(world, supervisor, seed=one.run.seed, names=one.method[:2])
+    render_video(from_trajectory(trajectory, law), folder / one.clip, CLIP_STYLE, overwrite=True)
+
+
+def _scenario(one: Notable) -> Scenario:
+    mission = next(each for each in missions_of(one.track) if each.name == one.mission)
+    return under(mission.scenario, one.method.composition)

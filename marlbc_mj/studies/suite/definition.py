@@ -1,0 +1,265 @@
+"""Suite v1: which missions there are, on which layouts, and the hash that names it.
+
+No number of any supervisor, controller or law was chosen on these layouts: seeds begin at 80000, and layouts are of the split
+that no training draws. A change of any mission, by a default of a scenario for example, changes the hash and is another suite.
+"""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, NamedTuple
+
+from marlbc_mj.core.disturbances import LinearDrag
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.robots import make_robot
+from marlbc_mj.scenarios import Perturbation, Scenario, held_out, make_scenario, standard_behaviors
+from marlbc_mj.scenarios.base import YOUNG
+from marlbc_mj.scenarios.families import Field
+from marlbc_mj.scenarios.robot_gate import AIR_DRAG
+from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.provenance import plain_data
+
+VERSION = "v1"
+FROZEN = {
+    "paper": "8583da59a3fae4282a2aca626a4caf9b78f6e0209cd332f260464707e7b435a1",
+    "families": "477b9d37d5402b57e899dfb6b13095abfb1d8f8175f32f2b50946c342b5ab3f0",
+    "teams": "7735ddccf44e63efc97043ba84e72059f092549bda7e7d30dba3f02dc8c5882f",
+    "robots": "d3ac7afa6b168ba48d3b85c1fdce5ff5c70992aac189023cce4b84a73ba81aa9",
+    "control": "64d576ce57c397d24861a51c3818d726de894449972e0fa313d9c9ea70eb7828",
+}
+"""Hash of every track of this version."""
+SUITE_SEED = 80_000
+QUICK = 50
+"""Layouts of each mission in a quick run: the first of the whole suite's."""
+QUICK_TRACKS = ("paper", "families", "control")
+"""Tracks of a quick run where none are named: large teams and robots with wheels and rotors take most of the time."""
+HASH_DIGITS = 9
+"""Significant digits of numbers in the definition: the last bits of a sine differ between machines."""
+SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
+SUITE_TEAMS = (("circle", 8), ("line", 6), ("grid", 9), ("wedge", 16), ("grid", 32))
+TEAM_FAMILIES = ("field", "forest", "gates")
+ROOM: dict[int, dict[str, Any]] = {16: {"length": 120.0, "files": 2}, 32: {"length": 120.0, "files": 4}}
+"""A longer way and a shorter column for large teams: in one file they would never be through before the end."""
+OPENING = {16: 8.0, 32: 14.0}
+"""Width of the gates that a column of several files passes [m]."""
+DISC_DENSITY = 12 / 912.0
+"""Discs per square metre, as in the field of four agents."""
+SUITE_ROBOTS = ("disc", "omni", "diff_drive", "crazyflie")
+
+
+class SuiteMission(NamedTuple):
+    """One scenario, and the seeds that draw its layouts."""
+
+    track: str
+    name: str
+    scenario: Scenario
+    seeds: tuple[int, ...]
+
+
+class Track(NamedTuple):
+    """Missions that belong together, and the law that flies them."""
+
+    name: str
+    summary: str
+    missions: Callable[[], list[SuiteMission]]
+    controller: str | None  # the one that supervisors are compared under; None: controllers are compared
+    supervisor: str | None = None  # the one that controllers are compared under
+
+
+def _paper() -> list[SuiteMission]:
+    return [*_case_study("paper")]
+
+
+def _control() -> list[SuiteMission]:
+    return [*_case_study("control")]
+
+
+def _case_study(track: str) -> list[SuiteMission]:
+    """The published mission, and draws around it."""
+    published = make_scenario("paper")
+    drawn = replace(published, perturbation=CASE_STUDY_PERTURBATION)
+    return [
+        SuiteMission(track, f"{track}-published", published, seed_range(1, SUITE_SEED)),
+        SuiteMission(track, f"{track}-draws", drawn, seed_range(201, SUITE_SEED)),
+    ]
+
+
+def _families() -> list[SuiteMission]:
+    built = {name: make_scenario(name, agents=4, formation="wedge") for name in SUITE_FAMILIES}
+    return [SuiteMission("families", name, _unseen(each), seed_range(1000, SUITE_SEED)) for name, each in built.items()]
+
+
+def _teams() -> list[SuiteMission]:
+    return [
+        SuiteMission("teams", f"{formation}{agents}-{family}", _team(family, formation, agents), seed_range(200, SUITE_SEED))
+        for formation, agents in SUITE_TEAMS
+        for family in TEAM_FAMILIES
+    ]
+
+
+def _team(family: str, formation: str, agents: int) -> Scenario:
+    """A family for a team of this size, with as many discs on a square metre as the team of four has."""
+    changes = {"agents": agents, "formation": formation, **ROOM.get(agents, {})}
+    if family == "field":
+        wide = Field(**changes)
+        area = (wide.way[1] - wide.way[0]) * 2.0 * (wide.reach + wide.margin)
+        changes["obstacles"] = round(DISC_DENSITY * area)
+    if family == "gates" and agents in OPENING:
+        changes["width"] = OPENING[agents]
+    return _unseen(make_scenario(family, **changes))
+
+
+def _robots() -> list[SuiteMission]:
+    seeds = seed_range(200, SUITE_SEED)
+    gates = [SuiteMission("robots", f"gate-{robot}", gate_for(robot), seeds) for robot in SUITE_ROBOTS]
+    return [*gates, *(SuiteMission("robots", f"field-{robot}", field_for(robot), seeds) for robot in SUITE_ROBOTS)]
+
+
+def gate_for(robot: str) -> Scenario:
+    """The case study's gate at the robot's scale, with starts within 1 and obstacles within 0.5 of its length units."""
+    unit = make_robot(robot).length
+    return make_scenario("robot_gate", robot=robot, perturbation=Perturbation(unit, 0.5 * unit))
+
+
+def field_for(robot: str) -> Scenario:
+    """The field of discs at the robot's scale: lengths in its length units, speeds and gains that its limits allow.
+
+    Speed, gains and the distance at which avoidance begins are chosen as in :mod:`marlbc_mj.scenarios.robot_gate`.
+    """
+    body = make_robot(robot)
+    unit, speed = body.length, 0.4 * body.speed_limit
+    gain = 0.8 * body.acceleration_limit / body.speed_limit
+    avoid = unit + speed**2 / body.acceleration_limit + 0.3 * unit
+    scenario = make_scenario(
+        "field",
+        spacing=6.0 * unit,
+        column_spacing=3.0 * unit,
+        length=60.0 * unit,
+        speed=speed,
+        safe_distance=unit,
+        agent_distance=1.5 * unit,
+        formation_tolerance=0.5 * unit,
+        formation_gain=gain,
+        avoidance_gain=2.5 * gain,
+        obstacles=8,  # avoidance begins farther out than for a point mass, so fewer fit
+        radius=(unit, unit),  # solid bodies have one
+        margin=3.0 * unit,
+        gap=max(4.0 * unit, 2.2 * avoid),
+        disturbance=LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
+        **body.scale(),
+    )
+    slots, column = (tuple(map(tuple, rows.tolist())) for rows in scenario.formations)
+    behaviors = standard_behaviors(
+        slots,
+        column,
+        avoidance_gain=2.5 * gain,
+        formation_gain=gain,
+        safe_distance=avoid,
+        agent_distance=1.5 * unit,
+    )
+    return _unseen(replace(scenario, name=f"field-{robot}", behaviors=behaviors))
+
+
+def _unseen(scenario: Scenario) -> Scenario:
+    """The held-out layouts of a scenario that draws layouts; one that draws starts only is as new by its seeds."""
+    return scenario if scenario.layout is None else held_out(scenario)
+
+
+TRACKS = {
+    track.name: track
+    for track in (
+        Track("paper", "the published case study, and draws around it", _paper, "sorlc"),
+        Track("families", "missions drawn by seed, for a wedge of four", _families, "sorlc"),
+        Track("teams", "the same for other formations of 6 to 32", _teams, "sorlc"),
+        Track("robots", "a gate and a field, scaled to robots with contact, wheels and rotors", _robots, "pd"),
+        Track("control", "every controller under the schedule of the case study", _control, None, "scripted"),
+    )
+}
+"""All tracks by name."""
+
+
+@cache
+def missions_of(track: str) -> tuple[SuiteMission, ...]:
+    """All missions of a track.
+
+    Raises:
+        ConfigurationError: an unknown track.
+    """
+    if track not in TRACKS:
+        raise unknown("track", track, TRACKS)
+    return tuple(TRACKS[track].missions())
+
+
+def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layouts: int | None = None) -> list[SuiteMission]:
+    """Missions of the named tracks, all of them without names.
+
+    Args:
+        tracks: names; none: all.
+        names: of missions, to leave out others.
+        layouts: of each mission, the first so many.
+
+    Raises:
+        ConfigurationError: an unknown or repeated name, or fewer than one layout.
+    """
+    for kind, given in (("track", tracks), ("mission", names)):
+        if len(set(given)) != len(given):
+            raise ConfigurationError(f"a {kind} is named twice: {', '.join(given)}")
+    if layouts is not None and layouts < 1:
+        raise ConfigurationError(f"layouts must be at least 1, got {layouts}")
+    found = [mission for track in tracks or TRACKS for mission in missions_of(track)]
+    for name in names:
+        if name not in (mission.name for mission in found):
+            raise unknown("mission", name, (mission.name for mission in found))
+    return [mission._replace(seeds=mission.seeds[:layouts]) for mission in found if not names or mission.name in names]
+
+
+def suite_hash() -> str:
+    """The hash that names this version: of the hashes of its tracks."""
+    return _digest({"version": VERSION, "tracks": FROZEN})
+
+
+@cache
+def track_hash(name: str) -> str:
+    """Hash of a track, as it is in this code.
+
+    Raises:
+        ConfigurationError: an unknown track, or one that needs a package that is not installed.
+    """
+    missions = [
+        {"name": m.name, "seeds": [m.seeds[0], len(m.seeds)], "scenario": _canonical(m.scenario)} for m in missions_of(name)
+    ]
+    return _digest({"controller": TRACKS[name].controller, "supervisor": TRACKS[name].supervisor, "missions": missions})
+
+
+def _digest(content: Any) -> str:
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _canonical(scenario: Scenario) -> Any:
+    """A scenario as data, rounded, without fields that came later and do nothing at their defaults, and without prose."""
+    young = {f.name: f.default for f in scenario.__dataclass_fields__.values() if f.metadata == YOUNG}
+    left_out = {name for name, default in young.items() if getattr(scenario, name) == default} | {"description"}
+    data = {name: getattr(scenario, name) for name in scenario.__dataclass_fields__ if name not in left_out}
+    return _round(plain_data(data))
+
+
+def _round(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _round(entry) for key, entry in value.items()}
+    if isinstance(value, list):
+        return [_round(entry) for entry in value]
+    return f"{value:.{HASH_DIGITS}g}" if isinstance(value, float) else value
+
+
+def check_frozen(tracks: Sequence[str]) -> None:
+    """Raise ConfigurationError where a track of this code is not the frozen one."""
+    for name in tracks:
+        if track_hash(name) != FROZEN[name]:
+            raise ConfigurationError(
+                f"track {name} of suite {VERSION} is {FROZEN[name][:12]}, but this code's missions make {track_hash(name)[:12]}: "
+                "a default has changed; restore it, or give the suite another version"
+            )
