@@ -128,7 +128,7 @@ class Fickle:
 
     def sample(self, rng: np.random.Generator) -> Sample:
         x = rng.uniform(-1.0, 1.0)
-        if x < 0.0:
+        if x > 0.0:
             raise ConfigurationError(f"no layout for {x:.3f}")
         return Sample(np.array([[100.0, 100.0 + x, 1.0]]), np.zeros((0, 6)))
 
@@ -140,7 +140,7 @@ def test_draws_without_a_layout_are_named_and_the_others_flown() -> None:
     runs = evaluate_batch(scenario, range(10), "fixed")
     flown = [run.seed for run in runs if run.metrics is not None]
     assert flown == [seed for seed in range(10) if _has_layout(scenario, seed)] and 0 < len(flown) < 10
-    assert all("no layout for -" in str(run.failure) and run.instance is None for run in runs if run.metrics is None)
+    assert all("no layout for 0" in str(run.failure) and run.instance is None for run in runs if run.metrics is None)
 
 
 def _has_layout(scenario: Scenario, seed: int, world: int = 0) -> bool:
