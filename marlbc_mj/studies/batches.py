@@ -31,7 +31,7 @@ from marlbc_mj.util.seeding import stream
 
 MOST_TOGETHER = 32
 """Draws that are flown together: more would share the cost of a call, which is small by then, with no gain."""
-MEMORY = 128e6
+MOST_BYTES = 128e6
 """Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
 
 
@@ -90,7 +90,7 @@ def evaluate_batch(
 def draws_together(scenario: Scenario) -> int:
     """How many draws of a scenario are flown at once."""
     each = 8 * 2 * len(Record._fields) * scenario.agents * scenario.substeps * scenario.mission_steps  # bytes of doubles
-    return max(1, min(MOST_TOGETHER, int(MEMORY // each)))
+    return max(1, min(MOST_TOGETHER, int(MOST_BYTES // each)))
 
 
 def fly_together(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:

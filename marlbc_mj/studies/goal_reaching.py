@@ -28,12 +28,12 @@ from marlbc_mj.supervisors import make_supervisor
 
 AGENTS, BOXES = 8, 8
 SIDE = 40.0  # of the square [m]
-RADIUS = 0.5  # of an agent [m]
-APART = 4.0 * RADIUS  # of starts from each other and from rectangles; goals likewise [m]
+AGENT_RADIUS = 0.5  # of an agent [m]
+LEAST_GAP = 4.0 * AGENT_RADIUS  # of starts from each other and from rectangles; goals likewise [m]
 SIDES = (1.0, 5.0)  # of a rectangle [m]
 STEP = 0.03  # [s]
 HORIZONS = (256, 1024)  # steps
-DISC = 0.25  # radius of the discs inside a rectangle that make its edge, before they are made to cover it [m]
+EDGE_DISC = 0.25  # radius of the discs inside a rectangle that make its edge, before they are made to cover it [m]
 
 
 class Box(NamedTuple):
@@ -51,13 +51,13 @@ class Box(NamedTuple):
 
     def discs(self) -> list[Obstacle]:
         """Discs along its edge that cover it but for its inside, where nobody gets."""
-        inner = self.half - DISC
-        sides = [np.linspace(-half, half, int(np.ceil(2.0 * half / DISC)) + 1) for half in inner]
+        inner = self.half - EDGE_DISC
+        sides = [np.linspace(-half, half, int(np.ceil(2.0 * half / EDGE_DISC)) + 1) for half in inner]
         long = [(x, sign * inner[1]) for x in sides[0] for sign in (-1.0, 1.0)]
         short = [(sign * inner[0], y) for y in sides[1][1:-1] for sign in (-1.0, 1.0)]
         cosine, sine = np.cos(self.angle), np.sin(self.angle)
         places = np.array([*long, *short]) @ np.array([[cosine, sine], [-sine, cosine]]) + self.middle
-        return [Obstacle(float(x), float(y), float(np.sqrt(2.0) * DISC)) for x, y in places]
+        return [Obstacle(float(x), float(y), float(np.sqrt(2.0) * EDGE_DISC)) for x, y in places]
 
 
 class GoalDraw(NamedTuple):
@@ -87,12 +87,12 @@ def draw_goals(rng: np.random.Generator) -> GoalDraw:
 
 
 def _places(rng: np.random.Generator, boxes: tuple[Box, ...]) -> np.ndarray:
-    """(N, 2) places, each at least APART from the others and from all rectangles."""
+    """(N, 2) places, each at least LEAST_GAP from the others and from all rectangles."""
     found: list[np.ndarray] = []
     while len(found) < AGENTS:
         place = rng.uniform(0.0, SIDE, 2)
         others = [float(np.linalg.norm(place - other)) for other in found]
-        if min([*others, *(float(box.distance(place)) for box in boxes)]) > APART:
+        if min([*others, *(float(box.distance(place)) for box in boxes)]) > LEAST_GAP:
             found.append(place)
     return np.array(found)
 
@@ -104,10 +104,12 @@ def goal_scenario(drawn: GoalDraw) -> Scenario:
     return Scenario(
         name="goals",
         starts=points(drawn.starts),
-        behaviors=standard_behaviors(slots, slots, formation_gain=2.0, safe_distance=RADIUS, agent_distance=2.0 * RADIUS),
+        behaviors=standard_behaviors(
+            slots, slots, formation_gain=2.0, safe_distance=AGENT_RADIUS, agent_distance=2.0 * AGENT_RADIUS
+        ),
         path_origin=points(middle[None])[0],
         obstacles=tuple(disc for box in drawn.boxes for disc in box.discs()),
-        safe_distance=RADIUS,
+        safe_distance=AGENT_RADIUS,
         duration=STEP * max(HORIZONS),
         mission_step=STEP,
         force_limit=100.0,
@@ -122,10 +124,10 @@ def fly_to_goals(seed: int, supervisor: str = "fixed", *, shield: bool = True) -
     drawn = draw_goals(np.random.default_rng(seed))
     world = World(goal_scenario(drawn), record=True, shield=shield)
     at = run_episode(world, make_supervisor(supervisor)).position[:: world.scenario.substeps]
-    near = np.linalg.norm(at - drawn.goals, axis=-1) < 2.0 * RADIUS
-    touched = np.min([box.distance(at) for box in drawn.boxes], axis=0) < RADIUS
+    near = np.linalg.norm(at - drawn.goals, axis=-1) < 2.0 * AGENT_RADIUS
+    touched = np.min([box.distance(at) for box in drawn.boxes], axis=0) < AGENT_RADIUS
     between = np.linalg.norm(at[:, :, None] - at[:, None], axis=-1) + np.diag(np.full(AGENTS, np.inf))
-    touched |= (between < 2.0 * RADIUS).any(axis=-1)
+    touched |= (between < 2.0 * AGENT_RADIUS).any(axis=-1)
     return _first(near), _first(touched)
 
 
