@@ -14,7 +14,7 @@ from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.seeds import SeedRun
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario, paper
 from marlbc_mj.scenarios.layout import Sample
-from marlbc_mj.studies.batches import MOST_BYTES, MOST_TOGETHER, Entry, draws_together, evaluate_batch, fly_together
+from marlbc_mj.studies.batches import RECORD_BYTES, MOST_TOGETHER, Entry, draws_together, evaluate_batch, fly_together
 from marlbc_mj.studies.draws import perturbed
 from marlbc_mj.supervisors import Blend, FixedPriority, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -78,7 +78,7 @@ def test_the_number_of_draws_together_is_bounded_by_memory() -> None:
     assert draws_together(make_scenario("field", duration=1.0)) == MOST_TOGETHER
     assert draws_together(make_scenario("field", agents=256, length=2000.0, formation="grid")) == 1
     each = 80 * 4 * 10 * 1200
-    assert draws_together(make_scenario("field")) == min(MOST_TOGETHER, int(MOST_BYTES // each))
+    assert draws_together(make_scenario("field")) == min(MOST_TOGETHER, int(RECORD_BYTES // each))
 
 
 # What fails ---------------------------------------------------------------------------------------------------------------------

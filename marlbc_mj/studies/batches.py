@@ -8,7 +8,7 @@ together, shared out evenly.
 from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,7 +31,7 @@ from marlbc_mj.util.seeding import stream
 
 MOST_TOGETHER = 32
 """Draws that are flown together: more would share the cost of a call, which is small by then, with no gain."""
-MOST_BYTES = 128e6
+RECORD_BYTES = 128e6
 """Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
 
 
@@ -69,8 +69,8 @@ def evaluate_batch(
     Raises:
         ConfigurationError: unknown names, or a composition that the scenario cannot have.
     """
-    if composition is not None:
-        scenario = replace(scenario, composition=composition)
+    changes: dict[str, Any] = {} if composition is None else {"composition": composition}
+    scenario = replace(scenario, **changes)
     entry = Entry(
         scenario, make_supervisor(supervisor, controller), make_controller(controller), (supervisor, controller), shield
     )
@@ -90,7 +90,7 @@ def evaluate_batch(
 def draws_together(scenario: Scenario) -> int:
     """How many draws of a scenario are flown at once."""
     each = 8 * 2 * len(Record._fields) * scenario.agents * scenario.substeps * scenario.mission_steps  # bytes of doubles
-    return max(1, min(MOST_TOGETHER, int(MOST_BYTES // each)))
+    return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
 
 
 def fly_together(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:

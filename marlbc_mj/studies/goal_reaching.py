@@ -140,7 +140,9 @@ def goal_shares(ends: list[tuple[np.ndarray, np.ndarray]], steps: int) -> GoalSh
     """Shares of what :func:`fly_to_goals` gave, within a number of steps."""
     reached, touched = (np.array(rows) <= steps for rows in zip(*ends, strict=True))
     success = reached & ~touched
-    return GoalShares(steps, rate(reached.ravel()), rate(~touched.ravel()), rate(success.ravel()), rate(success.all(axis=1)))
+    return GoalShares(
+        steps, rate(reached.ravel()), rate(~touched.ravel()), rate(success.ravel()), rate(np.asarray(success.all(axis=1)))
+    )
 
 
 def report_goals() -> None:

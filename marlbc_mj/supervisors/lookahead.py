@@ -97,7 +97,7 @@ def blocked_lanes(observation: Observation, lanes: Lanes, span: np.ndarray | tup
     """
     blocked = np.zeros(observation.position.shape[:2], dtype=np.bool_)
     obstacles = np.ascontiguousarray(observation.obstacles)
-    spans = np.ascontiguousarray(np.broadcast_to(np.asarray(span, dtype=np.float64), (blocked.shape[1], 2)))
+    spans = np.ascontiguousarray(np.broadcast_to(np.asarray(span, dtype=np.float64), (len(lanes.slots), 2)))
     _fill_blocked(observation.time, lanes.slots, lanes.path, lanes.safe_distance, spans, obstacles, blocked)
     return blocked
 
