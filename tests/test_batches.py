@@ -14,7 +14,7 @@ from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.seeds import SeedRun
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario, paper
 from marlbc_mj.scenarios.layout import Sample
-from marlbc_mj.studies.batches import RECORD_BYTES, MOST_TOGETHER, Entry, draws_together, evaluate_batch, fly_together
+from marlbc_mj.studies.batches import MOST_TOGETHER, RECORD_BYTES, Entry, draws_together, evaluate_batch, fly_together
 from marlbc_mj.studies.draws import perturbed
 from marlbc_mj.supervisors import Blend, FixedPriority, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
