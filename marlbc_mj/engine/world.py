@@ -82,6 +82,7 @@ class World:
         self.data = [mujoco.MjData(self.plan.model) for _ in range(worlds)]
         self._record = team.make_record(self.plan, worlds, record)
         self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
+        self._returns = np.zeros(worlds)
         self._arguments = self._make_arguments()
         self.reset()
 
@@ -226,14 +227,14 @@ class World:
             raise ConfigurationError(f"orders must have shape (steps, worlds, agents), got {sequence.shape}")
         sequence = np.stack([self._checked(row) for row in sequence])
         returns = np.zeros(self.worlds)
-        run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
-        run(returns, sequence, self._orders_alone, self._arguments)
+        self._play(returns, sequence, self._orders_alone)
         self.raise_if_diverged()
         return returns
 
-    def _serial(self) -> bool:
-        """Whether one thread does it all; otherwise numba has been told how many there are."""
-        return bool(self.worlds == 1 or not threads_usable(self.threads))
+    def _play(self, returns: np.ndarray, sequence: np.ndarray, given: np.ndarray) -> int:
+        """The compiled loop, on one thread or on several; how many worlds failed."""
+        run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
+        return int(run(returns, sequence, given, self._arguments))
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
@@ -247,8 +248,7 @@ class World:
         """
         given = self._orders_alone if velocity is None else velocity
         if self.native:
-            run = drivers.step_serial if self._serial() else drivers.step_parallel
-            return int(run(orders, given, self._arguments))
+            return self._play(self._returns, orders[np.newaxis], given)
         mission_step = laws.plain(loop.mission_step)
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
