@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
+from marlbc_mj.results.layouts import Cell, CellScores, LayoutMark, Marks
 from marlbc_mj.results.outcomes import FAILED_MISSION, MissionOutcome
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
@@ -18,10 +19,6 @@ from marlbc_mj.studies.safety import (
     OWN,
     SEARCHES,
     VELOCITY_GIVERS,
-    Cell,
-    CellScores,
-    LayoutMark,
-    Marks,
     SafetyStudy,
     ground,
 )
