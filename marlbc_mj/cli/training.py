@@ -75,8 +75,9 @@ class TrainCommand:
 
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""
-        from marlbc_mj.training.config import make_config, with_settings
+        from marlbc_mj.training.config import make_config
         from marlbc_mj.training.methods import METHODS
+        from marlbc_mj.util.changes import with_settings
 
         if self.method not in METHODS:
             raise unknown("method", self.method, METHODS)
