@@ -31,7 +31,18 @@ GROUNDS = ("field", "forest", "gates", "corridor", "traffic")
 DRAG_DRAWS = {"paper-drag-0": (0.0, 0), "paper-drag-2": (2.0, 67), "paper-drag-5": (5.0, 134)}
 """Draws around the case study: the factor of the drag and the first seed of each."""
 DRAWS_EACH = 67
-ORDER_GIVERS = ("fixed", "scripted", "fsams", "fsams-hysteresis", "fms", "set-based-rule", "lookahead", "mpcms", "rollout")
+ORDER_GIVERS = (
+    "fixed",
+    "scripted",
+    "fsams",
+    "fsams-hysteresis",
+    "fms",
+    "set-based-rule",
+    "lookahead",
+    "lookahead-distributed",
+    "mpcms",
+    "rollout",
+)
 """Supervisors whose orders are composed, under either composition."""
 VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 """Supervisors that give velocities, so that the composition does not matter."""

@@ -1,13 +1,14 @@
-"""Look ahead: the column while the formation's own lanes are blocked and the column's is not, else the formation (project).
+"""Look ahead: the column while the formation's own lanes are blocked, else the formation (project).
 
 A *lane* is the way of a slot along the path. It is blocked while the slot, moved along the path from ``behind`` ago until
 ``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the
-column while at least ``blocked`` lanes of the formation are blocked, since one agent can go around and several cannot at once,
-and the column's own lanes are free: where they are not, the column helps nobody.
+column while at least ``blocked`` lanes of the formation are blocked: one agent can go around, several cannot at once.
 
-In the column it stays while at least ``blocked`` agents are *shut in*: the straight way from an agent's place in the column to
-its slot comes within the safe distance of an obstacle, now or within ``change``. So nobody opens up between the walls of a
-passage, where lanes beside the walls are free. Under the set-based composition an agent would wait there; under (12) it violates.
+That says nothing of the column, nor of the way back from it: beside the walls of a passage, and behind its end, lanes are free
+while agents are still between the walls. Under the set-based composition these wait there. Under (12) they cross, and violate
+(corridor: 0 of 40 layouts). So under (12) two conditions are added. No column is formed whose own lanes are blocked, since it
+helps nobody. And it stays while at least ``blocked`` agents are *shut in*: the straight way from an agent's place in the column
+to its slot comes within the safe distance of an obstacle, now or within ``change``.
 
 The order in which an agent avoids comes from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published
 composition FM and FR alone would run into whatever is in the way. Under the set-based composition it is FM or FR alone.
@@ -22,7 +23,14 @@ from marlbc_mj.core.laws import compiled
 from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.set_based_rule import IN_COLUMN, IN_FORMATION, LocalRule, make_local_rule, rule_orders
+from marlbc_mj.supervisors.set_based_rule import (
+    IN_COLUMN,
+    IN_FORMATION,
+    LocalRule,
+    avoids_by_itself,
+    make_local_rule,
+    rule_orders,
+)
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -35,11 +43,12 @@ class Lanes(NamedTuple):
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
     safe_distance: float  # d_OA [m]
     rule: LocalRule
+    exposed: bool  # whether orders lead into obstacles: the composition does not avoid by itself
 
 
 @dataclass(frozen=True)
 class LookAhead:
-    """FR while FM's lanes are blocked and FR's are not, else FM; see the module.
+    """FR while at least ``blocked`` lanes are blocked, else FM; see the module.
 
     Raises:
         ConfigurationError: a time or a margin that is negative or not finite, or a number of lanes below 1.
@@ -67,16 +76,22 @@ class LookAhead:
         """
         rule = make_local_rule(scenario, self.margin)
         slots, column = map(np.ascontiguousarray, scenario.formations)
-        return Lanes(np.full(teams, IN_FORMATION), slots, column, rule.behaviors.path, float(scenario.safe_distance), rule)
+        fixed = (slots, column, rule.behaviors.path, float(scenario.safe_distance), rule, not avoids_by_itself(scenario))
+        return Lanes(np.full(teams, IN_FORMATION), *fixed)
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
         """One motion per team, avoidance per agent."""
-        blocked = blocked_lanes(observation, memory, (-self.behind, self.ahead))
-        narrow = blocked_lanes(observation, memory._replace(slots=memory.column), (0.0, self.ahead))
-        wanted = (blocked.sum(axis=1) >= self.blocked) & ~narrow.any(axis=1)
-        kept = (memory.motion == IN_COLUMN) & (shut_in(observation, memory, self.change).sum(axis=1) >= self.blocked)
-        motion = np.where(wanted | kept, IN_COLUMN, IN_FORMATION)
+        column = self._in_way(blocked_lanes(observation, memory, (-self.behind, self.ahead)))
+        if memory.exposed:
+            narrow = blocked_lanes(observation, memory._replace(slots=memory.column), (0.0, self.ahead)).any(axis=1)
+            stays = (memory.motion == IN_COLUMN) & self._in_way(shut_in(observation, memory, self.change))
+            column = (column & ~narrow) | stays
+        motion = np.where(column, IN_COLUMN, IN_FORMATION)
         return rule_orders(observation, motion, memory.rule), memory._replace(motion=motion)
+
+    def _in_way(self, blocked: np.ndarray) -> np.ndarray:
+        """(B,) bool: whether too many of ``blocked`` (B, N) are."""
+        return np.asarray(blocked.sum(axis=1) >= self.blocked)
 
 
 def blocked_lanes(observation: Observation, lanes: Lanes, span: tuple[float, float]) -> np.ndarray:
