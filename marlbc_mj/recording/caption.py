@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from marlbc_mj.recording.log import EpisodeLog
-from marlbc_mj.util.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, command_color, ink_on
+from marlbc_mj.util.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, SHIELD_COLOR, command_color, ink_on
 
 FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
 HEADER, FOOTER = 48, 80  # heights of the bars
@@ -199,10 +199,10 @@ def _draw_footer(pen: Pen, log: EpisodeLog, commands: Sequence[str], formation: 
         pen.pill(_spelled(command), 28, 14, command_color(command), width=widest, gap=gap)
     pen.x = pen.width - 24 - pen.length(state, 15, True)
     pen.text(state, 28, 15, INK, bold=True)
-    _draw_legend(pen, list(dict.fromkeys(b for name in log.commands for b in name.split(">"))))
+    _draw_legend(pen, list(dict.fromkeys(b for name in log.commands for b in name.split(">"))), log.shield.shape[1] > 0)
 
 
-def _draw_legend(pen: Pen, behaviors: Sequence[str]) -> None:
+def _draw_legend(pen: Pen, behaviors: Sequence[str], shielded: bool) -> None:
     pen.x = 24.0
     for behavior in behaviors:
         pen.dot(60, 6, command_color(behavior), gap=8)
@@ -211,7 +211,10 @@ def _draw_legend(pen: Pen, behaviors: Sequence[str]) -> None:
     pen.dashes(60, SAFE_DISTANCE_COLOR, gap=8)
     pen.text("safe distance", 60, 13, MUTED, gap=24)
     pen.dot(60, 4, GHOST_COLOR, gap=8)
-    pen.text("reference", 60, 13, MUTED)
+    pen.text("reference", 60, 13, MUTED, gap=24)
+    if shielded:
+        pen.dot(60, 6, SHIELD_COLOR, gap=8)
+        pen.text("shield acts", 60, 13, MUTED)
 
 
 def _spelled(command: str) -> str:

@@ -14,7 +14,7 @@ from marlbc_mj.recording.links import links_of_log
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, flat_disc, make_trail, ribbon
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
+from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, SHIELD_COLOR, agent_color, command_color, rgba
 from marlbc_mj.util.text import one_line
 
 BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
@@ -58,6 +58,10 @@ class Stage:
     def commands(self, time: float) -> list[str]:
         """Every agent's command at ``time`` [s], "OA>FM" for example."""
         return [self.log.commands[k] for k in self.log.command[self.step(time)]]
+
+    def shielded(self, time: float) -> list[int]:
+        """Agents whose shield changes what they do in the mission step of ``time`` [s]."""
+        return [int(i) for i in np.flatnonzero(self.log.intervened(self.step(time)))]
 
     def pose(self, time: float) -> None:
         """Move the model's agents and obstacles to where they are at ``time`` [s]."""
@@ -104,12 +108,12 @@ class Stage:
         ]
 
     def _agents(self, time: float) -> list[Mark]:
-        """Halos in the color of the command, and the references as ghosts."""
+        """Halos in the color of the command, their rims in the shield's where it acts, and the references as ghosts."""
         position, reference = (self.sample(v, time) for v in (self.log.position, self.log.reference))
-        marks, unit = [], self.scale
+        marks, unit, shielded = [], self.scale, self.shielded(time)
         for i, command in enumerate(self.commands(time)):
-            radius = float(self.radii[i])
-            marks.append(flat_disc(position[i], HALO * radius, 0.06 * unit, rgba("#FFFFFF"), unit))
+            radius, rim = float(self.radii[i]), SHIELD_COLOR if i in shielded else "#FFFFFF"
+            marks.append(flat_disc(position[i], HALO * radius, 0.06 * unit, rgba(rim), unit))
             marks.append(flat_disc(position[i], (HALO - RIM) * radius, 0.09 * unit, rgba(command_color(command)), unit))
             far = bool(np.hypot(*(reference[i] - position[i])) > radius)
             if far:

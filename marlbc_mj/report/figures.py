@@ -41,7 +41,8 @@ _FORCES = (
 )
 _PARETO = (
     "Control cost against what it buys. Colors are supervisors, shapes are controllers. Formation error: mean distance of an "
-    "agent from its slot in the first formation, relative to the centroid [m]. Dashed: LQR, whose gains minimise the paper's cost in regulation."
+    "agent from its slot in the first formation, relative to the centroid [m]. Dashed: LQR, whose gains minimise the cost of the "
+    "paper in regulation."
 )
 _CONTROL = (
     "with each framework's controller, below around the largest of them all. One scale: linear up to SORLC's limit (dashed), "
