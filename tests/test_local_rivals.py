@@ -183,11 +183,11 @@ def test_no_column_where_its_own_lane_is_blocked():
     assert orders_of(LookAhead(), seen(OPEN, closed)) == [FM] * 4
 
 
-@pytest.mark.parametrize(("end", "opens"), [(3.0, False), (-2.0, False), (-9.0, True)])
+@pytest.mark.parametrize(("end", "opens"), [(3.0, False), (-2.0, False), (-5.0, False), (-9.0, True)])
 def test_nobody_opens_up_between_walls(end, opens):
     """Two rows of discs from behind to ``end``, beside all lanes and across the way to the outer slots.
 
-    From the formation nothing is blocked. The column stays until the last but one of those who have to cross is out.
+    From the formation nothing is blocked. The column stays until the last one is out.
     """
     rows = [(x, side * 4.25, 1.0) for x in np.arange(-20.0, end + 0.1, 1.0) for side in (-1.0, 1.0)]
     supervisor, now = LookAhead(), seen(OPEN, rows, at=OPEN.formations[1])

@@ -7,8 +7,8 @@ column while at least ``blocked`` lanes of the formation are blocked: one agent 
 That says nothing of the column, nor of the way back from it: beside the walls of a passage, and behind its end, lanes are free
 while agents are still between the walls. Under the set-based composition these wait there. Under (12) they cross, and violate
 (corridor: 0 of 40 layouts). So under (12) two conditions are added. No column is formed whose own lanes are blocked, since it
-helps nobody. And it stays while at least ``blocked`` agents are *shut in*: the straight way from an agent's place in the column
-to its slot comes within the safe distance of an obstacle, now or within ``change``.
+helps nobody. And it stays while anybody is *shut in*: the straight way from an agent's place in the column to its slot comes
+within the safe distance of an obstacle, now or within ``change``.
 
 The order in which an agent avoids comes from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published
 composition FM and FR alone would run into whatever is in the way. Under the set-based composition it is FM or FR alone.
@@ -81,17 +81,13 @@ class LookAhead:
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
         """One motion per team, avoidance per agent."""
-        column = self._in_way(blocked_lanes(observation, memory, (-self.behind, self.ahead)))
+        column = blocked_lanes(observation, memory, (-self.behind, self.ahead)).sum(axis=1) >= self.blocked
         if memory.exposed:
             narrow = blocked_lanes(observation, memory._replace(slots=memory.column), (0.0, self.ahead)).any(axis=1)
-            stays = (memory.motion == IN_COLUMN) & self._in_way(shut_in(observation, memory, self.change))
+            stays = (memory.motion == IN_COLUMN) & shut_in(observation, memory, self.change).any(axis=1)
             column = (column & ~narrow) | stays
         motion = np.where(column, IN_COLUMN, IN_FORMATION)
         return rule_orders(observation, motion, memory.rule), memory._replace(motion=motion)
-
-    def _in_way(self, blocked: np.ndarray) -> np.ndarray:
-        """(B,) bool: whether too many of ``blocked`` (B, N) are."""
-        return np.asarray(blocked.sum(axis=1) >= self.blocked)
 
 
 def blocked_lanes(observation: Observation, lanes: Lanes, span: tuple[float, float]) -> np.ndarray:
