@@ -21,7 +21,8 @@ BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in
 BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
 RIM = 0.14  # width of the white rim around it, in drawn radii
-LINK_WIDTH, LINK_HEIGHT = 0.16, 0.058  # of the strip between two agents that hear each other, above trails and below halos [m]
+LINK_WIDTH = 0.13  # of the strip between two agents that hear each other [m]
+LINK_HEIGHT = 0.5  # of that strip, in drawn radii of the first: above the trails
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
 
 
@@ -101,9 +102,8 @@ class Stage:
         if not self.log.link.shape[1]:
             return []
         here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
-        size = LINK_WIDTH * self.scale, LINK_HEIGHT * self.scale
         return [
-            ribbon(here[i], here[j], *size, tuple(color), self.scale)
+            ribbon(here[i], here[j], LINK_WIDTH * self.scale, LINK_HEIGHT * self.radii[i], tuple(color), self.scale)
             for (i, j), color in zip(links.ends.tolist(), links.colors().tolist(), strict=True)
         ]
 

@@ -22,7 +22,7 @@ from marlbc_mj.studies.draws import DrawsJob, fly_draws
 from marlbc_mj.studies.episodes import check_free
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.supervisors.communication import Consensus, Flooding, Radio
+from marlbc_mj.supervisors.communication import Consensus, Flooding, Layer, Radio
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
@@ -168,7 +168,7 @@ def time_to_agree(place: np.ndarray, settings: Communication, seed: int = 0) -> 
     Under flooding everyone must know all places, under consensus everyone's estimate of their mean must be within ``AGREED``.
     """
     radio = Radio(settings, len(place), RATE)
-    layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
+    layer: Layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
     memory, mean = layer.start(1, 2), place.mean(axis=0)
     for k in range(PATIENCE):
         (heard, stamp), memory = layer.exchange(np.array([k * RATE]), place[None], place[None], memory, np.array([seed]))
