@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.results.layouts import Cell, CellScores, LayoutMark, Marks
+from marlbc_mj.results.layouts import CellScores, LayoutMark, Marks, MissionCell
 from marlbc_mj.results.outcomes import FAILED_MISSION, MissionOutcome
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
@@ -25,7 +25,7 @@ from marlbc_mj.studies.safety import (
 from marlbc_mj.util.errors import ConfigurationError
 
 GOOD = MissionOutcome(reached=True, violated=False, struck=False, collided=False)
-CELL = Cell("field", "set-based", False, "fixed")
+CELL = MissionCell("field", "set-based", False, "fixed")
 
 
 def test_every_layout_of_every_cell_is_in_one_job() -> None:

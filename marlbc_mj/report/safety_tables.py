@@ -9,13 +9,15 @@ import numpy as np
 
 from marlbc_mj.report.formats import DASH, fixed, interval, percent, significant
 from marlbc_mj.report.table import Column, Table
-from marlbc_mj.results.layouts import Cell, CellScores
+from marlbc_mj.results.layouts import CellScores, MissionCell
 from marlbc_mj.results.statistics import Estimate
 
 
 def write_cells(rows: Sequence[CellScores], path: Path) -> None:
     """A line per cell: shares in [0, 1] and medians, intervals beside them; empty where there is no number."""
-    columns: list[tuple[str, list[str]]] = [(name, [str(row.cell[k]) for row in rows]) for k, name in enumerate(Cell._fields)]
+    columns: list[tuple[str, list[str]]] = [
+        (name, [str(row.cell[k]) for row in rows]) for k, name in enumerate(MissionCell._fields)
+    ]
     for name in CellScores._fields[1:]:
         values = [getattr(row, name) for row in rows]
         if rows and isinstance(values[0], Estimate):

@@ -15,7 +15,7 @@ from marlbc_mj.results.statistics import Estimate, bootstrap, rate
 from marlbc_mj.scenarios import Scenario
 
 
-class Cell(NamedTuple):
+class MissionCell(NamedTuple):
     """One supervisor on one mission."""
 
     mission: str
@@ -54,7 +54,7 @@ def mark(run: SeedRun, scenario: Scenario) -> LayoutMark:
 class Marks(NamedTuple):
     """The result of a job."""
 
-    cell: Cell
+    cell: MissionCell
     layouts: tuple[LayoutMark, ...]
     decision_ms: float  # median of the first layout flown alone: what one team takes for a decision [ms]
 
@@ -62,7 +62,7 @@ class Marks(NamedTuple):
 class CellScores(NamedTuple):
     """What a table says of a cell. Rates count a failure against the supervisor, medians leave it out."""
 
-    cell: Cell
+    cell: MissionCell
     layouts: int
     failed: int
     success: Estimate
@@ -78,7 +78,7 @@ class CellScores(NamedTuple):
     reason: str  # of the first failure
 
     @classmethod
-    def of(cls, cell: Cell, parts: Sequence[Marks]) -> "CellScores":
+    def of(cls, cell: MissionCell, parts: Sequence[Marks]) -> "CellScores":
         """From the jobs of one cell."""
         layouts = [layout for part in parts for layout in part.layouts]
         flown = [layout for layout in layouts if not layout.failure]

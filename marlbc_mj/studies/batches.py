@@ -81,7 +81,7 @@ def evaluate_batch(
     runs: list[SeedRun] = []
     together = draws_together(scenario)
     for first in range(0, len(seeds), together):
-        for run in fly_together(entry, seeds[first : first + together]):
+        for run in fly_side_by_side(entry, seeds[first : first + together]):
             runs.append(run)
             progress(method_key(*entry.names), len(runs), len(seeds))
     return tuple(runs)
@@ -93,7 +93,7 @@ def draws_together(scenario: Scenario) -> int:
     return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
 
 
-def fly_together(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
+def fly_side_by_side(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
     """One run per seed, all flown at once.
 
     A supervisor that raises does not say on which draw. Then the draws are flown in halves, until it is known.
@@ -106,7 +106,7 @@ def fly_together(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
         if len(seeds) == 1:
             return [SeedRun(seeds[0], None if flight is None else flight.instances[0], failure=str(error))]
         half = len(seeds) // 2
-        return [*fly_together(entry, seeds[:half]), *fly_together(entry, seeds[half:])]
+        return [*fly_side_by_side(entry, seeds[:half]), *fly_side_by_side(entry, seeds[half:])]
     return [flight.measured(b) for b in range(len(seeds))]
 
 

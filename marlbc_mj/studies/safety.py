@@ -13,7 +13,7 @@ import numpy as np
 
 from marlbc_mj.report.safety_tables import safety_tables, write_cells
 from marlbc_mj.report.table import to_markdown
-from marlbc_mj.results.layouts import Cell, CellScores, Marks, mark
+from marlbc_mj.results.layouts import CellScores, Marks, MissionCell, mark
 from marlbc_mj.results.seeds import SeedRun
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
@@ -56,7 +56,7 @@ FIRST_SEED = 70_000
 class SafetyJob(NamedTuple):
     """A cell on some seeds."""
 
-    cell: Cell
+    cell: MissionCell
     controller: str
     seeds: tuple[int, ...]
 
@@ -96,10 +96,10 @@ class SafetyStudy:
         for mission in self.missions:
             ground(mission)
 
-    def cells(self) -> list[Cell]:
+    def cells(self) -> list[MissionCell]:
         """All cells, mission by mission; a supervisor that gives velocities has one composition."""
         return [
-            Cell(mission, composition, shield, supervisor)
+            MissionCell(mission, composition, shield, supervisor)
             for mission in self.missions
             for composition in (*self.compositions, OWN)
             for supervisor in self.supervisors
@@ -115,7 +115,7 @@ class SafetyStudy:
             for first in range(0, len(seeds), SEEDS_PER_JOB)
         ]
 
-    def _seeds(self, cell: Cell) -> tuple[int, ...]:
+    def _seeds(self, cell: MissionCell) -> tuple[int, ...]:
         count = min(self.layouts, self.searched) if cell.supervisor in SEARCHES else self.layouts
         first = self.seed
         if cell.mission in DRAG_DRAWS:
