@@ -118,10 +118,18 @@ class World:
         if mask is not None and np.asarray(mask).dtype != np.bool_:
             raise ConfigurationError(f"mask must be bool, got {np.asarray(mask).dtype}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
-            starts = team.reset(self.plan, self.state, int(b), stream(seed, int(b)))
-            mujoco.mj_resetData(self.plan.model, self.data[b])
-            team.put(self.plan, self.state, int(b), self.data[b], starts, np.zeros_like(starts))
+            self.begin(int(b), stream(seed, int(b)))
         return self.observe()
+
+    def begin(self, b: int, rng: np.random.Generator) -> None:
+        """Start an episode drawn with ``rng`` in world ``b`` alone; ``stream(s)`` draws what one world alone does under seed s.
+
+        Raises:
+            ConfigurationError: nothing can be flown for this draw; the world is as it was.
+        """
+        starts = team.reset(self.plan, self.state, b, rng)
+        mujoco.mj_resetData(self.plan.model, self.data[b])
+        team.put(self.plan, self.state, b, self.data[b], starts, np.zeros_like(starts))
 
     def copy_world(self, source: "World", source_world: int, world: int) -> None:
         """Put ``world`` in the state of another World's world: physics, references, controllers, clock. Same plan expected.
@@ -184,11 +192,20 @@ class World:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
             SimulationError: a number left the physical range or is NaN; names world, agent and time.
         """
+        step = self.try_step(orders, velocity)
+        self.raise_if_diverged()
+        return step
+
+    def try_step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
+        """:meth:`step`, but worlds that diverge stop no other: ``state.status`` is not 0 where one did.
+
+        Raises:
+            ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
+        """
         orders = self._checked(orders)
         if velocity is not None:
             velocity = self._checked_velocity(velocity)
-        if self.advance(orders, velocity):
-            self.raise_if_diverged()
+        self.advance(orders, velocity)
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 

@@ -1,0 +1,164 @@
+"""How safe and how good supervisors are where nobody tuned them: families of missions under both compositions, shield on and off.
+
+Of every layout few numbers are kept, see :mod:`marlbc_mj.results.layouts`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.report.safety_tables import safety_tables, write_cells
+from marlbc_mj.report.table import to_markdown
+from marlbc_mj.results.layouts import CellScores, Marks, MissionCell, mark
+from marlbc_mj.results.seeds import SeedRun
+from marlbc_mj.scenarios import Scenario, held_out, make_scenario
+from marlbc_mj.scenarios.base import COMPOSITIONS
+from marlbc_mj.studies.batches import evaluate_batch
+from marlbc_mj.studies.draws import SEEDS_PER_JOB, with_drag_range
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import provenance
+
+GROUNDS = ("field", "forest", "gates", "corridor", "traffic")
+"""Families with layouts to draw."""
+DRAG_DRAWS = {"paper-drag-0": (0.0, 0), "paper-drag-2": (2.0, 67), "paper-drag-5": (5.0, 134)}
+"""Draws around the case study: the factor of the drag and the first seed of each."""
+DRAWS_EACH = 67
+ORDER_GIVERS = (
+    "fixed",
+    "scripted",
+    "fsams",
+    "fsams-hysteresis",
+    "fms",
+    "set-based-rule",
+    "lookahead",
+    "lookahead-distributed",
+    "mpcms",
+    "rollout",
+)
+"""Supervisors whose orders are composed, under either composition."""
+VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
+"""Supervisors that give velocities, so that the composition does not matter."""
+SEARCHES = ("mpcms", "rollout")
+"""Supervisors that take seconds a layout."""
+OWN = "own"
+"""In the place of a composition: the supervisor's own velocities."""
+FIRST_SEED = 70_000
+
+
+class SafetyJob(NamedTuple):
+    """A cell on some seeds."""
+
+    cell: MissionCell
+    controller: str
+    seeds: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class SafetyStudy:
+    """Every supervisor on every mission, under every composition, without a shield and with one.
+
+    Raises:
+        ConfigurationError: no missions or supervisors, unknown ones, or numbers below 1.
+    """
+
+    missions: tuple[str, ...] = GROUNDS
+    """Scenarios that draw layouts, of which held-out ones are taken, or draws of :data:`DRAG_DRAWS`."""
+    supervisors: tuple[str, ...] = (*ORDER_GIVERS, *VELOCITY_GIVERS)
+    compositions: tuple[str, ...] = COMPOSITIONS
+    shields: tuple[bool, ...] = (False, True)
+    layouts: int = 1000
+    """Per cell; :data:`DRAG_DRAWS` have 67 each."""
+    searched: int = 100
+    """Per cell of a supervisor that searches."""
+    seed: int = FIRST_SEED
+    controller: str = "sorlc"
+
+    def __post_init__(self) -> None:
+        for name in ("missions", "supervisors", "compositions", "shields"):
+            if not getattr(self, name):
+                raise ConfigurationError(f"name at least one of {name}")
+        for name in ("layouts", "searched"):
+            if getattr(self, name) < 1:
+                raise ConfigurationError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for composition in self.compositions:
+            if composition not in COMPOSITIONS:
+                raise unknown("composition", composition, COMPOSITIONS)
+        for supervisor in self.supervisors:
+            make_supervisor(supervisor, self.controller)
+        for mission in self.missions:
+            ground(mission)
+
+    def cells(self) -> list[MissionCell]:
+        """All cells, mission by mission; a supervisor that gives velocities has one composition."""
+        return [
+            MissionCell(mission, composition, shield, supervisor)
+            for mission in self.missions
+            for composition in (*self.compositions, OWN)
+            for supervisor in self.supervisors
+            if (composition == OWN) == (supervisor in VELOCITY_GIVERS)
+            for shield in self.shields
+        ]
+
+    def jobs(self) -> list[SafetyJob]:
+        return [
+            SafetyJob(cell, self.controller, seeds[first : first + SEEDS_PER_JOB])
+            for cell in self.cells()
+            for seeds in [self._seeds(cell)]
+            for first in range(0, len(seeds), SEEDS_PER_JOB)
+        ]
+
+    def _seeds(self, cell: MissionCell) -> tuple[int, ...]:
+        count = min(self.layouts, self.searched) if cell.supervisor in SEARCHES else self.layouts
+        first = self.seed
+        if cell.mission in DRAG_DRAWS:
+            count, first = min(count, DRAWS_EACH), DRAG_DRAWS[cell.mission][1]
+        return tuple(range(first, first + count))
+
+    def run(self, job: SafetyJob, watch: Watch) -> Marks:
+        scenario, cell = ground(job.cell.mission), job.cell
+        composition = None if cell.composition == OWN else cell.composition
+        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", cell.supervisor))
+
+        def fly(seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
+            return evaluate_batch(
+                scenario,
+                seeds,
+                cell.supervisor,
+                job.controller,
+                composition=composition,
+                shield=cell.shield,
+                progress=lambda _, done, of: progress(label, done, of),
+            )
+
+        (alone,), runs = fly(job.seeds[:1], silent), fly(job.seeds, watch.progress)
+        decision_ms = np.nan if alone.metrics is None else alone.metrics["team"]["decision_ms_median"]
+        return Marks(cell, tuple(mark(run, scenario) for run in runs), float(decision_ms))
+
+    def report(self, results: Sequence[Marks], out: Path | None, progress: Progress = silent) -> Report:
+        rows = [CellScores.of(cell, list(parts)) for cell, parts in groupby(results, lambda marks: marks.cell)]
+        text = "\n".join(map(to_markdown, safety_tables(rows)))
+        if out is not None:
+            write_json(out / "config.json", {**provenance(), "study": self})
+            write_cells(rows, out / "safety.csv")
+            (out / "safety.md").write_text(text, encoding="utf-8")
+        return Report(text)
+
+
+def ground(name: str) -> Scenario:
+    """The scenario of a mission: held-out layouts of a family, or draws around the case study.
+
+    Raises:
+        ConfigurationError: an unknown scenario, or one that draws no layouts.
+    """
+    if name in DRAG_DRAWS:
+        drag = DRAG_DRAWS[name][0]
+        return with_drag_range(make_scenario("paper"), (drag, drag))
+    return held_out(make_scenario(name))
