@@ -24,7 +24,7 @@ SYNC_EVERY = 1.0  # between two flushes to the disk [s]
 _PREFIX, PACK_SUFFIX = "results-", ".pack"
 
 
-class Entry(NamedTuple):
+class Packed(NamedTuple):
     """Where a record's payload is."""
 
     key: str
@@ -40,7 +40,7 @@ class Entry(NamedTuple):
             return zstandard.ZstdDecompressor().decompress(file.read(self.length))
 
 
-def entries(path: Path, begin: int = 0) -> Iterator[Entry]:
+def entries(path: Path, begin: int = 0) -> Iterator[Packed]:
     """All whole records of a pack from a place on. What is damaged is passed over."""
     with path.open("rb") as file:
         while (entry := _entry(path, file, begin)) is not None or (begin := _next_magic(file, begin + 1)) > 0:
@@ -49,7 +49,7 @@ def entries(path: Path, begin: int = 0) -> Iterator[Entry]:
                 begin = entry.start + entry.length
 
 
-def _entry(path: Path, file: BinaryIO, begin: int) -> Entry | None:
+def _entry(path: Path, file: BinaryIO, begin: int) -> Packed | None:
     """The record at a place; None where there is no whole one."""
     file.seek(begin)
     head = file.read(_HEAD.size)
@@ -59,7 +59,7 @@ def _entry(path: Path, file: BinaryIO, begin: int) -> Entry | None:
     start = begin + _HEAD.size
     if start + length > os.fstat(file.fileno()).st_size or zlib.crc32(file.read(length), zlib.crc32(key)) != checksum:
         return None
-    return Entry(key.hex(), path, start, length)
+    return Packed(key.hex(), path, start, length)
 
 
 def _next_magic(file: BinaryIO, begin: int) -> int:
@@ -93,7 +93,7 @@ class PackWriter:
         """Whether another pack should be begun."""
         return self._end >= LARGEST_PACK
 
-    def add(self, key: str, payload: bytes) -> Entry:
+    def add(self, key: str, payload: bytes) -> Packed:
         """Append a record; on the disk within about a second, or when the pack is closed.
 
         Raises:
@@ -114,7 +114,7 @@ class PackWriter:
             if monotonic() > self._synced + SYNC_EVERY:
                 os.fsync(self._file)
                 self._synced = monotonic()
-        return Entry(key, self.path, begin + len(head), len(packed))
+        return Packed(key, self.path, begin + len(head), len(packed))
 
     def close(self) -> None:
         """Flush and close."""
