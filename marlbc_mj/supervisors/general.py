@@ -1,8 +1,8 @@
 """``marlms-general``: one learned policy for every agent of every team, distributed (project).
 
-Every agent senses its own lanes, sends what it sensed and decides by itself between formation and column, from what it sensed and
-what it heard of the others; see :mod:`marlbc_mj.policies.general`. Avoidance is the composition's business: only the set-based one
-will do. Without a communication layer in the scenario everybody hears everybody at once.
+Every agent senses its own lanes, sends what it sensed and decides by itself between formation and column, from what it sensed
+and what it heard of the others; see :mod:`marlbc_mj.policies.general`. Avoidance is the composition's business: only the
+set-based one will do. Without a communication layer in the scenario everybody hears everybody at once.
 """
 
 from dataclasses import dataclass

@@ -16,6 +16,8 @@ GENERAL = "marlms-general"
 """Name of the method, of the supervisor and of the shipped checkpoint."""
 GENERAL_SUMMARY = "one network for every agent of every team, over families of drawn layouts"
 """One line of description."""
+JUDGED_WITH = "sorlc"
+"""Controller of the evaluations."""
 DRAWN = ("field", "forest", "gates", "corridor", "traffic")
 """Families of missions that draw layouts."""
 HIDEABLE = ("pooled", "lanes", "column-lane", "ways")
@@ -42,7 +44,7 @@ class GeneralConfig:
 
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Random seed of network, exploration, layouts and the draws from the replay buffer."""
-    budget: Annotated[int, AT_LEAST_ONE] = 3_000_000
+    budget: Annotated[int, AT_LEAST_ONE] = 1_200_000
     """Mission steps, over all worlds."""
     families: Annotated[tuple[str, ...], _NAMED] = DRAWN
     """Families that are trained on."""
@@ -50,8 +52,10 @@ class GeneralConfig:
     """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
     worlds: Annotated[int, AT_LEAST_ONE] = 4
     """Worlds of every family and team, all stepped together."""
-    controller: str = "sorlc"
-    """Controller that tracks the references."""
+    controller: str = "pd"
+    """Controller that tracks the references while learning; evaluations have sorlc."""
+    substep: Annotated[float, POSITIVE] = 0.01
+    """Physics and control step while learning [s]; evaluations have the scenario's own."""
     most_drag: Annotated[float, NOT_NEGATIVE] = 2.0
     """Every episode multiplies the disturbance by a draw from 0 to this."""
     start_spread: Annotated[float, NOT_NEGATIVE] = 0.5
@@ -77,7 +81,7 @@ class GeneralConfig:
     """Step size of Adam at the end of the budget; linear in between."""
     batch: Annotated[int, AT_LEAST_ONE] = 512
     """Transitions of single agents per update."""
-    updates: Annotated[int, AT_LEAST_ONE] = 10
+    updates: Annotated[int, AT_LEAST_ONE] = 8
     """Updates after each decision of all worlds."""
     capacity: Annotated[int, AT_LEAST_ONE] = 400_000
     """Transitions of single agents in the replay buffer."""
@@ -100,9 +104,9 @@ class GeneralConfig:
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
 
-    evaluate_every: Annotated[int, AT_LEAST_ONE] = 500_000
+    evaluate_every: Annotated[int, AT_LEAST_ONE] = 400_000
     """Mission steps between evaluations on held-out layouts."""
-    layouts: Annotated[int, AT_LEAST_ONE] = 20
+    layouts: Annotated[int, AT_LEAST_ONE] = 10
     """Held-out layouts of each family per evaluation."""
     threads: Annotated[int, AT_LEAST_ONE] = 1
     """Threads of the simulation."""
@@ -140,7 +144,7 @@ def training_scenarios(config: GeneralConfig) -> list[Scenario]:
     spread = Perturbation(start_spread=config.start_spread, drag_scale=(0.0, config.most_drag))
     teams = [read_team(name) for name in config.teams]
     return [
-        make_scenario(family, **team._asdict(), composition="set-based", perturbation=spread)
+        make_scenario(family, **team._asdict(), substep=config.substep, composition="set-based", perturbation=spread)
         for family in config.families
         for team in teams
     ]

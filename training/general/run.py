@@ -6,7 +6,7 @@ from time import monotonic
 from typing import Any
 
 from marlbc_mj.policies.general import write_general
-from marlbc_mj.training.general.config import GeneralConfig, judging_scenarios
+from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, remove_run, stopper, write_table
@@ -55,7 +55,7 @@ class GeneralRun:
         self.config, self.out = config, out
         self.trainer = GeneralTrainer(config)
         scenarios = judging_scenarios(config)
-        self.judges = {k: Judge(each, config.controller, config.layouts, config.threads) for k, each in scenarios.items()}
+        self.judges = {k: Judge(each, JUDGED_WITH, config.layouts, config.threads) for k, each in scenarios.items()}
         self.origin = provenance()
         self.evaluations: list[TrainingScores] = []
         self.wall = 0.0  # time of training so far, without evaluations [s]
