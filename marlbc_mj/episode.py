@@ -1,6 +1,6 @@
 """One episode: supervisor and world in turn, and the trajectory they leave behind."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
@@ -8,13 +8,15 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.behaviors import clearances, clearances_among
+from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.engine.world import World
+from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
+from marlbc_mj.supervisors.communication import Hearing, hearing
 from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
@@ -32,6 +34,7 @@ class Frame(NamedTuple):
     decision_ms: float  # what the supervisor took [ms]
     pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
     shield: ShieldCounts | None = None  # (N,) each, since the episode began, at the end of the mission step; with a shield only
+    hearing: Hearing | None = None  # (N, N) each, when orders were given; where messages are not ideal, of a supervisor with any
 
     @property
     def first(self) -> Record:
@@ -62,6 +65,7 @@ class Trajectory:
     motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as motion.move has them; (0, 6): at rest
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
     shield: ShieldCounts | None = None  # (M, N) each, at the end of each mission step, see Frame
+    hearing: Hearing | None = None  # (M, N, N) each, see Frame
 
     def clearances(self) -> np.ndarray:
         """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
@@ -95,42 +99,89 @@ def run_episode(
     """
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
-    supervisor = batched(supervisor)
-    memory = supervisor.start(world.scenario, 1)
-    observation, done = world.reset(seed), False
-    frames: list[Frame] = []
+    frames, last = _play(world, batched(supervisor), world.reset(seed), on_frame)
+    return _trajectory(world, 0, frames[0], last, (seed, *names))
+
+
+def run_episodes(
+    world: World,
+    supervisor: Supervisor | OneTeamSupervisor,
+    seeds: Sequence[int],
+    *,
+    names: tuple[str, str] = ("supervisor", "controller"),
+) -> list[Trajectory]:
+    """Run the episodes of many seeds together, a world each: bit for bit those of :func:`run_episode`, in less time.
+
+    A decision counts as what it took for all, divided by their number.
+
+    Args:
+        world: made with ``worlds=len(seeds), record=True``.
+        supervisor: decides for B teams, or for one.
+        seeds: which draws of the scenario.
+        names: supervisor's and controller's.
+
+    Raises:
+        ConfigurationError: another number of worlds, or a decision of wrong shape or type.
+        SimulationError: one of the worlds diverged.
+    """
+    if world.worlds != len(seeds):
+        raise ConfigurationError(f"run_episodes needs a World of {len(seeds)} worlds, got {world.worlds}")
+    one = World(world.scenario, world.plan.controller, native=world.native, shield=world.shield)
+    for b, seed in enumerate(seeds):
+        one.reset(seed)
+        world.copy_world(one, 0, b)
+    frames, last = _play(world, batched(supervisor), world.observe())
+    return [_trajectory(world, b, frames[b], last, (seed, *names)) for b, seed in enumerate(seeds)]
+
+
+def _play(
+    world: World, supervisor: Supervisor, observation: Observation, on_frame: Callable[[Frame], None] | None = None
+) -> tuple[list[list[Frame]], Observation]:
+    """All worlds to the end of their episodes: the frames of each, and what is seen at the end."""
+    memory, done = supervisor.start(world.scenario, world.worlds), False
+    frames: list[list[Frame]] = [[] for _ in range(world.worlds)]
     while not done:
         began = perf_counter()
         decision, memory = supervisor.decide(observation, memory)
-        decision_ms = 1e3 * (perf_counter() - began)
-        controller_state, pose = world.state.controller[0].copy(), body_poses(world)
+        decision_ms = 1e3 * (perf_counter() - began) / world.worlds
+        heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
+        before = [(world.state.controller[b].copy(), body_poses(world, b)) for b in range(world.worlds)]
         step = carry_out(world, decision)
-        assert step.record is not None, "run_episode needs World(record=True)"
-        record = Record(*(rows[0] for rows in step.record))
-        command, reward = step.observation.command[0], float(step.reward[0])
-        shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
-        frames.append(Frame(observation.team(0), record, command, reward, controller_state, decision_ms, pose, shield))
-        if on_frame is not None:
-            on_frame(frames[-1])
-        observation, done = step.observation, bool(step.done[0])
-    return _trajectory(world, frames, observation, seed, names)
+        for b, (controller_state, pose) in enumerate(before):
+            frames[b].append(_frame(b, observation, step, (controller_state, decision_ms, pose), heard))
+            if on_frame is not None:
+                on_frame(frames[b][-1])
+        observation, done = step.observation, bool(step.done.all())
+    return frames, observation
 
 
-def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int, names: tuple[str, str]) -> Trajectory:
-    """The frames of a whole episode in one world, and the ``last`` observation of its end, as one record."""
+def _frame(b: int, seen: Observation, step: Step, others: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
+    """Of world ``b``; ``others`` are controller state, decision time and pose."""
+    assert step.record is not None, "an episode needs World(record=True)"
+    record = Record(*(rows[b] for rows in step.record))
+    shield = None if step.shield is None else ShieldCounts(*(rows[b] for rows in step.shield))
+    links = None if heard is None else heard.team(b)
+    return Frame(seen.team(b), record, step.observation.command[b], float(step.reward[b]), *others, shield, links)
+
+
+def _trajectory(world: World, b: int, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
+    """The frames of a whole episode in world ``b``, and the ``last`` observation of its end, as one record.
+
+    ``names`` are seed, supervisor and controller.
+    """
     scenario, state = world.scenario, world.state
     position, velocity, *others = (np.concatenate(rows) for rows in zip(*(f.record for f in frames), strict=True))
     reference, reference_velocity, force = others
-    formation = [*(f.observation.formation for f in frames[1:]), last.formation[0]]
+    formation = [*(f.observation.formation for f in frames[1:]), last.formation[b]]
     return Trajectory(
         scenario=scenario,
-        supervisor=names[0],
-        controller=names[1],
-        seed=seed,
-        obstacles=(state.anchors if scenario.moving else state.obstacles)[0].copy(),
+        supervisor=names[1],
+        controller=names[2],
+        seed=names[0],
+        obstacles=(state.anchors if scenario.moving else state.obstacles)[b].copy(),
         time=np.arange(len(position)) * scenario.substep,
-        position=np.concatenate([position, last.position]),
-        velocity=np.concatenate([velocity, last.velocity]),
+        position=np.concatenate([position, last.position[b, None]]),
+        velocity=np.concatenate([velocity, last.velocity[b, None]]),
         reference=reference,
         reference_velocity=reference_velocity,
         force=force,
@@ -139,9 +190,10 @@ def _trajectory(world: World, frames: list[Frame], last: Observation, seed: int,
         reward=np.array([f.reward for f in frames]),
         controller_state=np.array([f.controller_state for f in frames]),
         decision_ms=np.array([f.decision_ms for f in frames]),
-        motions=state.motions[0].copy(),
+        motions=state.motions[b].copy(),
         pose=np.array([f.pose for f in frames]),
         shield=_shield(frames),
+        hearing=_hearing(frames),
     )
 
 
@@ -149,6 +201,12 @@ def _shield(frames: list[Frame]) -> ShieldCounts | None:
     """What a shield did by the end of each mission step; None without a shield."""
     counts = [f.shield for f in frames if f.shield is not None]
     return ShieldCounts(*(np.array(rows) for rows in zip(*counts, strict=True))) if counts else None
+
+
+def _hearing(frames: list[Frame]) -> Hearing | None:
+    """Who heard whom at each mission step; None where nobody said anything, or all heard everything."""
+    moments = [f.hearing for f in frames if f.hearing is not None]
+    return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True))) if moments else None
 
 
 def body_poses(world: World, b: int = 0) -> np.ndarray:

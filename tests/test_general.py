@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from marlbc_mj import World, make_scenario, paper
 from marlbc_mj.cli import main
+from marlbc_mj.core.communication import Communication
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, read_general, write_general
@@ -307,3 +308,30 @@ def test_the_shipped_policy_flies_what_it_never_saw() -> None:
     verdict = Judge(scenario, "sorlc", 2)(make_supervisor("marlms-general"), seed=59_000)
     assert verdict.success.all()
     assert shipped("marlms-general").stat().st_size < 1_000_000
+
+
+def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
+    """(steps, B, N) orders of the first mission steps of held-out layouts."""
+    supervisor, world = General(random_policy()), World(scenario, worlds=worlds)
+    observation, memory = world.reset(3), supervisor.start(scenario, worlds)
+    taken = []
+    for _ in range(steps):
+        orders, memory = supervisor.decide(observation, memory)
+        taken.append(orders.copy())
+        observation = world.step(orders).observation
+    return np.stack(taken)
+
+
+def test_ideal_communication_is_the_limit_of_a_long_range() -> None:
+    """One decision is the same whether nothing is exchanged because all hear all, or a layer carries it without limits."""
+    ideal, carried = (field(communication=c) for c in (Communication(), Communication(range=1e6)))
+    np.testing.assert_array_equal(decisions(carried), decisions(ideal))
+
+
+@pytest.mark.parametrize("changes", [{"delay": 0.1, "loss": 0.5}, {"silent": (0,)}, {"protocol": "consensus", "range": 9.0}])
+def test_it_flies_over_any_network(changes) -> None:
+    """Every team decides on its own network: alone it takes the same orders as beside another."""
+    scenario = field(communication=Communication(**changes))
+    taken = decisions(scenario)
+    assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
+    np.testing.assert_array_equal(decisions(scenario, worlds=1)[:, 0], taken[:, 0])

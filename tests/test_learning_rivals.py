@@ -251,7 +251,8 @@ def test_the_own_entries_of_a_state_are_the_agents_own(name):
     def read(velocity, command, age):
         position = np.arange(8.0).reshape(1, 4, 2)
         obstacles, none = np.zeros((1, 1, 3)), np.zeros(1, dtype=np.int64)
-        observation = Observation(none, np.zeros(1), position, velocity, np.ones((1, 4)), none, command, age, position, obstacles)
+        clearance = np.ones((1, 4))
+        observation = Observation(none, np.zeros(1), position, velocity, clearance, none, command, age, position, obstacles, none)
         return state(observation)[0]
 
     velocity, command, age = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64), np.ones((1, 4))

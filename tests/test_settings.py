@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from marlbc_mj.policies.actions import ACTIONS
 from marlbc_mj.policies.states import STATES
 from marlbc_mj.scenarios import load_scenario
-from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config, with_settings
+from marlbc_mj.training.config import PRESETS, TrainConfig, from_json, make_config
 from marlbc_mj.training.shaping import Shaping
+from marlbc_mj.util.changes import with_settings
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import plain_data
 from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, check, convert, json_data, tables, texts

@@ -26,12 +26,13 @@ from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.codes import StateHash
-from marlbc_mj.training.config import TrainConfig, make_config, with_settings
+from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.run import RESUME, make_trainer, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util import provenance
+from marlbc_mj.util.changes import with_settings
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 SMALL = {

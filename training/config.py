@@ -2,8 +2,8 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, is_dataclass, replace
-from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Literal
 
 from marlbc_mj.training.methods import METHODS, PPO, WITHOUT_RISKS
 from marlbc_mj.training.shaping import Shaping
@@ -14,11 +14,9 @@ from marlbc_mj.util.settings import (
     POSITIVE,
     SHARE,
     Rule,
-    annotations,
     check,
     convert,
     json_data,
-    texts,
 )
 
 MOST_BITS = 24
@@ -222,7 +220,7 @@ def make_config(preset: str, **changes: Any) -> TrainConfig:
     return replace(PRESETS[preset][0], **changes)
 
 
-_JSON, _TEXTS = json_data(), texts()
+_JSON = json_data()
 
 
 def from_json(data: Mapping[str, Any]) -> TrainConfig:
@@ -250,39 +248,3 @@ def flat_settings(data: Mapping[str, Any]) -> dict[str, Any]:
 def _without_types(data: Mapping[str, Any]) -> dict[str, Any]:
     """JSON data of dataclasses without the names of their types."""
     return {name: _without_types(value) if isinstance(value, dict) else value for name, value in data.items() if name != "type"}
-
-
-class _Dataclass(Protocol):
-    """Any dataclass."""
-
-    __dataclass_fields__: ClassVar[dict[str, Any]]
-
-
-Settings = TypeVar("Settings", bound=_Dataclass)
-
-
-def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "") -> Settings:
-    """A frozen dataclass with fields replaced by ``name=value`` texts; ``outer.inner=value`` reaches a nested one.
-
-    Args:
-        config: the dataclass.
-        settings: the texts; ``hidden=64,64`` gives a tuple.
-        prefix: text before the fields' names in messages.
-
-    Raises:
-        ConfigurationError: no such field, or a value of the wrong kind.
-    """
-    for setting in settings:
-        name, equals, text = setting.partition("=")
-        if not equals:
-            raise ConfigurationError(f"--set takes name=value, got {setting!r}")
-        outer, dot, inner = name.partition(".")
-        hints = annotations(type(config))
-        if outer not in hints or (dot and not is_dataclass(hints[outer])):
-            raise unknown("setting", prefix + (outer if outer not in hints else name), (prefix + hint for hint in hints))
-        if dot:
-            value = with_settings(getattr(config, outer), (f"{inner}={text}",), f"{outer}.")
-        else:
-            value = convert(_TEXTS, text, hints[outer], f"setting {prefix}{outer}")
-        config = replace(config, **{outer: value})
-    return config

@@ -9,7 +9,14 @@ from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand
 from marlbc_mj.cli.listing import ListCommand
-from marlbc_mj.cli.measuring import AblationCommand, CalibrateCommand, OracleCommand, PerfCommand, ScaleCommand
+from marlbc_mj.cli.measuring import (
+    AblationCommand,
+    CalibrateCommand,
+    CommunicationCommand,
+    OracleCommand,
+    PerfCommand,
+    ScaleCommand,
+)
 from marlbc_mj.cli.parsing import parse
 from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
@@ -33,6 +40,7 @@ Command = (
     | Annotated[PerfCommand, subcommand("perf")]
     | Annotated[ScaleCommand, subcommand("scale")]
     | Annotated[AblationCommand, subcommand("ablation")]
+    | Annotated[CommunicationCommand, subcommand("communication")]
     | Annotated[CalibrateCommand, subcommand("calibrate")]
     | Annotated[OracleCommand, subcommand("oracle")]
 )

@@ -8,11 +8,14 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.terminal import print_results, progress_bars
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
     from marlbc_mj.scenarios import Scenario
     from marlbc_mj.studies.bench import BenchConfig
+
+SETTABLE = ("communication.", "imperfections.")
+"""Tables of a scenario whose fields ``--set`` reaches."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +42,8 @@ class ScenarioOptions:
     """Robot, by name, path of an .xml or .py file, or FILE.py:NAME; a scenario takes its mass, force and limits."""
     split: str | None = None
     """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
+    set: tuple[str, ...] = ()
+    """Settings of communication and imperfections, name=value: communication.range=8 communication.loss=0.2."""
 
     allow_code: bool = False
     """Run the Python file that a scenario file names as its robot."""
@@ -47,6 +52,7 @@ class ScenarioOptions:
         """The named scenario with these changes, and with ``others`` that are not None."""
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
+        from marlbc_mj.util.changes import with_settings
 
         keys = ("substep", "reference", "composition", "force_limit", "duration", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
@@ -56,7 +62,19 @@ class ScenarioOptions:
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        return make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
+        scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
+        return with_settings(scenario, self._tables_set())
+
+    def _tables_set(self) -> tuple[str, ...]:
+        """The settings of --set; other fields of a scenario follow from each other, so that one alone cannot be set.
+
+        Raises:
+            ConfigurationError: a setting that is in neither table.
+        """
+        for setting in self.set:
+            if not setting.startswith(SETTABLE):
+                raise unknown("setting", setting.partition("=")[0], [f"{table}NAME=VALUE" for table in SETTABLE])
+        return self.set
 
     def _robot_changes(self, name: str) -> dict[str, Any]:
         """What another robot changes, but for what other options set."""
@@ -75,7 +93,7 @@ class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
     By default scripted runs with every controller, and every supervisor with sorlc but those that are to be named: mpcms-mujoco,
-    oracle-schedule, fixed, set-based-rule, lookahead, rollout, orca and cbf-qp.
+    oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca and cbf-qp.
     """
 
     scenario: Positional[str] = "paper"

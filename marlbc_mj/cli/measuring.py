@@ -1,8 +1,11 @@
-"""``marlbc perf``, ``scale``, ``ablation``, ``calibrate`` and ``oracle``: how fast it is, and what is behind its numbers."""
+"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and what is behind it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from tyro.conf import OmitArgPrefixes, Positional
+
+from marlbc_mj.cli.benchmark import ScenarioOptions
 from marlbc_mj.cli.terminal import progress_bars, progress_lines
 
 
@@ -76,6 +79,56 @@ class AblationCommand:
         print(done.report.text)
         if self.out is not None:
             print(f"{self.out / 'index.html'} shows it all")
+
+
+@dataclass(frozen=True)
+class CommunicationCommand:
+    """Measure what range, delay, loss and a silent agent cost a distributed supervisor, on held-out layouts.
+
+    Ranges are full, 2 and 1.2 distances between neighbors, delays 0, 0.1 and 0.3 s, losses 0, 20 and 50 %.
+    """
+
+    missions: Positional[tuple[str, ...]] = ("gates", "corridor")
+    """Scenarios that draw layouts, see `marlbc list`, or .toml files."""
+    supervisor: str = "lookahead-distributed"
+    """Supervisor that is distributed."""
+    controller: str = "sorlc"
+    """Controller it runs with."""
+    seeds: int = 40
+    """Number of held-out layouts."""
+    seed: int = 65000
+    """First seed."""
+    workers: int = 1
+    """Processes that share the cases."""
+    agreement: bool = False
+    """Measure only how long agents take to agree, by flooding and by consensus; nothing is written."""
+    out: Path = Path("out/communication")
+    """Folder for communication.csv and config.json."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+    shield: bool = False
+    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
+    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+
+    def run(self) -> None:
+        """Fly all cases, write their numbers, and print the table."""
+        from marlbc_mj.report.table import to_markdown
+        from marlbc_mj.results.seeds import seed_range
+        from marlbc_mj.scenarios import held_out
+        from marlbc_mj.studies.communication import CommunicationStudy, agreement_table
+        from marlbc_mj.studies.runner import counting, run_study
+
+        if self.agreement:
+            print(to_markdown(agreement_table()))
+            return
+        missions = tuple(held_out(self.options.build(name)) for name in self.missions)
+        seeds = seed_range(self.seeds, self.seed)
+        study = CommunicationStudy(missions, self.supervisor, seeds, self.controller, self.shield)
+        with progress_bars() as progress:
+            told = counting(study.jobs(), lambda job: job.scenario.name, progress)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=told)
+        print(done.report.text)
+        print(f"{self.out / 'communication.csv'} holds the numbers")
 
 
 @dataclass(frozen=True)

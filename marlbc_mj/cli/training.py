@@ -91,8 +91,8 @@ class TrainCommand:
         Raises:
             ConfigurationError: an option that this method does not have.
         """
-        from marlbc_mj.training.config import with_settings
         from marlbc_mj.training.general.config import GeneralConfig
+        from marlbc_mj.util.changes import with_settings
 
         if self.preset != "fast" or self.device is not None:
             raise ConfigurationError(f"{self.method} has neither presets nor devices; leave out --preset and --device")
@@ -112,9 +112,10 @@ class TrainCommand:
 
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""
-        from marlbc_mj.training.config import make_config, with_settings
+        from marlbc_mj.training.config import make_config
         from marlbc_mj.training.general.config import GENERAL
         from marlbc_mj.training.methods import METHODS
+        from marlbc_mj.util.changes import with_settings
 
         if self.method not in METHODS:
             raise unknown("method", self.method, (*METHODS, GENERAL))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.compiling import allocation_free
+from marlbc_mj.core.compiling import allocation_free, plain
 from marlbc_mj.util.errors import ConfigurationError
 
 _WORD = 0xFFFFFFFF
@@ -88,6 +88,25 @@ def normal(seed, count, stream):
     base = _mixed(_mixed(_mixed(seed & _WORD) ^ (count & _WORD)) ^ (2 * stream + 1))
     angle = _mixed(base ^ 0x9E3779B9)
     return np.sqrt(-2.0 * np.log((base + 1.0) / 4294967296.0)) * np.cos(2.0 * np.pi * angle / 4294967296.0)
+
+
+_SALT = 0x9E3779B9  # keeps uniform numbers apart from the normal ones of the same seed
+_mixed_arrays = plain(_mixed)
+
+
+def uniform(seed: np.ndarray, count: np.ndarray, streams: np.ndarray) -> np.ndarray:
+    """Uniform numbers in [0, 1) that are a function of three integers: no state, so no order.
+
+    Args:
+        seed: (B,) int64.
+        count: (B,) int64.
+        streams: (...) int64, numbers of the streams.
+
+    Returns:
+        (B, ...).
+    """
+    base = _mixed_arrays(_mixed_arrays((seed ^ _SALT) & _WORD) ^ (count & _WORD))
+    return np.asarray(_mixed_arrays(base.reshape(-1, *[1] * streams.ndim) ^ (2 * streams + 1)) / 4294967296.0)
 
 
 @allocation_free

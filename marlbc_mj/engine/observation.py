@@ -21,6 +21,7 @@ class Observation(NamedTuple):
     age: np.ndarray  # (B, N) how long that command has been in force [s]; infinite where the episode began with it
     reference: np.ndarray  # (B, N, 2) p_r [m], where a ``virtual`` reference has its behaviors evaluated
     obstacles: np.ndarray  # (B, K, 3) x, y, radius [m]; (B, K, 5) where they move, with their velocity [m/s]
+    noise_seed: np.ndarray  # (B,) int64, drawn with the episode: seeds what is random in it besides its draw, lost messages too
 
     def team(self, b: int) -> "Observation":
         """Team ``b`` alone: ``position`` (N, 2), ``clearance`` (N,), ``obstacles`` (K, 3), and so on."""

@@ -179,6 +179,7 @@ def observe(plan: Plan, team: Team) -> Observation:
         age=(team.steps[:, None] - team.since) * duration,
         reference=team.reference.copy(),
         obstacles=team.obstacles.copy(),
+        noise_seed=team.noise_seed.copy(),
     )
 
 

@@ -10,6 +10,10 @@ from marlbc_mj.engine.loop import fill_clearance, verdict
 from marlbc_mj.engine.plan import make_mission, make_plan
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import NO_POSE, Trajectory, body_poses
+from marlbc_mj.supervisors.communication import Hearing
+
+NO_HEARING = Hearing(np.zeros((1, 0, 0), dtype=np.bool_), np.zeros((1, 0, 0)))
+"""Of one mission step in which agents did not talk, or all heard everything at once."""
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,8 @@ class EpisodeLog:
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,) [ms]
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
+    link: np.ndarray = field(default_factory=lambda: NO_HEARING.link)  # (M, N, N) bool, see Hearing; (M, 0, 0) without
+    age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) of what agents know of each other [s]
 
     def obstacles_at(self, time: float) -> np.ndarray:
         """(K, 3) x, y, radius [m] at ``time`` [s]."""
@@ -117,7 +123,13 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         reward=trajectory.reward,
         decision_ms=trajectory.decision_ms,
         pose=trajectory.pose,
+        **hearing_columns(trajectory.hearing, len(position)),
     )
+
+
+def hearing_columns(hearing: Hearing | None, steps: int) -> dict[str, np.ndarray]:
+    """``link`` and ``age`` of an :class:`EpisodeLog` of ``steps`` mission steps."""
+    return (hearing or Hearing(*(np.repeat(array, steps, axis=0) for array in NO_HEARING)))._asdict()
 
 
 def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

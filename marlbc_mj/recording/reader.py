@@ -26,9 +26,10 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
-from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.recording.log import EpisodeLog, hearing_columns
 from marlbc_mj.recording.rerun_file import write_rerun
 from marlbc_mj.recording.writer import METADATA, MODEL
+from marlbc_mj.supervisors.communication import Hearing
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
 
@@ -92,6 +93,11 @@ def _check_log(log: EpisodeLog) -> None:
             raise ValueError(f"{name} is not finite")
     if log.pose.shape[:2] not in ((steps, 0), (steps, agents)) or log.pose.shape[2:] != (7,) or not np.isfinite(log.pose).all():
         raise ValueError(f"pose has shape {log.pose.shape}, or is not finite")
+    for name in ("link", "age"):
+        if getattr(log, name).shape not in ((steps, 0, 0), (steps, agents, agents)):
+            raise ValueError(f"{name} has shape {getattr(log, name).shape}")
+    if not (log.age >= 0).all():
+        raise ValueError("an age is negative, or not a number")
     if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
         raise ValueError(f"a command is none of the {len(log.commands)} that there are")
     if not all(isinstance(name, str) for name in log.commands):
@@ -271,9 +277,9 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
-    """Decoded messages of every required topic, the same number of each."""
-    posed = any(channel.topic == schemas.POSE.name for channel in _channels(reader))
-    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *[schemas.POSE] * posed)}
+    """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
+    some = [topic for topic in (schemas.POSE, schemas.COMMUNICATION) if topic.name in _topics_used(reader)]
+    found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *some)}
     for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
         found[channel.topic].append(json.loads(message.data))
     counts = {name: len(messages) for name, messages in found.items()}
@@ -285,9 +291,13 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
     return found
 
 
-def _channels(reader: McapReader) -> list[Channel]:
+def _topics_used(reader: McapReader) -> set[str]:
+    """Topics with at least one message; a team whose supervisor says nothing leaves none on its communication."""
     summary = reader.get_summary()
-    return list(summary.channels.values()) if summary is not None else []
+    if summary is None or summary.statistics is None:
+        return set()
+    counts = summary.statistics.channel_message_counts
+    return {channel.topic for channel in summary.channels.values() if counts.get(channel.id, 0)}
 
 
 def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
@@ -314,7 +324,16 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
         "reward": scalar("/metrics", "reward"),
         "decision_ms": scalar("/metrics", "decision_ms"),
         "pose": agents(pose.name, *pose.columns) if pose.name in found else np.zeros((len(found["/state"]), 0, 7)),
+        **hearing_columns(_hearing(found), len(found["/state"])),
     }
+
+
+def _hearing(found: dict[str, list[dict[str, Any]]]) -> Hearing | None:
+    """Who heard whom, (M, N, N) each; None in a log without."""
+    if schemas.COMMUNICATION.name not in found:
+        return None
+    moments = [schemas.decode_hearing(message["agents"]) for message in found[schemas.COMMUNICATION.name]]
+    return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True)))
 
 
 def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:

@@ -8,6 +8,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from marlbc_mj.recording.links import links_of_log
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
@@ -21,7 +22,8 @@ PAIRS = {"state": ("position", "velocity"), "reference": ("reference", "referenc
 
 
 def write_rerun(log: EpisodeLog, stream: BinaryIO) -> None:
-    """Write a recording: ``/state``, ``/reference``, ``/force``, ``/metrics`` and ``/priorities`` by agent, and ``/scene``.
+    """Write a recording: ``/state``, ``/reference``, ``/force``, ``/metrics`` and ``/priorities`` by agent, ``/scene``, and where
+    agents talk ``/communication``.
 
     Raises:
         ConfigurationError: ``rerun-sdk`` is not installed.
@@ -84,6 +86,8 @@ def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
         recording.send_columns(f"scene/{name}", [_clock(rerun, log.time)], columns)
     strips = [np.column_stack([log.position[:, i], np.zeros(steps)]) for i in range(agents)]
     recording.log("scene/paths", rerun.LineStrips3D(strips, colors=colors), static=True)
+    if log.link.shape[1]:
+        _write_links(rerun, recording, log)
     if not len(log.obstacles):
         return
     places = np.array([log.obstacles_at(float(time)) for time in (log.time if len(log.motions) else log.time[:1])])
@@ -95,6 +99,19 @@ def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
     recording.log("scene/obstacles", rerun.Cylinders3D.from_fields(**shape), static=True)
     columns = rerun.Cylinders3D.columns(centers=_upright(places)).partition(np.full(steps, len(radii)))
     recording.send_columns("scene/obstacles", [_clock(rerun, log.time)], columns)
+
+
+def _write_links(rerun: Any, recording: Any, log: EpisodeLog) -> None:
+    """Who hears whom, as lines between agents that fade with the age of what they know of each other; and that age as plots."""
+    moments = [links_of_log(log, k) for k in range(len(log.time))]
+    strips = [log.position[k][links.ends] for k, links in enumerate(moments)]
+    raised = [np.pad(pair, ((0, 0), (0, 1)), constant_values=RADIUS) for step in strips for pair in step]
+    colors = [np.rint(255 * color).astype(int).tolist() for links in moments for color in links.colors()]
+    columns = rerun.LineStrips3D.columns(strips=raised, colors=colors).partition([len(links.ends) for links in moments])
+    recording.send_columns("scene/links", [_clock(rerun, log.time)], columns)
+    known = np.where(np.isfinite(log.age), log.age, 0.0)
+    for i in range(log.age.shape[1]):
+        _plot(rerun, recording, f"communication/agent{i + 1}/oldest", log.time, known[:, i].max(axis=1)[:, None], ("oldest",))
 
 
 def _upright(places: np.ndarray) -> np.ndarray:

@@ -17,8 +17,10 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.engine.assembly import OBSTACLE_HEIGHT, POINT_RADIUS
+from marlbc_mj.recording.links import drawn_links
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.communication import Hearing
 from marlbc_mj.util.palette import BEHAVIOR_COLORS, agent_color, rgba
 
 SCENE_TOPIC = "/scene"
@@ -29,6 +31,7 @@ _OBSTACLE_COLOR = (0.42, 0.45, 0.50, 1.0)
 _RING_COLOR = rgba(BEHAVIOR_COLORS["OA"], 0.7)
 _RING_POINTS = 32
 _RING_HEIGHT = 0.02  # above the ground, so that it does not flicker [m]
+_LINK_HEIGHT = 0.05  # [m]
 _REFERENCE_DIAMETER = 0.3  # [m]
 
 
@@ -60,7 +63,9 @@ class Scene:
         ]
         self._references = [(e.spheres[1].pose.position, e.lines[0].points[1]) for e in entities]
 
-    def encode(self, stamp: int, position: np.ndarray, reference: np.ndarray) -> tuple[bytes, bytes]:
+    def encode(
+        self, stamp: int, position: np.ndarray, reference: np.ndarray, hearing: Hearing | None = None
+    ) -> tuple[bytes, bytes]:
         """SceneUpdate and FrameTransforms of one mission step.
 
         Obstacles are in every SceneUpdate: after a seek a viewer gets one message a topic, and would show none of them
@@ -70,6 +75,7 @@ class Scene:
             stamp: [ns].
             position: (N, 2) [m].
             reference: (N, 2) p_r [m].
+            hearing: who hears whom, (N, N) each, where agents talk.
         """
         seconds, nanos = divmod(stamp, 1_000_000_000)
         for timestamp in self._stamps:
@@ -81,7 +87,8 @@ class Scene:
                     target.x = x
                     target.y = y
         static = self._obstacles_at(1e-9 * stamp) if len(self._motions) else self._static
-        return static + self._team.SerializeToString(), self._transforms.SerializeToString()
+        links = b"" if hearing is None else _links_message(position, hearing)
+        return static + links + self._team.SerializeToString(), self._transforms.SerializeToString()
 
     def _obstacles_at(self, time: float) -> bytes:
         """The message of all obstacles at ``time`` [s]."""
@@ -107,6 +114,18 @@ def _agent_entity(agent: int, radius: float, length: float) -> SceneEntity:
     points = [Point3(z=radius), Point3(z=radius)]
     line = LinePrimitive(pose=_pose(), points=points, thickness=2.0, scale_invariant=True, color=color)
     return SceneEntity(frame_id=WORLD_FRAME, id=f"agent{agent + 1}", spheres=spheres, lines=[line])
+
+
+def _links_message(position: np.ndarray, hearing: Hearing) -> bytes:
+    """The message of the links between agents: one list of lines, a color for both ends of each."""
+    links = drawn_links(position, hearing.link, hearing.age)
+    points = [Point3(x=x, y=y, z=_LINK_HEIGHT) for pair in position[links.ends].tolist() for x, y in pair]
+    colors = [_color(color) for color in np.repeat(links.colors(), 2, axis=0).tolist()]
+    lines = LinePrimitive(
+        type=LinePrimitive.LINE_LIST, pose=_pose(), points=points, thickness=3.0, scale_invariant=True, colors=colors
+    )
+    entity = SceneEntity(frame_id=WORLD_FRAME, id="links", lines=[lines])
+    return bytes(SceneUpdate(entities=[entity]).SerializeToString())
 
 
 def _obstacle_entity(obstacles: np.ndarray, safe_distance: float) -> SceneEntity:

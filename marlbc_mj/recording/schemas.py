@@ -13,6 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.communication import components
+from marlbc_mj.supervisors.communication import Hearing
+
+UNKNOWN_AGE = "-"
 SCHEMA_ENCODING = "jsonschema"
 MESSAGE_ENCODING = "json"
 
@@ -116,11 +120,24 @@ SHIELD = Topic(
         "state": MessageField("number", "substeps outside the set of states from which agents can stop in time"),
     },
 )
+COMMUNICATION = Topic(
+    "/communication",
+    "marlbc.Communication",
+    "who hears whom, and how old what each agent knows of the others is, when orders were given",
+    {
+        "component": MessageField("integer", "number of the first agent of its connected component, from 1"),
+        "hears": MessageField("string", "numbers of the agents that it hears directly, from 1"),
+        "ages": MessageField("string", "of what it knows of each agent [s]; - where it knows nothing"),
+        "known": MessageField("integer", "how many agents it knows something of, itself included"),
+        "oldest": MessageField("number", "greatest of the ages [s]"),
+    },
+)
 TOPICS = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-Robots with a free joint have ``POSE`` too, and teams with a shield ``SHIELD``.
+Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and those whose communication is not ideal
+``COMMUNICATION``.
 """
 
 
@@ -152,6 +169,43 @@ def encode_rows(columns: tuple[str, ...], values: np.ndarray) -> str:
         return _template(columns, len(values)) % tuple(numbers)
     rows = [{n: x for n, x in zip(columns, row, strict=True) if math.isfinite(x)} for row in values.tolist()]
     return ",".join(json.dumps(row, separators=(",", ":")) for row in rows)
+
+
+def encode_hearing(hearing: Hearing) -> bytes:
+    """A message on ``COMMUNICATION``; links and ages (N, N) read back bit for bit."""
+    part = components((hearing.link & hearing.link.T)[None])[0]
+    rows = []
+    for first, link, age in zip(part.tolist(), hearing.link, hearing.age.tolist(), strict=True):
+        known = [seconds for seconds in age if math.isfinite(seconds)]
+        row = {
+            "component": first + 1,
+            "hears": " ".join(str(j + 1) for j in np.flatnonzero(link)),
+            "ages": " ".join(repr(seconds) if math.isfinite(seconds) else UNKNOWN_AGE for seconds in age),
+            "known": len(known),
+            "oldest": max(known),
+        }
+        rows.append(json.dumps(row, separators=(",", ":")))
+    return message([], ",".join(rows))
+
+
+def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
+    """Links and ages (N, N) from the rows of a message on ``COMMUNICATION``.
+
+    Raises:
+        ValueError: a row that :func:`encode_hearing` does not write.
+    """
+    agents = len(rows)
+    link, age = np.zeros((agents, agents), dtype=np.bool_), np.empty((agents, agents))
+    for i, row in enumerate(rows):
+        heard = [int(number) for number in row["hears"].split()]
+        if not all(1 <= number <= agents for number in heard):
+            raise ValueError(f"an agent hears {row['hears']}, of {agents} agents")
+        link[i, [number - 1 for number in heard]] = True
+        ages = [math.inf if text == UNKNOWN_AGE else float(text) for text in row["ages"].split()]
+        if len(ages) != agents:
+            raise ValueError(f"an agent knows {len(ages)} ages, of {agents} agents")
+        age[i] = ages
+    return Hearing(link, age)
 
 
 def message(scalars: list[str], rows: str) -> bytes:

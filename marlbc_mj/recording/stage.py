@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.engine.assembly import LEAST_SOLID, POINT_RADIUS, agent_prefix
+from marlbc_mj.recording.links import links_of_log
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, flat_disc, make_trail, ribbon
 from marlbc_mj.util.errors import ConfigurationError
@@ -20,6 +21,7 @@ BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in
 BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
 RIM = 0.14  # width of the white rim around it, in drawn radii
+LINK_WIDTH, LINK_HEIGHT = 0.16, 0.058  # of the strip between two agents that hear each other, above trails and below halos [m]
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
 
 
@@ -69,13 +71,13 @@ class Stage:
         mujoco.mj_forward(self.model, self.data)
 
     def draw(self, scene: mujoco.MjvScene, time: float) -> None:
-        """Add rings, trails, halos and references at ``time`` [s] to a scene, after its model is in it.
+        """Add rings, trails, links, halos and references at ``time`` [s] to a scene, after its model is in it.
 
         Raises:
             ConfigurationError: the scene has no room for them.
         """
         rings = _rings(self.log, time, self.scale) if len(self.log.motions) else self.rings
-        marks = [*rings, *self._trails(time), *self._agents(time)]
+        marks = [*rings, *self._trails(time), *self._links(time), *self._agents(time)]
         if scene.ngeom + len(marks) > scene.maxgeom:
             raise ConfigurationError(f"a scene of {scene.maxgeom} shapes cannot hold {len(marks)} marks")
         for mark in marks:
@@ -89,6 +91,17 @@ class Stage:
     def _trails(self, time: float) -> list[Mark]:
         here = self.sample(self.log.position, time)
         return [mark for i, trail in enumerate(self.trails) for mark in trail.until(time, here[i])]
+
+    def _links(self, time: float) -> list[Mark]:
+        """Who hears whom, where agents talk."""
+        if not self.log.link.shape[1]:
+            return []
+        here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
+        size = LINK_WIDTH * self.scale, LINK_HEIGHT * self.scale
+        return [
+            ribbon(here[i], here[j], *size, tuple(color), self.scale)
+            for (i, j), color in zip(links.ends.tolist(), links.colors().tolist(), strict=True)
+        ]
 
     def _agents(self, time: float) -> list[Mark]:
         """Halos in the color of the command, and the references as ghosts."""

@@ -22,6 +22,7 @@ from mcap_protobuf.schema import register_schema
 
 from marlbc_mj.controllers import Controller, sorlc
 from marlbc_mj.core import laws
+from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import Frame
 from marlbc_mj.recording import schemas
@@ -97,6 +98,7 @@ class LogWriter:
         self._weighted = laws.interface(controller.law).state == sorlc.STATE
         self._posed = len(make_robot(scenario.robot).joints) == 1
         self._shielded = shielded
+        self._communicating = scenario.communication != IDEAL
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]
         self._flushed = monotonic()  # when [s]
@@ -180,7 +182,8 @@ class LogWriter:
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
-        for topic in (*schemas.TOPICS, *[schemas.POSE] * self._posed, *[schemas.SHIELD] * self._shielded):
+        some = ((schemas.POSE, self._posed), (schemas.SHIELD, self._shielded), (schemas.COMMUNICATION, self._communicating))
+        for topic in (*schemas.TOPICS, *(topic for topic, there in some if there)):
             if topic is not schemas.WEIGHTS or self._weighted:
                 text = json.dumps(schemas.json_schema(topic)).encode()
                 schema = self._mcap.register_schema(topic.schema_name, schemas.SCHEMA_ENCODING, text)
@@ -190,7 +193,7 @@ class LogWriter:
     def _messages(self, frame: Frame, stamp: int) -> Iterator[tuple[str, bytes]]:
         """All messages of one mission step."""
         seen, first = frame.observation, frame.first
-        scene, transforms = self._scene.encode(stamp, first.position, first.reference)
+        scene, transforms = self._scene.encode(stamp, first.position, first.reference, frame.hearing)
         yield SCENE_TOPIC, scene
         yield TRANSFORMS_TOPIC, transforms
         motion = np.concatenate([first.position, first.velocity], axis=1)
@@ -204,6 +207,8 @@ class LogWriter:
         if self._shielded and frame.shield is not None:
             interventions, change, breaches = frame.shield
             yield schemas.SHIELD.name, schemas.encode(schemas.SHIELD, np.column_stack([interventions, change, breaches]))
+        if frame.hearing is not None:
+            yield schemas.COMMUNICATION.name, schemas.encode_hearing(frame.hearing)
         if self._weighted:
             yield "/weights", schemas.encode(schemas.WEIGHTS, _weight_table(frame.controller_state))
         verdicts = {"formation": int(seen.formation), "reward": float(frame.reward), "decision_ms": float(frame.decision_ms)}

@@ -8,6 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from marlbc_mj.core.behaviors import AgentAvoidance, Behavior, Formation, ObstacleAvoidance
+from marlbc_mj.core.communication import IDEAL, Communication
 from marlbc_mj.core.disturbances import Disturbance, PaperDrag
 from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
@@ -108,6 +109,7 @@ class Scenario:
     split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # whose layouts are drawn
     # how an order becomes a reference: avoidance as an equality task (12), or as an inequality
     composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
+    communication: Communication = field(default=IDEAL, metadata=YOUNG)  # who hears whom, when, of what share of messages
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
@@ -117,6 +119,7 @@ class Scenario:
         self._check_team()
         self._check_clocks()
         self.imperfections.check(self.agents, self.substep)
+        self.communication.check(np.array(self.starts, dtype=np.float64), self.mission_step)
         self.check_windows(self.schedule)
 
     @property

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from marlbc_mj.core.behaviors import Behavior
+from marlbc_mj.core.communication import IDEAL, Communication
 from marlbc_mj.core.disturbances import Disturbance, PaperDrag
 from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.scenarios.base import Obstacle, Perturbation, Point, Scenario, Window, standard_behaviors
@@ -46,6 +47,7 @@ class Mission:
     speed_limit: float = np.inf  # of references [m/s]
     acceleration_limit: float = np.inf  # of references [m/s^2]
     imperfections: Imperfections = NO_IMPERFECTIONS
+    communication: Communication = IDEAL
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = field(default_factory=Perturbation)
 

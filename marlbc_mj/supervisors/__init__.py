@@ -8,6 +8,7 @@ from marlbc_mj.policies.general import is_general
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
 from marlbc_mj.supervisors.cbf_qp import CBFQP
+from marlbc_mj.supervisors.distributed_lookahead import DistributedLookAhead
 from marlbc_mj.supervisors.fixed import FixedPriority
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
@@ -61,6 +62,7 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
     "fixed": (FixedPriority, "one priority order for ever, FM (classic null-space control, Antonelli & Chiaverini)"),
     "set-based-rule": (SetBasedRule, "avoidance on top only while the formation would break the safe distance; per agent"),
     "lookahead": (LookAhead, "the same, and the column while two lanes of the formation are blocked within 8 s"),
+    "lookahead-distributed": (DistributedLookAhead, "the same without a center: agents tell each other which lanes are blocked"),
     "rollout": (Rollout, "the same, and a search over 14 s of when to form the column and go back (Bertsekas)"),
     "orca": (ORCA, "reciprocal velocity obstacles on the formation's velocity (van den Berg)"),
     "cbf-qp": (CBFQP, "second-order barrier functions on the reference's acceleration (Ames)"),
@@ -70,7 +72,7 @@ ORACLES = ("oracle", "oracle-schedule")
 """Supervisors whose factories take the name of the controller that the schedule was found with."""
 LEARNED = ("marlms", "rlms")
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
-LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "rollout", "orca", "cbf-qp")
+LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "orca", "cbf-qp")
 """Supervisors for layouts that nobody has seen before, to be compared by ``marlbc evaluate``."""
 ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS, "marlms-general")
 """Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
@@ -120,6 +122,7 @@ __all__ = [
     "UNLEARNED",
     "Blend",
     "Decision",
+    "DistributedLookAhead",
     "FixedPriority",
     "FuzzyBlend",
     "General",

@@ -1,0 +1,194 @@
+"""What communication costs a distributed supervisor, and how long agents take to agree."""
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.core.communication import Communication
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episodes
+from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.results.metrics import Metrics, measure
+from marlbc_mj.results.outcomes import outcome_rates
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.formations import column, grid
+from marlbc_mj.studies.draws import DrawsJob, fly_draws
+from marlbc_mj.studies.episodes import check_free
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.supervisors.communication import Consensus, Flooding, Radio
+from marlbc_mj.util.errors import SimulationError
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import provenance
+
+RANGES = (np.inf, 2.0, 1.2)  # in distances between neighbors
+DELAYS = (0.0, 0.1, 0.3)  # [s]
+LOSSES = (0.0, 0.2, 0.5)
+
+
+class Case(NamedTuple):
+    """How a team communicates in one row of the table."""
+
+    range: float  # in distances between neighbors
+    delay: float  # [s]
+    loss: float
+    silent: bool = False  # whether the first agent never sends
+
+    def settings(self, scenario: Scenario) -> Communication:
+        """In metres, for the team of a scenario."""
+        reach = self.range * neighbor_distance(scenario)
+        return Communication(range=reach, delay=self.delay, loss=self.loss, silent=(0,) if self.silent else ())
+
+
+CASES = (
+    *(Case(*numbers) for numbers in product(RANGES, DELAYS, LOSSES)),
+    Case(np.inf, 0.0, 0.0, silent=True),
+    Case(1.2, 0.1, 0.2, silent=True),
+)
+"""Every range, delay and loss; then a silent agent, with good and with bad communication."""
+
+
+def neighbor_distance(scenario: Scenario) -> float:
+    """Greatest distance of a slot of the formation from the nearest other one [m]."""
+    slots = scenario.formations[0]
+    gaps = np.linalg.norm(slots[:, None] - slots[None], axis=-1) + np.diag(np.full(len(slots), np.inf))
+    return float(gaps.min(axis=1).max())
+
+
+@dataclass(frozen=True)
+class CommunicationStudy:
+    """One distributed supervisor in every :class:`Case` on the same draws of every mission."""
+
+    missions: tuple[Scenario, ...]
+    supervisor: str
+    seeds: tuple[int, ...]
+    controller: str = "sorlc"
+    shield: bool = False
+    cases: tuple[Case, ...] = CASES
+
+    def __post_init__(self) -> None:
+        make_supervisor(self.supervisor, self.controller)
+        self.jobs()  # a case that a mission cannot have is refused here
+
+    def pairs(self) -> list[tuple[Scenario, Case]]:
+        """Mission and case of every job."""
+        return list(product(self.missions, self.cases))
+
+    def jobs(self) -> list[DrawsJob]:
+        flown = [replace(mission, communication=case.settings(mission)) for mission, case in self.pairs()]
+        return [DrawsJob(scenario, self.supervisor, self.controller, self.seeds, self.shield) for scenario in flown]
+
+    def run(self, job: DrawsJob, watch: Watch) -> list[Metrics | None]:
+        return fly_together(job)
+
+    def report(self, results: Sequence[list[Metrics | None]], out: Path | None, progress: Progress = silent) -> Report:
+        rows = [case_row(mission, case, metrics) for (mission, case), metrics in zip(self.pairs(), results, strict=True)]
+        if out is not None:
+            with open(out / "communication.csv", "w", newline="") as stream:
+                table = csv.DictWriter(stream, rows[0], lineterminator="\n")
+                table.writeheader()
+                table.writerows(rows)
+            facts = {"supervisor": self.supervisor, "controller": self.controller, "seeds": self.seeds, "shield": self.shield}
+            write_json(out / "config.json", {**facts, "missions": self.missions, **provenance()})
+        return Report(to_markdown(case_table(rows)))
+
+
+def fly_together(job: DrawsJob) -> list[Metrics | None]:
+    """Metrics of every seed, in one batch; None for a run that failed. One by one where a world diverged, to tell which."""
+    law = make_controller(job.controller)
+    world = World(job.scenario, law, worlds=len(job.seeds), record=True, shield=job.shield)
+    try:
+        flown = run_episodes(world, make_supervisor(job.supervisor, job.controller), job.seeds)
+        for trajectory in flown:
+            check_free(trajectory, law)
+    except SimulationError:
+        return [run.metrics for run in fly_draws(job).runs]
+    return [measure(trajectory) for trajectory in flown]
+
+
+def case_row(mission: Scenario, case: Case, metrics: Sequence[Metrics | None]) -> dict[str, Any]:
+    """The numbers of one row; shares have Wilson's interval beside them."""
+    rates = outcome_rates(metrics, mission)
+    flown = [one for one in metrics if one is not None]
+    shares = {name: rates[name] for name in ("success", "violation", "reached", "collided")}
+    return {
+        "mission": mission.name,
+        **case._asdict(),
+        "runs": len(metrics),
+        **{name: share.value for name, share in shares.items()},
+        **{f"{name}_{end}": getattr(shares[name], end) for name in ("success", "violation") for end in ("low", "high")},
+        "switches": float(np.mean([sum(agent["switches"] for agent in one["agents"]) for one in flown])) if flown else np.nan,
+        "return": float(np.median([one["team"]["return"] for one in flown])) if flown else np.nan,
+    }
+
+
+def case_table(rows: Sequence[dict[str, Any]]) -> Table:
+    """Rows of :func:`case_row` for people."""
+    columns = (
+        *(Column("", name, unit) for name, unit in (("mission", ""), ("range", "neighbor distances"), ("delay", "s"))),
+        *(Column("", name, unit) for name, unit in (("loss", "%"), ("silent", ""), ("success", "%"), ("violation", "%"))),
+        *(Column("", name) for name in ("reached", "switches per team", "median return")),
+    )
+    cells = []
+    for row in rows:
+        success, violation = (
+            f"{100 * row[name]:.1f} [{100 * row[f'{name}_low']:.0f}, {100 * row[f'{name}_high']:.0f}]"
+            for name in ("success", "violation")
+        )
+        reach = "full" if row["range"] == np.inf else f"{row['range']:g}"
+        network = reach, f"{row['delay']:g}", f"{100 * row['loss']:g}", "agent 1" if row["silent"] else "–"
+        counts = f"{row['runs'] * row['reached']:.0f} of {row['runs']}", f"{row['switches']:.1f}", f"{row['return']:.0f}"
+        cells.append((row["mission"], *network, success, violation, *counts))
+    return Table("communication", "A distributed supervisor under worse and worse communication", columns, tuple(cells))
+
+
+# Agreement ----------------------------------------------------------------------------------------------------------------------
+
+TEAMS = (
+    ("16 agents in a grid, neighbors 6 m apart", grid(16, 6.0), 9.0),
+    ("64 agents in a grid, neighbors 6 m apart", grid(64, 6.0), 9.0),
+    ("64 agents in a column, 3 m apart", column(grid(64, 6.0), 3.0), 4.0),
+)
+"""Name, places (N, 2) [m] and range [m] of teams that stand still."""
+RATE = 0.05  # between two broadcasts [s]
+CLOSE = 0.01  # agreement of consensus: every estimate is that close to the mean of all places [m]
+PATIENCE = 4000  # mission steps after which nobody waits any longer
+
+
+def time_to_agree(place: np.ndarray, settings: Communication, seed: int = 0) -> float:
+    """How long agents at places (N, 2) [m], which say where they are, take to agree [s]; infinite beyond ``PATIENCE``.
+
+    Under flooding everyone must know all places, under consensus everyone's estimate of their mean must be within ``CLOSE``.
+    """
+    radio = Radio(settings, len(place), RATE)
+    layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
+    memory, mean = layer.start(1, 2), place.mean(axis=0)
+    for k in range(PATIENCE):
+        (heard, stamp), memory = layer.exchange(np.array([k * RATE]), place[None], place[None], memory, np.array([seed]))
+        flooded = settings.protocol == "flooding" and np.isfinite(stamp).all()
+        close = settings.protocol == "consensus" and np.linalg.norm(heard[0, :, 0] - mean, axis=-1).max() <= CLOSE
+        if flooded or close:
+            return k * RATE
+    return float("inf")
+
+
+def agreement_table() -> Table:
+    """Both protocols on all ``TEAMS``, without loss and with a fifth of the messages lost."""
+    rows = []
+    for (name, place, reach), loss in product(TEAMS, (0.0, 0.2)):
+        times = [
+            time_to_agree(place, Communication(protocol=protocol, range=reach, loss=loss))
+            for protocol in ("flooding", "consensus")
+        ]
+        shown = (f"{seconds:.2f}" if np.isfinite(seconds) else f"> {PATIENCE * RATE:.0f}" for seconds in times)
+        rows.append((name, f"{reach:g}", f"{100 * loss:g}", *shown))
+    columns = (Column("", "team"), Column("", "range", "m"), Column("", "loss", "%"))
+    times_to = (Column("time to agree", "flooding", "s"), Column("time to agree", "consensus, to 1 cm", "s"))
+    return Table("agreement", "Time to agree, one broadcast every 0.05 s", (*columns, *times_to), tuple(rows))

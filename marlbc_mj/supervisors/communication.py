@@ -1,0 +1,331 @@
+"""The communication layer: what every agent of B teams has heard of every other, one mission step after the other.
+
+A supervisor that decides agent by agent says at every mission step what each agent has to say, a short *message* of M numbers.
+The layer of the scenario (:class:`~marlbc_mj.core.communication.Communication`) carries it, by one of two protocols:
+
+- **Flooding.** Everyone keeps the newest message of everyone, with the time at which its author sent it, and broadcasts that
+  whole table every period; of two entries the newer one wins. After as many periods as the graph's diameter everyone knows
+  everyone of its connected component. One hop takes one period, or the delay where that is longer.
+- **Consensus.** First-order dynamic average consensus (Kia et al. 2019): everyone keeps an estimate x of the mean message m,
+  x_i <- x_i - eps sum_j a_ij (x_i - x_j) + dm_i, with eps = 1 and Metropolis weights a_ij = 1 / (1 + max(d_i, d_j)). A pair
+  moves only if both the message and its acknowledgment arrive, both by the same amount, so whatever is lost, the sum of all x
+  stays the sum of all m. A round takes two delays, or the period where that is longer. What an agent hears "of j" is its own
+  estimate, whoever j is: means and sums can be read from it, least and greatest entries cannot.
+
+While a team is in parts, each part has what its members say and what was heard of the others before; the time stamps tell how old
+that is. What to make of it is the supervisor's business.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from marlbc_mj.core.communication import IDEAL, Communication, within_range
+from marlbc_mj.core.imperfections import uniform
+from marlbc_mj.scenarios import Scenario
+
+NEVER_HEARD = -np.inf
+"""Time stamp of what was never heard [s]."""
+_NOT_YET = -1
+"""Mission step of a team that has not exchanged anything."""
+
+
+class Knowledge(NamedTuple):
+    """What agents know of each other."""
+
+    heard: np.ndarray  # (B, N, N, M) row i: what agent i last heard of each agent, itself included; zeros where never
+    stamp: np.ndarray  # (B, N, N) when the author sent that [s]; NEVER_HEARD
+
+
+class Hearing(NamedTuple):
+    """Who hears whom at one moment of B teams, for logs."""
+
+    link: np.ndarray  # (B, N, N) bool: agent i is in range of j, which sends
+    age: np.ndarray  # (B, N, N) of what agent i knows of j, to the microsecond [s]; infinite where it knows nothing
+
+    def team(self, b: int) -> "Hearing":
+        """Of team ``b`` alone, (N, N) each."""
+        return Hearing(self.link[b], self.age[b])
+
+
+def hearing(memory: Any, time: np.ndarray) -> Hearing | None:
+    """From the memory of a supervisor whose field ``network`` is that of a layer, at times (B,) [s]; None of any other."""
+    network = getattr(memory, "network", None)
+    if network is None:
+        return None
+    return Hearing(network.link.copy(), np.round(time[:, None, None] - network.stamp, 6))
+
+
+class Layer(Protocol):
+    """Carries messages; made by :func:`make_layer`. It holds no state: what is under way travels in the memory."""
+
+    def start(self, teams: int, size: int) -> Any:
+        """Memory of B ``teams`` whose messages have M = ``size`` numbers; nothing has been heard.
+
+        It has fields ``link``, (B, N, N) bool, whether agent i was in range of j, which was not silent, at the last exchange, and
+        ``stamp`` as :class:`Knowledge` has it.
+        """
+        ...
+
+    def exchange(
+        self, time: np.ndarray, position: np.ndarray, message: np.ndarray, memory: Any, seed: np.ndarray | None = None
+    ) -> tuple[Knowledge, Any]:
+        """One mission step: what arrives now is heard, and who is due broadcasts. To be called at every mission step.
+
+        A team whose time is not later than at its last exchange begins anew.
+
+        Args:
+            time: (B,) [s].
+            position: (B, N, 2) [m].
+            message: (B, N, M) what each agent has to say now.
+            memory: from :meth:`start` or the last exchange.
+            seed: (B,) whose losses are drawn, ``observation.noise_seed``; zeros if it is left out.
+
+        Returns:
+            What every agent knows now, and the memory for the next exchange.
+        """
+        ...
+
+    def forget(self, memory: Any, teams: np.ndarray) -> Any:
+        """The memory, with ``teams`` (B,) bool as they start."""
+        ...
+
+
+def make_layer(scenario: Scenario) -> Layer:
+    """The layer of a scenario."""
+    radio = Radio(scenario.communication, scenario.agents, scenario.mission_step)
+    return Consensus(radio) if scenario.communication.protocol == "consensus" else Flooding(radio)
+
+
+@dataclass(frozen=True)
+class Radio:
+    """What both protocols share: who can hear whom, and whose messages are lost."""
+
+    communication: Communication
+    agents: int
+    mission_step: float  # [s]
+
+    def steps(self, seconds: float) -> int:
+        """A time in whole mission steps."""
+        return round(seconds / self.mission_step)
+
+    def count(self, time: np.ndarray) -> np.ndarray:
+        """(B,) int64, mission steps at times (B,) [s]."""
+        return np.rint(time / self.mission_step).astype(np.int64)
+
+    def link(self, time: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """(B, N, N) bool: whether agent i is in range of j, and j sends."""
+        settings = self.communication
+        near = within_range(position, settings.range)
+        if not settings.silent:
+            return near
+        mute = np.zeros((len(time), self.agents), dtype=np.bool_)
+        mute[:, list(settings.silent)] = (time >= settings.silent_from - 1e-9)[:, None]
+        return np.asarray(near & ~mute[:, None, :])
+
+    def arrives(self, count: np.ndarray, seed: np.ndarray | None) -> np.ndarray:
+        """(B, N, N) bool: whether what j sends to i at mission steps ``count`` (B,) is not lost."""
+        if self.communication.loss == 0.0:
+            return np.ones((len(count), self.agents, self.agents), dtype=np.bool_)
+        seeds = np.zeros(len(count), dtype=np.int64) if seed is None else seed
+        streams = np.arange(self.agents * self.agents).reshape(self.agents, self.agents)
+        return np.asarray(uniform(seeds, count, streams) >= self.communication.loss)
+
+
+# Flooding -----------------------------------------------------------------------------------------------------------------------
+
+
+class Broadcast(NamedTuple):
+    """The tables that agents of B teams sent at one mission step."""
+
+    arrival: np.ndarray  # (B,) int64, mission step at which they are heard
+    hears: np.ndarray  # (B, N, N) bool: whether agent i hears j's
+    knowledge: Knowledge  # as it was sent
+
+
+class Flood(NamedTuple):
+    """Memory of :class:`Flooding`. Arrays are never written to again, so that broadcasts under way can share them."""
+
+    count: np.ndarray  # (B,) int64, mission step of the last exchange
+    due: np.ndarray  # (B,) int64, mission step of the next broadcast
+    heard: np.ndarray  # of Knowledge
+    stamp: np.ndarray
+    link: np.ndarray  # (B, N, N) bool
+    under_way: tuple[Broadcast, ...] = ()
+
+
+@dataclass(frozen=True)
+class Flooding:
+    """Time-stamped flooding; see the module."""
+
+    radio: Radio
+
+    def start(self, teams: int, size: int) -> Flood:
+        agents = self.radio.agents
+        pairs = (teams, agents, agents)
+        never = np.full(pairs, NEVER_HEARD)
+        count = np.full(teams, _NOT_YET)
+        return Flood(count, np.zeros(teams, dtype=np.int64), np.zeros((*pairs, size)), never, np.zeros(pairs, dtype=np.bool_))
+
+    def exchange(
+        self, time: np.ndarray, position: np.ndarray, message: np.ndarray, memory: Flood, seed: np.ndarray | None = None
+    ) -> tuple[Knowledge, Flood]:
+        radio, settings = self.radio, self.radio.communication
+        if settings == IDEAL:
+            return self._ideal(time, position, message)
+        count = radio.count(time)
+        memory = self.forget(memory, count <= memory.count)
+        knowledge, under_way = _deliver(_with_own(memory, time, message), count, memory.under_way)
+        link, due = radio.link(time, position), count >= memory.due
+        if due.any():
+            hears = link & radio.arrives(count, seed) & due[:, None, None]
+            under_way = (*under_way, Broadcast(count + radio.steps(settings.delay), hears, knowledge))
+            knowledge, under_way = _deliver(knowledge, count, under_way)
+        next_due = np.where(due, count + max(1, radio.steps(settings.period)), memory.due)
+        return knowledge, Flood(count, next_due, *knowledge, link, under_way)
+
+    def _ideal(self, time: np.ndarray, position: np.ndarray, message: np.ndarray) -> tuple[Knowledge, Flood]:
+        """The limit of infinite range, no delay and no loss."""
+        pairs = (len(time), self.radio.agents, self.radio.agents)
+        heard = np.broadcast_to(message[:, None], (*pairs, message.shape[2]))
+        knowledge = Knowledge(heard, np.broadcast_to(time[:, None, None], pairs))
+        count = self.radio.count(time)
+        return knowledge, Flood(count, count + 1, *knowledge, self.radio.link(time, position))
+
+    def forget(self, memory: Flood, teams: np.ndarray) -> Flood:
+        if not teams.any():
+            return memory
+        fresh = self.start(len(teams), memory.heard.shape[3])
+        under_way = tuple(sent._replace(hears=sent.hears & ~teams[:, None, None]) for sent in memory.under_way)
+        others = (_where(teams, new, old) for new, old in zip(fresh[:-1], memory[:-1], strict=True))
+        return Flood(*others, under_way)
+
+
+def _with_own(memory: Flood, time: np.ndarray, message: np.ndarray) -> Knowledge:
+    """What agents knew, and what each has to say now at ``time`` (B,) [s]."""
+    heard, stamp = memory.heard.copy(), memory.stamp.copy()
+    own = np.arange(message.shape[1])
+    heard[:, own, own], stamp[:, own, own] = message, time[:, None]
+    return Knowledge(heard, stamp)
+
+
+def _deliver(
+    knowledge: Knowledge, count: np.ndarray, under_way: tuple[Broadcast, ...]
+) -> tuple[Knowledge, tuple[Broadcast, ...]]:
+    """What agents know after all broadcasts that have arrived by mission steps ``count`` (B,), and the others."""
+    later = []
+    for sent in under_way:
+        arrived = sent.arrival <= count
+        if arrived.all():
+            knowledge = _newest(knowledge, sent.knowledge, sent.hears)
+        elif arrived.any():
+            knowledge = _newest(knowledge, sent.knowledge, sent.hears & arrived[:, None, None])
+            later.append(sent._replace(hears=sent.hears & ~arrived[:, None, None]))
+        else:
+            later.append(sent)
+    return knowledge, tuple(later)
+
+
+def _newest(knowledge: Knowledge, sent: Knowledge, hears: np.ndarray) -> Knowledge:
+    """Of every agent's own entry and those of the tables that it ``hears`` (B, N, N), the newest."""
+    if not hears.any():
+        return knowledge
+    offered = np.where(hears[..., None], sent.stamp[:, None], NEVER_HEARD)  # (B, i, j, k): what j tells i of k
+    newer = offered.max(axis=2) > knowledge.stamp
+    teams, _, authors = np.nonzero(newer)
+    senders = offered.argmax(axis=2)[newer]
+    heard, stamp = knowledge.heard.copy(), knowledge.stamp.copy()
+    stamp[newer] = sent.stamp[teams, senders, authors]
+    heard[newer] = sent.heard[teams, senders, authors]
+    return Knowledge(heard, stamp)
+
+
+# Consensus ----------------------------------------------------------------------------------------------------------------------
+
+
+class Handshakes(NamedTuple):
+    """The round of B teams that is under way; after it has ended, one that changes nothing."""
+
+    arrival: np.ndarray  # (B,) int64, mission step at which acknowledgments are back
+    met: np.ndarray  # (B, N) bool: who shakes hands with somebody
+    change: np.ndarray  # (B, N, M) of the estimates
+
+
+class Estimates(NamedTuple):
+    """Memory of :class:`Consensus`."""
+
+    count: np.ndarray  # (B,) int64, mission step of the last exchange
+    due: np.ndarray  # (B,) int64, mission step of the next round
+    estimate: np.ndarray  # (B, N, M) x
+    message: np.ndarray  # (B, N, M) m at the last exchange
+    stamp: np.ndarray  # (B, N, N) own: now; of others: the agent's last handshake [s]
+    link: np.ndarray  # (B, N, N) bool
+    under_way: Handshakes
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """Dynamic average consensus; see the module."""
+
+    radio: Radio
+
+    def start(self, teams: int, size: int) -> Estimates:
+        agents = self.radio.agents
+        zeros, none, pairs = np.zeros((teams, agents, size)), np.zeros(teams, dtype=np.int64), (teams, agents, agents)
+        nothing = Handshakes(none, np.zeros((teams, agents), dtype=np.bool_), zeros)
+        never, apart = np.full(pairs, NEVER_HEARD), np.zeros(pairs, dtype=np.bool_)
+        return Estimates(np.full(teams, _NOT_YET), none, zeros, zeros, never, apart, nothing)
+
+    def exchange(
+        self, time: np.ndarray, position: np.ndarray, message: np.ndarray, memory: Estimates, seed: np.ndarray | None = None
+    ) -> tuple[Knowledge, Estimates]:
+        radio, settings = self.radio, self.radio.communication
+        count = radio.count(time)
+        memory = self.forget(memory, count <= memory.count)
+        shared = memory._replace(count=count, estimate=memory.estimate + message - memory.message, message=message)
+        shared = _shake(shared._replace(link=radio.link(time, position)), time)
+        due, duration = count >= memory.due, 2 * radio.steps(settings.delay)
+        if due.any():
+            begun = _begin(shared, radio.arrives(count, seed) & due[:, None, None], duration)
+            under_way = Handshakes(*(_where(due, new, old) for new, old in zip(begun, shared.under_way, strict=True)))
+            next_due = np.where(due, count + max(1, duration, radio.steps(settings.period)), memory.due)
+            shared = _shake(shared._replace(due=next_due, under_way=under_way), time)
+        own = np.arange(radio.agents)
+        shared.stamp[:, own, own] = time[:, None]
+        heard = np.broadcast_to(shared.estimate[:, :, None], (*shared.stamp.shape, message.shape[2]))
+        return Knowledge(heard, shared.stamp), shared
+
+    def forget(self, memory: Estimates, teams: np.ndarray) -> Estimates:
+        if not teams.any():
+            return memory
+        fresh = self.start(len(teams), memory.message.shape[2])
+        under_way = Handshakes(*(_where(teams, new, old) for new, old in zip(fresh.under_way, memory.under_way, strict=True)))
+        others = (_where(teams, new, old) for new, old in zip(fresh[:-1], memory[:-1], strict=True))
+        return Estimates(*others, under_way)
+
+
+def _begin(shared: Estimates, arrives: np.ndarray, duration: int) -> Handshakes:
+    """A round of handshakes between neighbors whose message and acknowledgment both arrive, (B, N, N); it takes ``duration``."""
+    link = shared.link & shared.link.transpose(0, 2, 1)
+    degree = link.sum(axis=2)
+    weight = 1.0 / (1.0 + np.maximum(degree[:, :, None], degree[:, None]))
+    met = link & arrives & arrives.transpose(0, 2, 1)
+    weight = weight * met
+    change = weight @ shared.estimate - weight.sum(axis=2)[..., None] * shared.estimate
+    return Handshakes(shared.count + duration, met.any(axis=2), change)
+
+
+def _shake(shared: Estimates, time: np.ndarray) -> Estimates:
+    """The estimates of B teams after the round that is under way, where it has ended by ``time`` (B,) [s]."""
+    arrival, met, change = shared.under_way
+    ended = arrival <= shared.count
+    estimate = shared.estimate + change * ended[:, None, None]
+    stamp = np.where((met & ended[:, None])[:, :, None], time[:, None, None], shared.stamp)
+    left = Handshakes(arrival, met & ~ended[:, None], change * ~ended[:, None, None])
+    return shared._replace(estimate=estimate, stamp=stamp, under_way=left)
+
+
+def _where(teams: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
+    """``new`` for the ``teams`` (B,), ``old`` for the others, along the first axis."""
+    return np.asarray(np.where(teams.reshape(-1, *[1] * (new.ndim - 1)), new, old))

@@ -1,0 +1,45 @@
+"""Dataclasses with fields replaced by texts of a command line, ``name=value``."""
+
+from dataclasses import is_dataclass, replace
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.settings import annotations, convert, texts
+
+_TEXTS = texts()
+
+
+class _Dataclass(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+
+Settings = TypeVar("Settings", bound=_Dataclass)
+
+
+def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "") -> Settings:
+    """A frozen dataclass with fields replaced by ``name=value`` texts; ``outer.inner=value`` reaches a nested one.
+
+    Args:
+        config: the dataclass.
+        settings: the texts; ``hidden=64,64`` gives a tuple.
+        prefix: text before the fields' names in messages.
+
+    Raises:
+        ConfigurationError: no such field, or a value of the wrong kind.
+    """
+    for setting in settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--set takes name=value, got {setting!r}")
+        outer, dot, inner = name.partition(".")
+        hints = annotations(type(config))
+        if outer not in hints or (dot and not is_dataclass(hints[outer])):
+            raise unknown("setting", prefix + (outer if outer not in hints else name), (prefix + hint for hint in hints))
+        if dot:
+            value = with_settings(getattr(config, outer), (f"{inner}={text}",), f"{outer}.")
+        else:
+            value = convert(_TEXTS, text, hints[outer], f"setting {prefix}{outer}")
+        config = replace(config, **{outer: value})
+    return config
