@@ -11,9 +11,9 @@ README = Path(__file__).parent.parent / "README.md"
 
 
 def test_python_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The README's Python blocks, one after the other as one module, run; the user's laws among them run compiled."""
+    """The README's Python blocks, one after the other as one module, run, and run compiled."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
-    assert len(blocks) >= 5
+    assert blocks
     (tmp_path / "readme_blocks.py").write_text("\n".join(blocks))
     monkeypatch.syspath_prepend(tmp_path)
     module = importlib.import_module("readme_blocks")
@@ -27,8 +27,18 @@ def test_commands_exist() -> None:
 
     text = README.read_text()
     source = Path(cli.__file__).read_text()
-    for name in set(re.findall(r"`marlbc (\w+)", text)):
+    names = set(re.findall(r"(?:`|^)marlbc (\w+)", text, re.MULTILINE))
+    assert len(names) >= 5
+    for name in names:
         assert f'subcommand("{name}")' in source, name
     makefile = (README.parent / "Makefile").read_text()
     for target in set(re.findall(r"make (\w+)", text)) & {"benchmark", "test", "lint", "clean"}:
         assert f"\n{target}:" in makefile, target
+
+
+def test_it_is_short_enough_to_be_read() -> None:
+    """In five minutes, with time left to try it; and what it links to is there."""
+    text = README.read_text()
+    assert len(text.split()) <= 900
+    for target in re.findall(r"\]\((?!http)([^)#]+)", text):
+        assert (README.parent / target).exists(), target

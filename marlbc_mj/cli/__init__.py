@@ -4,7 +4,7 @@ from typing import Annotated
 
 from tyro.conf import subcommand
 
-from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand
+from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, SafetyCommand
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand
@@ -28,6 +28,7 @@ Command = (
     Annotated[BenchCommand, subcommand("bench")]
     | Annotated[RunCommand, subcommand("run")]
     | Annotated[EvaluateCommand, subcommand("evaluate")]
+    | Annotated[SafetyCommand, subcommand("safety")]
     | Annotated[TrainCommand, subcommand("train")]
     | Annotated[ShipCommand, subcommand("ship")]
     | Annotated[ExportCommand, subcommand("export")]

@@ -1,4 +1,4 @@
-"""``marlbc bench``, ``run`` and ``evaluate``, and the changes to a scenario that they share."""
+"""``marlbc bench``, ``run``, ``evaluate`` and ``safety``, and the changes to a scenario that they share."""
 
 import sys
 from dataclasses import dataclass, field, fields
@@ -257,3 +257,50 @@ class EvaluateCommand:
     def scenario_flown(self) -> "Scenario":
         """The scenario with the team and the changes of the command line."""
         return self.options.build(self.scenario, agents=self.agents, formation=self.formation)
+
+
+@dataclass(frozen=True)
+class SafetyCommand:
+    """Run supervisors on several missions, under both compositions, without a shield and with one: one table of outcomes.
+
+    Missions are held-out layouts of families, or draws around the case study with its drag multiplied by 0, 2 or 5:
+    paper-drag-0, paper-drag-2 and paper-drag-5.
+    """
+
+    missions: Positional[tuple[str, ...]] = ("field", "forest", "gates", "corridor", "traffic")
+    """Scenarios that draw layouts, see `marlbc list`, or draws around the case study."""
+    supervisors: tuple[str, ...] | None = None
+    """Supervisors to run; by default every one that needs neither learning nor a known map, and scripted."""
+    compositions: tuple[str, ...] = ("null-space", "set-based")
+    """How orders become references."""
+    shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
+    """Whether agents have a shield."""
+    layouts: int = 1000
+    """Layouts of every supervisor on every mission."""
+    searched: int = 100
+    """Layouts of mpcms and rollout, which take seconds each."""
+    seed: int = 70_000
+    """First seed of the layouts."""
+    controller: str = "sorlc"
+    """Controller that all run with."""
+    workers: int = 1
+    """Processes that share the layouts."""
+    out: Path = Path("out/safety")
+    """Folder of the tables."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+
+    def run(self) -> None:
+        """Run the study, and print its tables."""
+        from marlbc_mj.studies.runner import run_study
+        from marlbc_mj.studies.safety import SafetyStudy
+
+        names = ("missions", "compositions", "layouts", "searched", "seed", "controller")
+        settings: dict[str, Any] = {name: getattr(self, name) for name in names}
+        if self.supervisors is not None:
+            settings["supervisors"] = self.supervisors
+        study = SafetyStudy(**settings, shields=tuple(shield == "yes" for shield in self.shields))
+        with progress_bars() as progress:
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=progress)
+        print(done.report.text)
+        print(f"{self.out / 'safety.csv'} has all numbers")

@@ -125,7 +125,10 @@ def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def threaded(function: Law) -> Law:
-    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads."""
+    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads.
+
+    Such a loop counts in uint64. It should hand on ``np.int64`` of that: otherwise whatever it calls is compiled once more.
+    """
     return _jit(function, parallel=True)
 
 

@@ -1,6 +1,7 @@
 """How the compiled loop is called: what a World hands over is bundled once, and worlds are stepped in series or by threads."""
 
 import numba
+import numpy as np
 from numba import types
 from numba.experimental import structref
 
@@ -26,36 +27,11 @@ def bundle(mission, behaviors, native, plant, team, record):
     return Arguments(mission, behaviors, native, plant, team, record)
 
 
-@threaded
-def _step_parallel(worlds, orders, given, mission, behaviors, native, plant, team, record):
-    failed = 0
-    for b in numba.prange(worlds):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
 @compiled
-def step_parallel(orders, given, a):
-    """:func:`mission_step` of every world, shared out over numba's threads; the same numbers as in series."""
-    worlds = a.team.steps.shape[0]
-    return _step_parallel(worlds, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+def play(b, sequence, given, mission, behaviors, native, plant, team, record):
+    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
 
-
-@compiled
-def step_serial(orders, given, a):
-    """:func:`mission_step` of every world, one after the other. Returns how many failed."""
-    mission, behaviors, native, plant, team, record = a.mission, a.behaviors, a.native, a.plant, a.team, a.record
-    failed = 0
-    for b in range(team.steps.shape[0]):
-        failed += mission_step(b, orders, given, mission, behaviors, native, plant, team, record)
-    return failed
-
-
-@compiled
-def roll_out(b, sequence, given, mission, behaviors, native, plant, team, record):
-    """MissionRules steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
-
-    Returns the sum of rewards, up to the step that failed if one did.
+    Returns the sum of rewards, up to the step that failed if one did; ``team.status`` tells.
     """
     total = 0.0
     for m in range(sequence.shape[0]):
@@ -66,19 +42,24 @@ def roll_out(b, sequence, given, mission, behaviors, native, plant, team, record
 
 
 @threaded
-def _rollout_parallel(returns, sequence, given, mission, behaviors, native, plant, team, record):
+def _share_out(returns, sequence, given, mission, behaviors, native, plant, team, record):
     for b in numba.prange(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, mission, behaviors, native, plant, team, record)
+        returns[b] = play(np.int64(b), sequence, given, mission, behaviors, native, plant, team, record)
 
 
 @compiled
-def rollout_parallel(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series."""
-    _rollout_parallel(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+def play_parallel(returns, sequence, given, a):
+    """:func:`play` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series.
+
+    Returns how many worlds failed.
+    """
+    _share_out(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    return np.count_nonzero(a.team.status)
 
 
 @compiled
-def rollout_serial(returns, sequence, given, a):
-    """:func:`roll_out` of every world into ``returns`` (B,), one after the other."""
+def play_serial(returns, sequence, given, a):
+    """:func:`play` of every world into ``returns`` (B,), one after the other. Returns how many worlds failed."""
     for b in range(returns.shape[0]):
-        returns[b] = roll_out(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+        returns[b] = play(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    return np.count_nonzero(a.team.status)

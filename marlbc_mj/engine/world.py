@@ -82,6 +82,7 @@ class World:
         self.data = [mujoco.MjData(self.plan.model) for _ in range(worlds)]
         self._record = team.make_record(self.plan, worlds, record)
         self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
+        self._returns = np.zeros(worlds)
         self._arguments = self._make_arguments()
         self.reset()
 
@@ -115,10 +116,18 @@ class World:
         if mask is not None and np.asarray(mask).dtype != np.bool_:
             raise ConfigurationError(f"mask must be bool, got {np.asarray(mask).dtype}")
         for b in range(self.worlds) if mask is None else np.flatnonzero(mask):
-            starts = team.reset(self.plan, self.state, int(b), stream(seed, int(b)))
-            mujoco.mj_resetData(self.plan.model, self.data[b])
-            team.put(self.plan, self.state, int(b), self.data[b], starts, np.zeros_like(starts))
+            self.begin(int(b), stream(seed, int(b)))
         return self.observe()
+
+    def begin(self, b: int, rng: np.random.Generator) -> None:
+        """Start an episode drawn with ``rng`` in world ``b`` alone; ``stream(s)`` draws what one world alone does under seed s.
+
+        Raises:
+            ConfigurationError: nothing can be flown for this draw; the world is as it was.
+        """
+        starts = team.reset(self.plan, self.state, b, rng)
+        mujoco.mj_resetData(self.plan.model, self.data[b])
+        team.put(self.plan, self.state, b, self.data[b], starts, np.zeros_like(starts))
 
     def copy_world(self, source: "World", source_world: int, world: int) -> None:
         """Put ``world`` in the state of another World's world: physics, references, controllers, clock. Same plan expected.
@@ -181,11 +190,20 @@ class World:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
             SimulationError: a number left the physical range or is NaN; names world, agent and time.
         """
+        step = self.try_step(orders, velocity)
+        self.raise_if_diverged()
+        return step
+
+    def try_step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
+        """:meth:`step`, but worlds that diverge stop no other: ``state.status`` is not 0 where one did.
+
+        Raises:
+            ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
+        """
         orders = self._checked(orders)
         if velocity is not None:
             velocity = self._checked_velocity(velocity)
-        if self.advance(orders, velocity):
-            self.raise_if_diverged()
+        self.advance(orders, velocity)
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 
@@ -209,14 +227,14 @@ class World:
             raise ConfigurationError(f"orders must have shape (steps, worlds, agents), got {sequence.shape}")
         sequence = np.stack([self._checked(row) for row in sequence])
         returns = np.zeros(self.worlds)
-        run = drivers.rollout_serial if self._serial() else drivers.rollout_parallel
-        run(returns, sequence, self._orders_alone, self._arguments)
+        self._play(returns, sequence, self._orders_alone)
         self.raise_if_diverged()
         return returns
 
-    def _serial(self) -> bool:
-        """Whether one thread does it all; otherwise numba has been told how many there are."""
-        return bool(self.worlds == 1 or not threads_usable(self.threads))
+    def _play(self, returns: np.ndarray, sequence: np.ndarray, given: np.ndarray) -> int:
+        """The compiled loop, on one thread or on several; how many worlds failed."""
+        run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
+        return int(run(returns, sequence, given, self._arguments))
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
@@ -230,8 +248,7 @@ class World:
         """
         given = self._orders_alone if velocity is None else velocity
         if self.native:
-            run = drivers.step_serial if self._serial() else drivers.step_parallel
-            return int(run(orders, given, self._arguments))
+            return self._play(self._returns, orders[np.newaxis], given)
         mission_step = laws.plain(loop.mission_step)
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 

@@ -1,24 +1,23 @@
-"""Every method on the same draws around a scenario: a job is one method on all seeds, in one world reset from seed to seed."""
+"""Every method on the same draws around a scenario: a job is one method on up to a hundred seeds, many at a time."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
-from marlbc_mj.controllers import Controller, make_controller
-from marlbc_mj.engine.world import World
-from marlbc_mj.episode import run_episode
+from marlbc_mj.controllers import make_controller
 from marlbc_mj.report.seed_page import write_seed_report
-from marlbc_mj.results.metrics import measure
-from marlbc_mj.results.seeds import Instance, MethodRuns, SeedResults, SeedRun, seed_range
+from marlbc_mj.results.seeds import MethodRuns, SeedResults, seed_range
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.scenarios import Perturbation, Scenario
+from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.bench import BenchConfig, describe
-from marlbc_mj.studies.episodes import check_free
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_jobs, run_study
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 
@@ -28,10 +27,12 @@ CASE_STUDY_PERTURBATION = Perturbation(start_spread=1.0, obstacle_spread=0.5, dr
 A slot of the case study passes its points at 1 m and the gate is 8 m wide, so 0.5 m moves when a supervisor has to act, not
 whether the mission can be done. A schedule fixed in time may violate then; that is an outcome.
 """
+SEEDS_PER_JOB = 100
+"""So that a study has more jobs than workers, and a job is soon done again."""
 
 
 class DrawsJob(NamedTuple):
-    """One method on every seed."""
+    """One method on some seeds."""
 
     scenario: Scenario
     supervisor: str
@@ -76,14 +77,17 @@ class DrawsStudy:
 
     def jobs(self) -> list[DrawsJob]:
         shield = self.config is not None and self.config.shield
-        return [DrawsJob(self.scenario, *method, self.seeds, shield) for method in self.methods]
+        parts = [self.seeds[first : first + SEEDS_PER_JOB] for first in range(0, len(self.seeds), SEEDS_PER_JOB)]
+        return [DrawsJob(self.scenario, *method, seeds, shield) for method in self.methods for seeds in parts]
 
     def run(self, job: DrawsJob, watch: Watch) -> MethodRuns:
         return fly_draws(job, watch.progress)
 
     def gather(self, runs: Sequence[MethodRuns]) -> SeedResults:
         """The whole matrix from the results of all jobs."""
-        return SeedResults(self.scenario, self.seeds, tuple(runs), self.against or method_key(*self.methods[0]))
+        methods = groupby(runs, lambda part: (part.supervisor, part.controller))
+        whole = (MethodRuns(*names, tuple(chain.from_iterable(part.runs for part in parts))) for names, parts in methods)
+        return SeedResults(self.scenario, self.seeds, tuple(whole), self.against or method_key(*self.methods[0]))
 
     def report(self, results: Sequence[MethodRuns], out: Path | None, progress: Progress = silent) -> Report:
         if out is not None:
@@ -102,7 +106,8 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
     """
     seeds = seed_range(config.seeds or 0, config.seed)
     study = DrawsStudy(perturbed(scenario), tuple(config.methods), seeds, config.against, config)
-    done = run_study(study, out, overwrite=config.overwrite, workers=config.workers, progress=progress or silent)
+    told = tallied(study.methods, len(seeds), progress or silent)
+    done = run_study(study, out, overwrite=config.overwrite, workers=config.workers, progress=told)
     return study.gather(done.results)
 
 
@@ -131,7 +136,8 @@ def run_methods(
         ConfigurationError: unknown names, no or repeated methods or seeds; nothing has been run then.
     """
     study = DrawsStudy(perturbed(scenario), tuple(methods), tuple(seeds), reference)
-    return study.gather(run_jobs(study, workers=workers, progress=progress or silent))
+    told = tallied(study.methods, len(study.seeds), progress or silent)
+    return study.gather(run_jobs(study, workers=workers, progress=told))
 
 
 def perturbed(scenario: Scenario) -> Scenario:
@@ -147,31 +153,17 @@ def with_drag_range(scenario: Scenario, drag_range: tuple[float, float]) -> Scen
 
 
 def fly_draws(job: DrawsJob, progress: Progress = silent) -> MethodRuns:
-    """One method on every seed; ``progress`` is called with how many seeds are done."""
-    law = make_controller(job.controller)
-    try:
-        world = World(job.scenario, law, record=True, shield=job.shield)
-    except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
-        refused = tuple(SeedRun(seed, None, failure=str(error)) for seed in job.seeds)
-        return MethodRuns(job.supervisor, job.controller, refused)
-    runs = []
-    for done, seed in enumerate(job.seeds):
-        runs.append(fly_seed(world, law, job.supervisor, job.controller, seed))
-        progress(method_key(job.supervisor, job.controller), done + 1, len(job.seeds))
-    return MethodRuns(job.supervisor, job.controller, tuple(runs))
+    """One method on the seeds of a job; ``progress`` is called for every seed."""
+    runs = evaluate_batch(job.scenario, job.seeds, job.supervisor, job.controller, shield=job.shield, progress=progress)
+    return MethodRuns(job.supervisor, job.controller, runs)
 
 
-def fly_seed(world: World, law: Controller, supervisor: str, controller: str, seed: int) -> SeedRun:
-    """One episode in a world made with ``record=True``; its trajectory is measured and let go."""
-    try:
-        world.reset(seed)
-    except ConfigurationError as error:  # no layout was found for this seed
-        return SeedRun(seed, None, failure=str(error))
-    state = world.state
-    instance = Instance(state.position[0].copy(), state.obstacles[0, :, :3].copy(), float(state.disturbance_params[0, 0]))
-    try:
-        trajectory = run_episode(world, make_supervisor(supervisor, controller), seed=seed, names=(supervisor, controller))
-        check_free(trajectory, law)
-        return SeedRun(seed, instance, metrics=measure(trajectory))
-    except (ConfigurationError, SimulationError) as error:  # a supervisor that cannot start here is an outcome too
-        return SeedRun(seed, instance, failure=str(error))
+def tallied(methods: Sequence[tuple[str, str]], total: int, progress: Progress) -> Progress:
+    """Progress of whole methods, ``total`` seeds each, from that of their jobs, which tell every seed once."""
+    keys, done = {method_key(*method) for method in methods}, Counter[str]()
+
+    def tell(what: str, part: float, of: float) -> None:
+        done[what] += 1
+        progress(what, *((done[what], total) if what in keys else (part, of)))
+
+    return tell

@@ -156,7 +156,7 @@ def _judge_serial(kinematic, behaviors, problem, teams, pairs, scratch, trails, 
 def _judge_parallel(kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
     """:func:`judge_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
     for c in numba.prange(costs.shape[0]):
-        judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
+        judge_pair(np.int64(c), kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
 
 
 def judge_pairs(

@@ -1,0 +1,8 @@
+"""One episode: the scripted supervisor and the controller of the paper, on the first 20 s of the case study."""
+
+from marlbc_mj import Scripted, World, measure, paper, run_episode
+
+trajectory = run_episode(World(paper(duration=20.0), record=True), Scripted())
+metrics = measure(trajectory)
+print("return", metrics["team"]["return"])
+print("least clearance of each agent [m]", [round(agent["clearance_min"], 2) for agent in metrics["agents"]])

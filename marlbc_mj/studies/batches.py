@@ -1,0 +1,229 @@
+"""Many draws of a scenario side by side in one World: flown together, measured one by one, and let go.
+
+Worlds and teams do not interact. So what comes of a draw, its metrics or the reason why there are none, is to the bit what
+:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only the time of a decision is another: that of all teams
+together, shared out evenly.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from time import perf_counter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import Controller, make_controller
+from marlbc_mj.core.shield import ShieldCounts
+from marlbc_mj.engine import team
+from marlbc_mj.engine.loop import Record, Team
+from marlbc_mj.engine.world import Step, World
+from marlbc_mj.episode import Trajectory
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.seeds import Instance, SeedRun
+from marlbc_mj.results.summary import method_key
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.studies.episodes import check_free
+from marlbc_mj.supervisors import Supervisor, make_supervisor
+from marlbc_mj.supervisors.base import split_decision
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.seeding import stream
+
+MOST_TOGETHER = 32
+"""Draws that are flown together: more would share the cost of a call, which is small by then, with no gain."""
+RECORD_BYTES = 128e6
+"""Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
+
+
+class Entry(NamedTuple):
+    """What is flown on every draw."""
+
+    scenario: Scenario
+    supervisor: Supervisor
+    law: Controller
+    names: tuple[str, str]  # of supervisor and controller
+    shield: bool
+
+
+def evaluate_batch(
+    scenario: Scenario,
+    seeds: Sequence[int],
+    supervisor: str,
+    controller: str = "sorlc",
+    *,
+    composition: str | None = None,
+    shield: bool = False,
+    progress: Progress = silent,
+) -> tuple[SeedRun, ...]:
+    """One method on every seed; a draw that cannot be flown to its end has the reason in the place of metrics.
+
+    Args:
+        scenario: drawn from, once per seed.
+        seeds: of the draws.
+        supervisor: by name, see :func:`~marlbc_mj.supervisors.make_supervisor`.
+        controller: by name.
+        composition: of orders to references; None: the scenario's.
+        shield: whether agents have a shield, of the scenario's own numbers.
+        progress: called for every seed, with how many are done.
+
+    Raises:
+        ConfigurationError: unknown names, or a composition that the scenario cannot have.
+    """
+    changes: dict[str, Any] = {} if composition is None else {"composition": composition}
+    scenario = replace(scenario, **changes)
+    entry = Entry(
+        scenario, make_supervisor(supervisor, controller), make_controller(controller), (supervisor, controller), shield
+    )
+    try:
+        World(scenario, entry.law, shield=shield)
+    except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
+        return tuple(SeedRun(seed, None, failure=str(error)) for seed in seeds)
+    runs: list[SeedRun] = []
+    together = draws_together(scenario)
+    for first in range(0, len(seeds), together):
+        for run in fly_together(entry, seeds[first : first + together]):
+            runs.append(run)
+            progress(method_key(*entry.names), len(runs), len(seeds))
+    return tuple(runs)
+
+
+def draws_together(scenario: Scenario) -> int:
+    """How many draws of a scenario are flown at once."""
+    each = 8 * 2 * len(Record._fields) * scenario.agents * scenario.substeps * scenario.mission_steps  # bytes of doubles
+    return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
+
+
+def fly_together(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
+    """One run per seed, all flown at once.
+
+    A supervisor that raises does not say on which draw. Then the draws are flown in halves, until it is known.
+    """
+    flight = None
+    try:
+        flight = JointFlight(entry, seeds)
+        flight.fly(entry.supervisor)
+    except (ConfigurationError, SimulationError) as error:
+        if len(seeds) == 1:
+            return [SeedRun(seeds[0], None if flight is None else flight.instances[0], failure=str(error))]
+        half = len(seeds) // 2
+        return [*fly_together(entry, seeds[:half]), *fly_together(entry, seeds[half:])]
+    return [flight.measured(b) for b in range(len(seeds))]
+
+
+class JointFlight:
+    """Episodes side by side, all that is recorded of them, and why some could not be finished.
+
+    Args:
+        entry: what is flown.
+        seeds: one draw each; those for which there is none have failed.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run.
+    """
+
+    def __init__(self, entry: Entry, seeds: Sequence[int]) -> None:
+        scenario, count = entry.scenario, len(seeds)
+        self.entry = entry
+        self.seeds = seeds
+        self.world = World(scenario, entry.law, worlds=count, record=True, shield=entry.shield)
+        self.failures: dict[int, str] = {}  # by world
+        self.instances = [self._begin(b) for b in range(count)]
+        steps, shape = scenario.mission_steps, (count, scenario.mission_steps * scenario.substeps + 1, scenario.agents, 2)
+        self.record = Record(*(np.empty(shape) for _ in Record._fields))  # and the end, of position and velocity
+        self.command = np.empty((count, steps, scenario.agents), dtype=np.int64)
+        self.formation = np.empty((count, steps), dtype=np.int64)
+        self.reward = np.empty((count, steps))
+        self.decision_ms = np.empty(steps)  # of one team
+        self.shield: ShieldCounts | None = None  # (B, N) each, at the end
+
+    def _begin(self, b: int) -> Instance | None:
+        """Draw the instance of world ``b``; None, and a failure, where there is none."""
+        world, state = self.world, self.world.state
+        try:
+            world.begin(b, stream(self.seeds[b]))
+        except ConfigurationError as error:
+            self.failures[b] = str(error)
+            return None
+        return Instance(state.position[b].copy(), state.obstacles[b, :, :3].copy(), float(state.disturbance_params[b, 0]))
+
+    def fly(self, supervisor: Supervisor) -> None:
+        """All episodes to their end, or until every one of them has failed.
+
+        Raises:
+            ConfigurationError: a decision of wrong shape or type.
+            SimulationError: the supervisor's.
+        """
+        world, count = self.world, self.world.worlds
+        try:
+            memory = supervisor.start(world.scenario, count)
+        except (ConfigurationError, SimulationError) as error:
+            self.failures = {b: self.failures.get(b, str(error)) for b in range(count)}
+            return
+        observation, shape = world.observe(), (count, world.scenario.agents)
+        for m in range(world.scenario.mission_steps):
+            if len(self.failures) == count:
+                return
+            began = perf_counter()
+            decision, memory = supervisor.decide(observation, memory)
+            self.decision_ms[m] = 1e3 * (perf_counter() - began) / count
+            step = world.try_step(*split_decision(decision, shape))
+            self._keep(m, step)
+            observation = world.observe() if self._drop_diverged() else step.observation
+
+    def _keep(self, m: int, step: Step) -> None:
+        """Record mission step ``m``."""
+        assert step.record is not None, "made with record=True"
+        substeps = self.world.scenario.substeps
+        for tape, rows in zip(self.record, step.record, strict=True):
+            tape[:, m * substeps : (m + 1) * substeps] = rows
+        self.record.position[:, -1], self.record.velocity[:, -1] = step.observation.position, step.observation.velocity
+        self.command[:, m], self.formation[:, m] = step.observation.command, step.observation.formation
+        self.reward[:, m], self.shield = step.reward, step.shield
+
+    def _drop_diverged(self) -> bool:
+        """Whether worlds diverged; they have failed, and begin an episode that nobody looks at, since others go on."""
+        world, state = self.world, self.world.state
+        diverged = np.flatnonzero(state.status).tolist()
+        for b in diverged:
+            alone = Team(*(rows[b : b + 1] for rows in state))
+            error = team.diverged(world.plan, alone, 0, int(state.status[b]), int(state.steps[b]) - 1)
+            self.failures.setdefault(b, str(error))
+            world.begin(b, stream(0, b))  # what this world was made with
+        return bool(diverged)
+
+    def measured(self, b: int) -> SeedRun:
+        """The run of world ``b``: its metrics, or why it failed."""
+        seed, instance = self.seeds[b], self.instances[b]
+        if b in self.failures:
+            return SeedRun(seed, instance, failure=self.failures[b])
+        trajectory = self._trajectory(b)
+        try:
+            check_free(trajectory, self.entry.law)
+        except SimulationError as error:
+            return SeedRun(seed, instance, failure=str(error))
+        return SeedRun(seed, instance, metrics=measure(trajectory))
+
+    def _trajectory(self, b: int) -> Trajectory:
+        """What is measured of world ``b``; controllers' states and poses, which no metric reads, are not kept."""
+        scenario, state = self.entry.scenario, self.world.state
+        position, velocity, reference, reference_velocity, force = (tape[b] for tape in self.record)
+        return Trajectory(
+            scenario=scenario,
+            supervisor=self.entry.names[0],
+            controller=self.entry.names[1],
+            seed=self.seeds[b],
+            obstacles=(state.anchors if scenario.moving else state.obstacles)[b],
+            time=np.arange(len(position) - 1) * scenario.substep,
+            position=position,
+            velocity=velocity,
+            reference=reference[:-1],
+            reference_velocity=reference_velocity[:-1],
+            force=force[:-1],
+            command=self.command[b],
+            formation=self.formation[b],
+            reward=self.reward[b],
+            controller_state=np.zeros((0, *state.controller.shape[1:])),
+            decision_ms=self.decision_ms,
+            motions=state.motions[b],
+            shield=None if self.shield is None else ShieldCounts(*(rows[b : b + 1] for rows in self.shield)),
+        )
