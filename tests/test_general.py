@@ -272,9 +272,22 @@ def test_training_is_its_seed(tmp_path: Path) -> None:
     assert any((x != y).any() for x, y in zip(networks[0].weights, networks[2].weights, strict=True))
     with (tmp_path / "a" / "eval.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert {"success_field", "return_corridor", "mission_steps", "wall_s"} <= set(rows[0])
+    assert {"success_field_wedge-4", "return_corridor_wedge-4", "mission_steps", "wall_s"} <= set(rows[0])
     with pytest.raises(ConfigurationError, match="not empty"):
         train_general(SMALL, tmp_path / "a")
+
+
+def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
+    """The first policy is the old one; other layers, or another kind of checkpoint, are refused."""
+    policy, path = random_policy(), tmp_path / "general.safetensors"
+    write_general(path, policy, {})
+    trainer = GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path), first_temperature=0.2))
+    assert trainer.temperature == pytest.approx(0.2)
+    for one, other in zip(policy.network.weights, trainer.policy().network.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
+        with pytest.raises(ConfigurationError, match=said):
+            GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
 
 
 def test_lost_messages_age() -> None:

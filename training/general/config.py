@@ -6,7 +6,7 @@ from typing import Annotated, Literal, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.general_inputs import BINS, FEATURES, INPUTS, LANES
-from marlbc_mj.scenarios import FAMILIES, Perturbation, Scenario, make_scenario
+from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario
 from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.util.errors import ConfigurationError, unknown
@@ -46,8 +46,12 @@ class GeneralConfig:
     """Random seed of network, exploration, layouts and the draws from the replay buffer."""
     budget: Annotated[int, AT_LEAST_ONE] = 1_200_000
     """Mission steps, over all worlds."""
+    start: str = ""
+    """Checkpoint of a general policy whose network learning begins with; a random one by default."""
+    first_temperature: Annotated[float, POSITIVE] = 1.0
+    """Temperature at the start, below 1 for a network that has learned before."""
     families: Annotated[tuple[str, ...], _NAMED] = DRAWN
-    """Families that are trained on."""
+    """Families that are trained on; one that is named twice counts twice."""
     teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "wedge-8", "circle-8", "line-6", "grid-9")
     """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
     worlds: Annotated[int, AT_LEAST_ONE] = 4
@@ -151,10 +155,13 @@ def training_scenarios(config: GeneralConfig) -> list[Scenario]:
 
 
 def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
-    """Held-out layouts by family, whether it is trained on or not, for the first team."""
-    assert set(DRAWN) <= set(FAMILIES)
-    team = read_team(config.teams[0])._asdict()
-    return {name: make_scenario(name, **team, composition="set-based", split="test") for name in DRAWN}
+    """Held-out layouts of every family, whether it is trained on or not, for the first and the last team; by family and team."""
+    names = dict.fromkeys((config.teams[0], config.teams[-1]))
+    return {
+        f"{family}_{team}": make_scenario(family, **read_team(team)._asdict(), composition="set-based", split="test")
+        for team in names
+        for family in DRAWN
+    }
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from time import monotonic
+from time import monotonic, process_time
 from typing import Any
 
 from marlbc_mj.policies.general import write_general
@@ -59,15 +59,16 @@ class GeneralRun:
         self.origin = provenance()
         self.evaluations: list[TrainingScores] = []
         self.wall = 0.0  # time of training so far, without evaluations [s]
+        self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]
 
     def go(self, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
         """Train to the end of the budget, or until a signal arrives."""
         trainer = self.trainer
         with stopper() as stop:
             while not trainer.finished:
-                began = monotonic()
+                began, used = monotonic(), process_time()
                 trainer.advance()
-                self.wall += monotonic() - began
+                self.wall, self.cpu = self.wall + monotonic() - began, self.cpu + process_time() - used
                 if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished or stop.signal:
                     self.evaluate()
                 if progress and self.evaluations:
@@ -79,7 +80,12 @@ class GeneralRun:
     def evaluate(self) -> None:
         """Fly the held-out layouts; write the learning curve, the last checkpoint and perhaps the best."""
         policy = self.trainer.policy()
-        row = {"wall_s": self.wall, "mission_steps": float(self.trainer.steps), "updates": float(self.trainer.learner.updates)}
+        row = {
+            "wall_s": self.wall,
+            "cpu_s": self.cpu,
+            "mission_steps": float(self.trainer.steps),
+            "updates": float(self.trainer.learner.updates),
+        }
         row |= {"td_error": self.trainer.error, **judge_policy(policy, self.judges)}
         best = max((judged_rank(each) for each in self.evaluations), default=None)
         self.evaluations.append(row)

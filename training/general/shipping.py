@@ -67,9 +67,9 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         "twice.",
         f"- Command: `marlbc train {GENERAL} --seed {train['seed']}{''.join(map(' {}'.format, _changed(train)))}`",
         f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
-        f"{evaluation['wall_s']:.0f} s on {train['threads']} thread(s) of {description['cpu']}, which other work shared.",
-        f"- Evaluations: {train['layouts']} held-out layouts of each family, team {train['teams'][0]}, controller {JUDGED_WITH}; "
-        "success at mission steps, median return.",
+        f"{evaluation['cpu_s']:.0f} s of processor time on {train['threads']} thread(s) of {description['cpu']}.",
+        f"- Evaluations: {train['layouts']} held-out layouts of each family and team, controller {JUDGED_WITH}; success at "
+        "mission steps, median return.",
         f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
         "",
         pipe_table(("mission steps", *families), [_curve_cells(row, families) for row in rows]),

@@ -1,11 +1,12 @@
 """Learning of the general policy: one dueling network on the transitions of all agents of all squads."""
 
 import math
+from pathlib import Path
 
 import numpy as np
 import torch
 
-from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general
+from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import single_thread
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
@@ -36,6 +37,8 @@ class GeneralTrainer:
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
         self.learner = Learner(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        if config.start:
+            self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
         rows = sum(squad.rows for squad in self.squads)
         self.replay = Replay(max(config.capacity // rows, 2 * config.n_step), rows, 1, INPUTS)
@@ -56,7 +59,25 @@ class GeneralTrainer:
     @property
     def temperature(self) -> float:
         """Wanted randomness of the actions; it falls from 1."""
-        return math.exp(math.log(COLD) * self.share / self.config.cool_by)
+        first = math.log(self.config.first_temperature)
+        return math.exp(first + (math.log(COLD) - first) * self.share / self.config.cool_by)
+
+    def _begin_with(self, policy: GeneralPolicy) -> None:
+        """Take over the network of a policy, also for targets and for the running mean.
+
+        Raises:
+            ConfigurationError: its layers have other sizes than the configuration's.
+        """
+        found = tuple(bias.shape[2] for bias in policy.network.biases[:-1])
+        if found != self.config.hidden:
+            raise ConfigurationError(f"checkpoint {self.config.start} has hidden layers {found}, the run {self.config.hidden}")
+        learner = self.learner
+        arrays = (*policy.network.weights, *policy.network.biases)
+        for network in (learner.network, learner.smooth):
+            for parameter, array in zip((*network.weights, *network.biases), arrays, strict=True):
+                parameter.data.copy_(torch.from_numpy(array.copy()))
+        for _ in range(self.config.copies):
+            learner.push()
 
     def advance(self) -> None:
         """One decision in every world, stored, and the updates after it.
