@@ -114,6 +114,7 @@ class FormationTask(composer.Task):
         """
         orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
         loop.begin(0, orders, self._orders_alone, self.plan.mission, self.plan.behaviors, self.state)
+        loop.shield_references(0, self.plan.mission, self.plan.behaviors, self._plant, self.state)
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:

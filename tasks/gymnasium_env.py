@@ -15,7 +15,7 @@ from marlbc_mj.policies.states import State
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
 from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
-from marlbc_mj.tasks.painter import Painter
+from marlbc_mj.tasks.painter import Drawn, Painter
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -37,7 +37,7 @@ def terms(outcome: DecisionOutcome, safe_distance: float) -> dict[str, np.ndarra
     }
 
 
-class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
+class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
     """One team: a MultiDiscrete joint order in, the team's state and shared reward (13) out.
 
     An episode is the whole mission and ends by termination. ``info`` has the reward's terms, switches and clearance.
@@ -68,10 +68,8 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode)
         made, law = scenario_from(scenario, changes), controller_from(controller)
-        self.batch = FormationBatch(made, law, interval=interval, state=state, actions=actions)
-        self.painter = Painter()
+        super().__init__(FormationBatch(made, law, interval=interval, state=state, actions=actions), render_mode)
         self.action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
         self.observation_space = state_space(self.batch.read)
 
@@ -89,18 +87,6 @@ class PaperFormation(gymnasium.Env[np.ndarray, np.ndarray]):
         outcome = self.batch.step(array_from(action)[None])
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
         return outcome.final_state[0], float(outcome.reward[0]), bool(outcome.terminal[0]), False, info
-
-    def render(self) -> np.ndarray | None:
-        """(height, width, 3) uint8: the team as it is now; None without a render mode.
-
-        Raises:
-            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
-        """
-        return None if self.render_mode is None else self.painter.draw(self.batch.world)
-
-    def close(self) -> None:
-        """Give the OpenGL context back."""
-        self.painter.close()
 
 
 class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):

@@ -11,6 +11,8 @@ from marlbc_mj.recording.camera import make_camera
 from marlbc_mj.recording.log import from_world
 from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import Stage, make_stage, restage
+from marlbc_mj.tasks.batch import FormationBatch
+from marlbc_mj.tasks.given import check_render_mode
 
 
 class Painter:
@@ -54,6 +56,35 @@ class Painter:
 
     def __del__(self) -> None:
         self.close()
+
+
+class Drawn:
+    """A view of one team that draws itself.
+
+    Args:
+        batch: the team.
+        render_mode: ``"rgb_array"``: :meth:`render` draws it; None: it does not.
+
+    Raises:
+        ConfigurationError: another render mode.
+    """
+
+    def __init__(self, batch: FormationBatch, render_mode: str | None) -> None:
+        self.batch = batch
+        self.render_mode = check_render_mode(render_mode)
+        self.painter = Painter()
+
+    def render(self) -> np.ndarray | None:
+        """(height, width, 3) uint8: the team as it is now; None without a render mode.
+
+        Raises:
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+        """
+        return None if self.render_mode is None else self.painter.draw(self.batch.world)
+
+    def close(self) -> None:
+        """Give the OpenGL context back."""
+        self.painter.close()
 
 
 _painting: WeakSet[Painter] = WeakSet()

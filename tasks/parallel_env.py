@@ -10,13 +10,13 @@ from pettingzoo import ParallelEnv
 from marlbc_mj.controllers import Controller
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import FormationBatch
-from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
+from marlbc_mj.tasks.given import RENDER_MODES, array_from, controller_from, scenario_from
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
-from marlbc_mj.tasks.painter import Painter
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.tasks.painter import Drawn
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
-class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
+class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
     """One team as a PettingZoo ``ParallelEnv``; agents are ``agent_1`` to ``agent_N``.
 
     Everybody observes the team's state; ``state()`` returns it too.
@@ -47,10 +47,8 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
         render_mode: str | None = None,
         **changes: Any,
     ) -> None:
-        self.render_mode = check_render_mode(render_mode)
         made, law = scenario_from(scenario, changes), controller_from(controller)
-        self.batch = FormationBatch(made, law, interval=interval, state=observation, actions=actions)
-        self.painter = Painter()
+        super().__init__(FormationBatch(made, law, interval=interval, state=observation, actions=actions), render_mode)
         self.possible_agents = [f"agent_{i + 1}" for i in range(self.batch.scenario.agents)]
         self.agents: list[str] = []
         self.state_space = state_space(self.batch.read)
@@ -70,8 +68,14 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode; the draw of the scenario comes from ``seed``."""
+        """Begin an episode; the draw of the scenario comes from ``seed``.
+
+        Raises:
+            ConfigurationError: a seed that is negative or no whole number.
+        """
         if seed is not None:
+            if not isinstance(seed, int | np.integer) or seed < 0:
+                raise ConfigurationError(f"a seed must be a whole number from 0, got {seed!r}")
             self._seeds = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
         self._state = self.batch.reset(int(self._seeds.integers(2**31)))[0]
@@ -83,11 +87,14 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
         """One decision of every agent; the reward (13) is the same for all.
 
         Raises:
-            ConfigurationError: an agent without an action, no whole number, or an index that is no action.
+            ConfigurationError: an agent without an action, one that is not there, no whole number, or an index that is no action.
         """
         if not isinstance(actions, Mapping):
             raise ConfigurationError(f"actions must be a dictionary with one per agent, got {type(actions).__name__}")
         missing = [agent for agent in self.possible_agents if agent not in actions]
+        unknown_agents = [agent for agent in actions if agent not in self.possible_agents]
+        if unknown_agents:
+            raise unknown("agent", unknown_agents[0], self.possible_agents)
         if missing:
             raise ConfigurationError(f"every agent needs an action, there is none for {', '.join(missing)}")
         outcome = self.batch.step(array_from([[actions[agent] for agent in self.possible_agents]]))
@@ -103,18 +110,6 @@ class PaperFormationParallel(ParallelEnv[str, np.ndarray, int]):
             dict.fromkeys(agents, False),
             {agent: dict(info) for agent in agents},
         )
-
-    def render(self) -> np.ndarray | None:
-        """(height, width, 3) uint8: the team as it is now; None without a render mode.
-
-        Raises:
-            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
-        """
-        return None if self.render_mode is None else self.painter.draw(self.batch.world)
-
-    def close(self) -> None:
-        """Give the OpenGL context back."""
-        self.painter.close()
 
     def state(self) -> np.ndarray:
         """(S,) the team's state."""

@@ -21,7 +21,7 @@ from marlbc_mj.recording.schemas import COMMUNICATION, decode_hearing, encode_he
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, make_scenario
-from marlbc_mj.studies.communication import CASES, Case, CommunicationStudy, neighbor_distance, time_to_agree
+from marlbc_mj.studies.communication import CASES, CommunicationStudy, NetworkCase, neighbor_distance, time_to_agree
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.supervisors import DistributedLookAhead, LookAhead, make_supervisor
 from marlbc_mj.supervisors.communication import Hearing
@@ -218,7 +218,9 @@ def test_the_study_flies_every_case(tmp_path):
     """Two cases, two layouts; the table has a row each, the file too."""
     scenario = gates(duration=0.5, split="test")
     assert neighbor_distance(scenario) == pytest.approx(6.0) and len(CASES) == 29
-    study = CommunicationStudy((scenario,), "lookahead-distributed", (1, 2), "pd", cases=(CASES[0], Case(1.2, 0.1, 0.2, True)))
+    study = CommunicationStudy(
+        (scenario,), "lookahead-distributed", (1, 2), "pd", cases=(CASES[0], NetworkCase(1.2, 0.1, 0.2, True))
+    )
     done = run_study(study, tmp_path / "out")
     assert [job.scenario.communication.range for job in study.jobs()] == [np.inf, pytest.approx(7.2)]
     assert [line.split(",")[:6] for line in (tmp_path / "out" / "communication.csv").read_text().splitlines()[1:]] == [

@@ -85,6 +85,35 @@ def test_a_signal_leaves_nothing_half_written(tmp_path, tmp_path_factory, number
     assert list(tmp_path.iterdir()) == []
 
 
+DROPPED = """
+import ctypes, signal, sys, time
+from marlbc_mj.cli.ending import in_one_line
+with in_one_line("marlbc"):
+    try:
+        if sys.argv[2] == "dropped":  # as where the compiler calls back when it has made code
+            ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(int(sys.argv[1])))()
+        else:
+            signal.raise_signal(int(sys.argv[1]))
+        time.sleep(20.0)
+        print("went on")
+    finally:
+        time.sleep(0.7)
+        print("removed")
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+@pytest.mark.parametrize(("number", "status", "said"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")])
+@pytest.mark.parametrize("way", ["dropped", "through"])
+def test_a_signal_is_not_lost_in_a_callback_and_does_not_stop_the_removal(number, status, said, way):
+    """What a handler raises while C code calls back into Python is dropped, and so raised again; what got through is not."""
+    began = time.monotonic()
+    command = [sys.executable, "-c", DROPPED, str(int(number)), way]
+    done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "removed\n", f"marlbc: {said}\n")
+    assert time.monotonic() - began < 15.0
+
+
 def test_a_full_disk_anywhere_is_status_3(monkeypatch, capsys):
     """Also where nobody has thought of one: the file is named if the system names it."""
     error = OSError(errno.ENOSPC, "No space left on device", "figure.pdf")

@@ -179,7 +179,7 @@ def views():
 @pytest.mark.parametrize("name", WRONG)
 def test_no_view_takes_a_wrong_action(view, name, views):
     if view == "pettingzoo" and name in ("too many", "a dictionary"):
-        pytest.skip("agents beyond the team are not looked at; a dictionary is what it takes")
+        pytest.skip("a dictionary is what it takes, and each agent has one action in it")
     with pytest.raises(ConfigurationError) as error:
         views[view](WRONG[name])
     assert "\n" not in str(error.value)
@@ -218,6 +218,9 @@ def test_orders_by_name():
         (lambda: PaperFormation(paper(), durtion=3.0), "field of a scenario 'durtion'"),
         (lambda: PaperFormation(render_mode="ansi"), "render_mode 'ansi'"),
         (lambda: PaperFormationParallel(render_mode="human"), "render_mode 'human'"),
+        (lambda: PaperFormationParallel(duration=1.0).reset(seed=-1), "whole number from 0, got -1"),
+        (lambda: PaperFormationParallel(duration=1.0).reset(seed=0.5), "whole number from 0, got 0.5"),
+        (lambda: PaperFormationParallel(duration=1.0).step({f"agent_{i}": 0 for i in range(1, 6)}), "unknown agent 'agent_5'"),
         (lambda: PaperFormationVector(2, duration=1.0).reset(options=[1]), "options"),
         (lambda: PaperFormationVector(2, duration=1.0).reset(seed=[0, 1.5]), "seed"),
         (lambda: marlbc_mj.tasks.load("formation", "paper", render_mode=None), "field of a scenario 'render_mode'"),

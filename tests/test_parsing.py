@@ -5,6 +5,7 @@ import re
 import pytest
 import tyro
 
+import marlbc_mj
 from marlbc_mj.cli import Command, main, parsing
 
 
@@ -68,3 +69,8 @@ def test_an_event_that_is_new_is_left_to_tyro() -> None:
         prog = "marlbc"
 
     assert parsing._refusal(Unheard(), Command, []) is None
+
+
+def test_the_version_is_one_line(capsys):
+    main(["--version"])
+    assert capsys.readouterr().out == f"marlbc {marlbc_mj.__version__}\n"

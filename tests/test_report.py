@@ -434,7 +434,7 @@ def test_comparison_figures(results: list[Result]) -> None:
         with pytest.raises(ValueError, match="'pd' has no network weights"):
             draw(episodes[1])
     assert len(curves.priorities(episodes).axes) == 4
-    assert len(curves.control(episodes, 3).axes) == 3 * 3
+    assert len(curves.control(episodes, 3).axes) == 2 * len(episodes)
 
 
 def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]], tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ from marlbc_mj.engine.assembly import OPTIONS
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.robots.standard import standard_text
-from marlbc_mj.scenarios import load_scenario
+from marlbc_mj.scenarios import load_scenario, make_scenario
 from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.studies.robot_check import checklist
 from marlbc_mj.studies.robot_gate import fly_gate
@@ -87,6 +87,7 @@ DRIVEN = {
     "actuatorfrcrange": (cart(joints=SLIDES.replace('axis="', 'actuatorfrcrange="-2 2" axis="')), 2.0),
     "tendons": (cart(motors=ON_TENDONS, tail=TENDONS.format("")), 12.0),
     "tendons with a limit": (cart(motors=ON_TENDONS, tail=TENDONS.format(' actuatorfrcrange="-1 1"')), 6.0),
+    "armature": (cart(joints=SLIDES.replace('axis="', 'armature="1.5" axis="')), 12.0),
     "site": (
         cart(shape=SHAPE + '<site name="fan"/>', motors='<motor site="fan" gear="2 0 0 0 0 0" ctrlrange="-3 3"/>'
              '<motor site="fan" gear="0 -2 0 0 0 0" ctrlrange="-3 3"/>'),
@@ -139,6 +140,16 @@ def test_the_recorded_force_is_what_moves_the_body(case, write):
     np.testing.assert_allclose(force, np.tile([-limit, limit], (len(force), 1)), rtol=1e-9)
 
 
+def test_a_law_without_a_limit_does_not_make_motors_stronger(write):
+    """The file's limit is the robot's, whatever the law asks for."""
+    name = write(DRIVEN["forcerange"][0])
+    model = World(robot_gate(name), PD(64.0, 16.0, limited=False)).plan.model
+    np.testing.assert_array_equal(model.actuator_forcerange, np.tile([-2.0, 2.0], (8, 1)))
+    assert model.actuator_forcelimited.all()
+    free = World(make_scenario("paper", duration=1.0), PD(limited=False)).plan.model
+    assert not free.actuator_forcelimited.any()
+
+
 @pytest.mark.parametrize(
     "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "turned body", "no names", "buoyant"]
 )
@@ -171,6 +182,9 @@ REFUSED = {
     "constant push": (
         '<general name="{name}" joint="{joint}" biastype="affine" biasprm="3 0 0" ctrlrange="-9 9"/>', "even at control 0"),
     "delay": ('<motor name="{name}" joint="{joint}" ctrlrange="-9 9" nsample="4" delay="0.01"/>', "acts after a delay"),
+    "a brake beside the motor": (
+        '<motor name="{name}" joint="{joint}" ctrlrange="-9 9"/><damper name="{name}b" joint="{joint}" kv="2" ctrlrange="0 1"/>'
+        '<velocity name="{name}_brake" joint="{joint}" kv="2"/>', "'push_e_brake' is no motor: it is a velocity servo"),
     "one side only": ('<motor name="{name}" joint="{joint}" ctrlrange="0 12"/>', "'push_e' pushes from 0 to 12 N only"),
     "no limit": ('<motor name="{name}" joint="{joint}"/>', "'push_e' has no limit"),
 }  # fmt: off
@@ -225,6 +239,13 @@ def test_a_robot_that_does_not_follow_is_a_failed_row(write):
     assert not step.passed and "its force is at the limit of 12 N" in step.said
 
 
+def test_a_carriage_on_a_rail_is_driven_but_fails_its_check(write):
+    """A force along the rail moves less than one across it; a robot has one mass, and that is said."""
+    rail = NESTED.format(SHAPE).replace('mass="1e-6"', 'mass="1"')
+    items = {item.name: item for item in checklist(write(cart(joints="", shape=rail)))}
+    assert not items["mass"].passed and items["mass"].said == "3 kg move along x, 4 kg along y; a robot has one mass"
+
+
 # Options ---------------------------------------------------------------------------------------------------------------------
 
 
@@ -235,11 +256,26 @@ def test_options_are_taken_over_or_named(write, recwarn, monkeypatch, tmp_path):
     name = write(cart(head=head))
     said = {item.name: item.said for item in checklist(name)}["options"]
     assert "density 1.2" in said and "gravity 0 0 -1.62" in said and "not kept: timestep 0.01 s" in said
+    assert "integrator implicitfast" in said
     model = World(robot_gate(name), PD(64.0, 16.0)).plan.model
     alone = mujoco.MjModel.from_xml_path(name)
     for option in OPTIONS:
         np.testing.assert_allclose(getattr(model.opt, option), getattr(alone.opt, option), err_msg=option)
     assert model.opt.timestep == 0.0025 and not recwarn.list and not (tmp_path / "MUJOCO_LOG.TXT").exists()
+
+
+def test_no_section_of_a_file_makes_mujoco_warn(write, capfd, recwarn, monkeypatch, tmp_path):
+    """Sizes, pictures and statistics of the file conflict with the arena's; nobody has to read about it."""
+    monkeypatch.chdir(tmp_path)
+    head = (
+        '<size nuser_geom="3" memory="9M"/><statistic extent="9" meansize="0.5"/><visual><map znear="0.3"/>'
+        '<global offwidth="99"/></visual><option timestep="0.1" magnetic="1 2 3" o_margin="0.1" impratio="9" cone="elliptic"'
+        ' solver="CG" tolerance="1e-3" sdf_iterations="7"><flag contact="disable" energy="enable" sensornoise="enable"/></option>'
+    )
+    name = write(cart(head=head))
+    World(robot_gate(name), PD(64.0, 16.0))
+    make_environment(robot_gate(name, duration=0.5), PD(64.0, 16.0)).reset()
+    assert capfd.readouterr() == ("", "") and not recwarn.list and not (tmp_path / "MUJOCO_LOG.TXT").exists()
 
 
 # Parts of a model ------------------------------------------------------------------------------------------------------------
@@ -426,6 +462,15 @@ def test_slips_in_a_robot_are_named(changes, message, write):
     """The field, its value and what there is."""
     with pytest.raises(ConfigurationError, match=message):
         direct(write(cart()), **changes).spec()
+
+
+@pytest.mark.parametrize("laws_of", [None, "omni"])
+def test_a_robot_in_python_must_not_turn_its_slides(laws_of, write):
+    """A yaw before the slides turns the axes that forces and unknown dynamics are given along."""
+    other = {} if laws_of is None else {f: getattr(make_robot(laws_of), f) for f in ("drive", "reading", "params", "state")}
+    robot = direct(write(DRIVEN["yaw first"][0]), **({"motors": (), **other} if other else {}))
+    with pytest.raises(ConfigurationError, match="joint 'yaw' turns the slide joints"):
+        robot.spec()
 
 
 @pytest.mark.parametrize(

@@ -1,22 +1,27 @@
 """Users' Python files: the same in every process and folder, anew after an edit, and every slip in one line."""
 
 import json
+import linecache
 import os
+import pickle
 import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import ModuleType
 
+import cloudpickle
 import numba
 import numpy as np
 import pytest
 
 from marlbc_mj.controllers import PD, make_controller
 from marlbc_mj.core import compiling, laws
+from marlbc_mj.engine.world import World
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.robots import make_robot
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import make_scenario, paper
 from marlbc_mj.studies.bench import BenchConfig
 from marlbc_mj.studies.robot_check import checklist
 from marlbc_mj.studies.robot_truth import all_plain
@@ -110,6 +115,29 @@ def test_a_users_robot_is_the_same_in_every_process(skate, tmp_path):
     assert in_a_process(str(skate), tmp_path) == [0.8, 0.8]
 
 
+def test_a_robot_is_made_anew_after_an_edit_or_in_another_folder(skate, tmp_path, monkeypatch):
+    """In the same process, as in a notebook: of its file, of a helper, of its MJCF; without one it is the same object."""
+    monkeypatch.chdir(skate.parent)
+
+    def made() -> tuple[float, float, float]:
+        robot, ctrl, none = make_robot("skate.py"), np.zeros(2), np.zeros(0)
+        assert make_robot("skate.py") is robot
+        all_plain(robot.drive)(none, none, np.zeros(2), np.zeros(2), np.ones(2), 0.1, ctrl)
+        return robot.speed_limit, ctrl[0], robot.spec().compile().body("deck").mass[0]
+
+    assert made() == (1.5, 0.5, 4.0)
+    skate.write_text(SKATE_PY.replace("speed_limit=1.5", "speed_limit=1.0"))
+    assert made() == (1.0, 0.5, 4.0)
+    skate.with_name("helper.py").write_text(HELPER.replace("0.5", "0.25"))
+    assert made() == (1.0, 0.25, 4.0)
+    skate.with_name("skate.xml").write_text(SKATE.replace('mass="4"', 'mass="3"'))
+    assert made() == (1.0, 0.25, 3.0)
+    moved = shutil.copytree(skate.parent, tmp_path / "moved")
+    (moved / "skate.py").write_text(SKATE_PY)
+    monkeypatch.chdir(moved)
+    assert made() == (1.5, 0.25, 3.0)
+
+
 def test_torn_files_of_the_cache_are_compiled_anew(skate, tmp_path):
     """Whatever another program left there."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]
@@ -194,6 +222,61 @@ def test_names_in_a_users_file_are_taken(mine):
     assert method_key(f"{mine}:Careful", f"{mine}:soft") == "mine.Careful+mine.soft"
     assert BenchConfig((f"{mine}:Careful",), (f"{mine}:soft",)).methods == [(f"{mine}:Careful", f"{mine}:soft")]
     assert make_controller(f"{mine}:STIFF") is make_controller(f"{mine}:STIFF")
+
+
+def test_what_is_in_a_users_file_goes_to_another_process(mine, tmp_path):
+    """A pickle finds the file again, where the package is installed; without the file it says which module is missing."""
+    kept = pickle.dumps(make_supervisor(f"{mine}:Careful"))
+    code = "import pickle, sys; print(type(pickle.load(sys.stdin.buffer)).__name__)"
+    environment = {**os.environ, "PYTHONPATH": ":".join(p for p in sys.path if p)}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, input=kept, capture_output=True, env=environment, check=False, cwd=tmp_path.parent)
+    assert done.stdout == b"OneTeam\n", done.stderr
+    Path(mine).unlink()
+    gone = subprocess.run(command, input=kept, capture_output=True, env=environment, check=False)
+    assert b"ModuleNotFoundError: No module named 'marlbc_user_mine_" in gone.stderr
+
+
+NOTEBOOK = """
+from dataclasses import dataclass
+import numpy as np
+from marlbc_mj.core import laws
+
+@laws.controller(gains="push")
+def pushed(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    force_out[0], force_out[1] = gains.push, 0.0
+
+@dataclass(frozen=True)
+class Push:
+    push: float = 2.0
+    limited = True
+    linear_gains = None
+    law = staticmethod(pushed)
+    def params(self, agent, limit):
+        return laws.gains_of(self)
+    def initial_state(self, agent):
+        return {}
+"""
+
+
+def test_a_law_of_a_notebook_runs_and_travels(monkeypatch, tmp_path):
+    """``__main__`` without a file: it runs compiled, and a copy by cloudpickle is compiled anew."""
+    main, paths = ModuleType("__main__"), ModuleType("IPython.paths")
+    vars(paths)["get_ipython_cache_dir"] = lambda: str(tmp_path)  # which numba asks
+    monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
+    monkeypatch.setitem(sys.modules, "IPython.paths", paths)
+    monkeypatch.setitem(sys.modules, "__main__", main)
+    cell, lines = "<ipython-input-3-0123456789ab>", NOTEBOOK.splitlines(keepends=True)
+    monkeypatch.setitem(linecache.cache, cell, (len(NOTEBOOK), None, lines, cell))  # as IPython keeps what was typed
+    exec(compile(NOTEBOOK, cell, "exec"), vars(main))
+    world = World(paper(duration=0.5), main.Push())
+    orders = np.zeros((1, 4), dtype=np.int64)
+    world.step(orders)
+    data = cloudpickle.dumps(world)
+    expected = world.step(orders).observation.position
+    monkeypatch.setitem(sys.modules, "__main__", ModuleType("__main__"))  # as in another process
+    twin = pickle.loads(data)
+    assert world.native and twin.native and (twin.step(orders).observation.position == expected).all()
 
 
 def test_a_checkpoint_is_a_supervisor_by_its_path():

@@ -1,9 +1,11 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
+import sys
 from typing import Annotated
 
 from tyro.conf import subcommand
 
+from marlbc_mj import __version__
 from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, SafetyCommand
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
@@ -46,12 +48,18 @@ Command = (
     | Annotated[OracleCommand, subcommand("oracle")]
 )
 
-DESCRIPTION = "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper"
+DESCRIPTION = (
+    "Benchmark of mission supervisors and controllers for robot teams on MuJoCo physics. Start with: marlbc bench paper. "
+    "Version: marlbc --version"
+)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run, see :func:`~marlbc_mj.cli.ending.in_one_line`."""
     with in_one_line("marlbc"):
+        if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+            print(f"marlbc {__version__}")
+            return
         command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
         prepare_gl(strict=isinstance(command, VideoCommand))
         command.run()

@@ -5,6 +5,7 @@ import os
 import signal
 import sys
 import threading
+import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from typing import Any
@@ -21,6 +22,14 @@ class Terminated(BaseException):
     """SIGTERM was received; what is half written is removed on the way out, as after Ctrl-C."""
 
 
+class CtrlC(KeyboardInterrupt):
+    """Ctrl-C was received."""
+
+
+_STOPS: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated, signal.SIGINT: CtrlC}
+_AGAIN = 0.25  # after which what was dropped is raised again [s]
+
+
 @contextmanager
 def in_one_line(prog: str) -> Iterator[None]:
     """Run a command; whatever stops it is said in one line.
@@ -32,7 +41,7 @@ def in_one_line(prog: str) -> Iterator[None]:
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal that has no box-drawing characters, or names that are no text
     try:
-        with _terminable():
+        with _stoppable():
             try:
                 yield
             finally:
@@ -65,21 +74,67 @@ def _end(said: str, status: int) -> None:
     sys.exit(status)
 
 
+class _Stop:
+    """Ends a command on a signal by an exception, which is raised again until it gets through.
+
+    Python drops what a signal handler raises while C code calls back into Python: the compiler of numba does so whenever it has
+    made code, and a signal that came while it was at work is handled there.
+    """
+
+    def __init__(self) -> None:
+        self.insists = hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM) == signal.SIG_DFL  # nobody else's alarm
+        self._kind: type[BaseException] | None = None
+        self._error: weakref.ref[BaseException] | None = None
+
+    def on_signal(self, number: int, frame: Any) -> None:
+        """Pass SIGTERM on to worker processes, and raise; a second SIGTERM does not stop the removal of what is half written."""
+        if number == signal.SIGTERM:
+            if self._on_its_way():
+                return
+            for child in multiprocessing.active_children():
+                child.terminate()
+        self._kind = _STOPS[number]
+        if self.insists:
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
+        self._throw()
+
+    def on_alarm(self, number: int, frame: Any) -> None:
+        """Raise again what has been dropped."""
+        if self._kind is not None and not self._on_its_way():
+            self._throw()
+
+    def _on_its_way(self) -> bool:
+        """Whether the exception still exists: whoever drops it holds no reference to it."""
+        return self._error is not None and self._error() is not None
+
+    def _throw(self) -> None:
+        assert self._kind is not None
+        error = self._kind()
+        self._error = weakref.ref(error)
+        try:
+            raise error
+        finally:
+            del error  # else this frame would keep it
+
+
 @contextmanager
-def _terminable() -> Iterator[None]:
-    """Turn SIGTERM into :class:`Terminated`, and pass it on to worker processes, during the block."""
+def _stoppable() -> Iterator[None]:
+    """Turn SIGTERM into :class:`Terminated` and Ctrl-C into :class:`CtrlC` during the block, whatever is at work."""
+    stop, ours = _Stop(), (signal.SIG_DFL, signal.default_int_handler)
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
         return
-
-    def stop(number: int, frame: Any) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one would stop the removal of what is half written
-        for child in multiprocessing.active_children():
-            child.terminate()
-        raise Terminated
-
-    signal.signal(signal.SIGTERM, stop)
+    taken: dict[int, Any] = {number: stop.on_signal for number in _STOPS if signal.getsignal(number) in ours}
+    if stop.insists:
+        taken[signal.SIGALRM] = stop.on_alarm
+    before = {number: signal.signal(number, handler) for number, handler in taken.items()}
+    say = sys.unraisablehook
+    sys.unraisablehook = lambda dropped: None if issubclass(dropped.exc_type, tuple(_STOPS.values())) else say(dropped)
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+        if stop.insists:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        sys.unraisablehook = say

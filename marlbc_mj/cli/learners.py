@@ -45,7 +45,7 @@ class StudyCommand:
         if self.source is not None:
             print(compare_learners(*read_study(self.source), self.out or self.source).text)
             return
-        from marlbc_mj.training.config import with_settings
+        from marlbc_mj.util.changes import with_settings
 
         adjust = partial(with_settings, settings=self.set)
         study = LearnerStudy(self.out or DEFAULT_OUT, self.variants, self.seeds, self.budget, adjust)

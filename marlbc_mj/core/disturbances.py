@@ -7,7 +7,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import numpy as np
 
 from marlbc_mj.core import laws
-from marlbc_mj.core.shield import ForceBound
+from marlbc_mj.core.stopping import ForceBound
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 HARMONICS = 12

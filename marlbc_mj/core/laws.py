@@ -165,7 +165,7 @@ def address(law: Law, signature: Any) -> int:
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
-    kind, entry = ON_ROWS[signature][0], cast(Any, law).entry
+    kind, entry = ON_ROWS[signature][0], _entry(law, signature)
     try:
         law.compile(_arguments(interface(law)))
         entry.compile(kind.args)
@@ -176,6 +176,13 @@ def address(law: Law, signature: Any) -> int:
         raise ConfigurationError(f"law {name!r} does not compile as {signature}: {_last_line(error)}") from error
     result = entry.get_compile_result(kind)
     return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+
+
+def _entry(law: Law, signature: Any) -> Any:
+    """The team form of a law: made where the law is declared, and anew for one that came out of a pickle."""
+    if not hasattr(law, "entry"):
+        cast(Any, law).entry = allocation_free(on_rows(law, signature), cache=False)
+    return cast(Any, law).entry
 
 
 def _arguments(declared: Interface) -> tuple[Any, ...]:

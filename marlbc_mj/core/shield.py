@@ -1,53 +1,52 @@
 """The shield: the force that is nearest to the controller's and keeps every agent able to stop in time, whatever f does.
 
-The plant is m v' = u + f with |f| <= B(|v|), a :class:`ForceBound`, and |u| <= U in every direction. Braking decelerates by at
-least a_b(|v|) = (U - B(|v|)) / m, so the path that is left is at most L(v) = |v|^2 / (2 a_b(|v|)), the radius of the *stopping
-ball*. A team is safe in
-
-    S = {d_k >= L_i for every obstacle k,  |p_i - p_j| - D >= L_i + L_j for every pair,  |v_i| <= v_s},
-
-with d_k the clearance beyond the distance that is kept. A force leads from S to S if its worst next state does. The next velocity
-v+ = v + h (u + f) / m lies in a ball of radius h B / m around w = v + h u / m, and moves the agent by h v+. Obstacles are convex,
-so d+ >= d + h n.v+ with n the normal, and d+ >= L(v+) is
-
-    |w - a h n| + h B / m <= sqrt(2 a C + a^2 h^2),   a = a_b(|w| + h B / m):
-
-w must be in a disc. C is the room: d_k for an obstacle; of a pair each agent takes half of the gap |p_i - p_j| - D - L_i - L_j,
-so C = L_i + gap / 2. Braking satisfies all of them at once from |v| = h U / m on; below it, stopping within the substep does, but
-for a drift of h^2 B / m that retreating from the nearest thing takes back. Hence S is invariant for any number of agents and any
+What is safe is in :mod:`marlbc_mj.core.stopping`: the velocity w that a force leads to must be in one disc for every thing
+that is near. Braking is in all of them at once from |v| = h U / m on; below it, stopping within the substep is, but for a
+drift of h^2 B / m that retreating from the nearest thing takes back. Hence S is invariant for any number of agents and any
 controller, see docs/shield.md for the proof and for what is assumed.
 
 The least change for one thing is the projection of w on its disc. It is the discrete, whole form of the barrier sqrt(2 a d) + n.v
 (Wang, Ames & Egerstedt 2017): nothing is linearized, and the tangential speed counts.
+
+Robots whose force is not known to act at once are shielded one level higher, by :func:`restrain_references`: their references
+always can brake, and robots are assumed to stay within a tube around them.
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free, clip, inlined
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.core.barriers import Barrier
+from marlbc_mj.core.braking import restrain
+from marlbc_mj.core.cells import fill, room
+from marlbc_mj.core.laws import allocation_free, clip
+from marlbc_mj.core.stopping import (
+    TINY,
+    ForceBound,
+    anything_near,
+    braking,
+    disc_of,
+    force_bound,
+    gap_to,
+    most_pressing,
+    most_violated,
+    moves,
+    pace_of,
+    reach_of,
+    speed_of,
+    spread_of,
+    stays_safe,
+    stopping_distance,
+)
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
-FAR = 1e9  # stopping distance of a speed from which nothing brakes [m]
-TINY = 1e-9  # rounding of a speed [m/s] or distance [m]
 ROUNDS = 8  # of projections, where several things are near
-SPEED_BROKEN, FORCE_BROKEN, STATE_BROKEN = 0, 1, 2
-"""Assumptions that are watched: the speed cap, the bound of all that is not u, and that the state is in S."""
-ASSUMPTIONS = ("speed", "force", "state")
+SPEED_BROKEN, FORCE_BROKEN, STATE_BROKEN, MOTION_BROKEN, TUBE_BROKEN = 0, 1, 2, 3, 4
+"""Assumptions that are watched: the speed cap, the bound of all that is not u, that the state is in S, that it is in S for
+obstacles that move, and the tube around references."""
+ASSUMPTIONS = ("speed", "force", "state", "motion", "tube")
 """Their names, in the order of their indices."""
-
-
-class ForceBound(NamedTuple):
-    """|f| <= constant + linear |v| + quadratic |v|^2."""
-
-    constant: float = 0.0  # [N]
-    linear: float = 0.0  # [N s/m]
-    quadratic: float = 0.0  # [N s^2/m^2]
-
-    def at(self, speed: float) -> float:
-        """The bound at a speed [m/s], in N."""
-        return self.constant + speed * (self.linear + speed * self.quadratic)
 
 
 @dataclass(frozen=True)
@@ -69,6 +68,18 @@ class Shield:
     margin: float = 1e-3  # that both distances are exceeded by [m]
     position_error: float = 0.0  # between what is known of p and p itself [m]
     velocity_error: float = 0.0  # of v [m/s]
+    latency: float = 0.0  # of messages between agents; a whole number of substeps [s]
+    message_loss: float = 0.0  # share of messages that are lost, at random
+    silent: int = -1  # agent whose messages are all lost; -1: none
+    obstacle_speed: float = 2.0  # at most, where obstacles move [m/s]
+    obstacle_acceleration: float = 2.0  # at most, where they move [m/s^2]
+    level: Literal["force", "reference"] | None = None  # what is changed; None: forces, if the robot's force_error is known
+    tube: float | None = None  # around references, which this shields; None: computed or the robot's own, if it is known [m]
+
+    @property
+    def mailed(self) -> bool:
+        """Whether agents know of each other by messages that are late or lost; else all know all at every moment."""
+        return self.latency > 0.0 or self.message_loss > 0.0 or self.silent >= 0
 
     def __post_init__(self) -> None:
         for name in (
@@ -80,170 +91,35 @@ class Shield:
             "margin",
             "position_error",
             "velocity_error",
+            "latency",
+            "message_loss",
+            "obstacle_speed",
+            "obstacle_acceleration",
+            "tube",
         ):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value >= 0):
                 raise ConfigurationError(f"Shield.{name} must be non-negative and finite, got {value}")
+        if self.message_loss > 1.0:
+            raise ConfigurationError(f"Shield.message_loss must be from 0 to 1, got {self.message_loss}")
+        if self.level not in (None, "force", "reference"):
+            raise unknown("level of a shield", str(self.level), ("force", "reference"))
+        if self.tube is not None and self.level == "force":
+            raise ConfigurationError(f"Shield.tube is for references, but level is 'force'; got {self.tube} m")
+        if self.tube == 0.0:
+            raise ConfigurationError("Shield.tube must be positive: no robot is exactly where its reference is; got 0")
         if self.disturbance is not None:
             object.__setattr__(self, "disturbance", ForceBound(*self.disturbance))
             if not all(np.isfinite(x) and x >= 0 for x in self.disturbance):
                 raise ConfigurationError(f"Shield.disturbance must have non-negative finite numbers, got {self.disturbance}")
 
 
-class ShieldNumbers(NamedTuple):
-    """A shield's assumptions, all resolved, as the laws below take them."""
-
-    force_limit: float  # U [N]
-    box: float  # limit of the actuators per axis [N]
-    mass: float  # [kg]
-    constant: float  # of the force bound [N]
-    linear: float  # [N s/m]
-    quadratic: float  # [N s^2/m^2]
-    speed_cap: float  # [m/s]
-    clearance: float  # kept from obstacles, with margin and error [m]
-    agent_distance: float  # D, with margin and errors [m]
-    velocity_error: float  # [m/s]
-    slack: float = 0.0  # part of the margin that drifts may use up before the state counts as outside S [m]
-
-
-_RECORD = np.dtype((np.record, [(name, np.float64) for name in ShieldNumbers._fields]))
-
-
-def as_records(numbers: ShieldNumbers) -> np.ndarray:
-    """(1,) records with the same fields: a loop over threads takes arrays within a named tuple, but no named tuple."""
-    return np.array([tuple(numbers)], dtype=_RECORD)
-
-
-NO_SHIELD = ShieldNumbers(0.0, np.inf, 1.0, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)
-
-
-class ShieldView(NamedTuple):
-    """What a shield sees of one team at the start of a substep."""
-
-    h: float  # substep [s]
-    p: np.ndarray  # (N, 2) as it is known [m]
-    v: np.ndarray  # (N, 2) as it is known [m/s]
-    moving: np.ndarray  # (N, 2) v itself, for what is watched [m/s]
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]
-    stopping: np.ndarray  # (N,) L_i, filled by shield_team [m]
-
-
 class ShieldCounts(NamedTuple):
     """What a shield did and saw since the episode began: rows of one team, or (B, ...) of many."""
 
-    interventions: np.ndarray  # (N,) substeps in which it changed the force
-    change: np.ndarray  # (N,) integral of |u - wish| dt [N s]
-    breaches: np.ndarray  # (N, 3) substeps in which an assumption did not hold, in the order of ASSUMPTIONS
-
-
-@inlined
-def force_bound(numbers, speed):
-    """B at a speed [m/s], in N."""
-    return numbers.constant + speed * (numbers.linear + speed * numbers.quadratic)
-
-
-@inlined
-def braking(numbers, speed):
-    """a_b [m/s^2] at a speed [m/s]; not positive where f may be stronger than the actuators."""
-    return (numbers.force_limit - numbers.constant - speed * (numbers.linear + speed * numbers.quadratic)) / numbers.mass
-
-
-@allocation_free
-def stopping_distance(numbers, speed):
-    """L = |v|^2 / (2 a_b(|v|)) [m] of a speed [m/s]."""
-    a = braking(numbers, speed)
-    return 0.5 * speed * speed / a if a > 0.0 else FAR
-
-
-@allocation_free
-def retreat_drift(numbers, h, speed):
-    """What a retreat at ``speed`` [m/s] may cost of the gap to other things in one substep [m]: 2 h^2 B / m + L(2 h B / m)."""
-    fastest = 2.0 * h * force_bound(numbers, speed) / numbers.mass
-    return h * fastest + stopping_distance(numbers, fastest)
-
-
-@inlined
-def speed_of(numbers, view, i):
-    """Greatest speed that agent ``i`` may have [m/s]."""
-    x, y = view.v[i, 0], view.v[i, 1]
-    return np.sqrt(x * x + y * y) + numbers.velocity_error
-
-
-@inlined
-def spread_of(numbers, view, i):
-    """Radius h B / m of the ball that v+ lies in [m/s]; the error of what is known of v adds to it."""
-    return view.h * force_bound(numbers, speed_of(numbers, view, i)) / numbers.mass + numbers.velocity_error
-
-
-@inlined
-def near(numbers, view, i, k, need):
-    """Whether thing ``k``, an obstacle or (from K on) an agent, leaves agent ``i`` less room than ``need`` [m]. No roots."""
-    count = view.obstacles.shape[0]
-    if k < count:
-        x, y = view.p[i, 0] - view.obstacles[k, 0], view.p[i, 1] - view.obstacles[k, 1]
-        reach = view.obstacles[k, 2] + numbers.clearance + need
-    else:
-        j = k - count
-        x, y = view.p[i, 0] - view.p[j, 0], view.p[i, 1] - view.p[j, 1]
-        reach = numbers.agent_distance + 2.0 * need - view.stopping[i] + view.stopping[j]
-    return reach > 0.0 and x * x + y * y < reach * reach
-
-
-@allocation_free
-def gap_to(numbers, view, i, k):
-    """(gap, normal x, normal y): distance to thing ``k`` less what is kept and the stopping balls [m], and n away from it."""
-    count = view.obstacles.shape[0]
-    if k < count:
-        x, y = view.p[i, 0] - view.obstacles[k, 0], view.p[i, 1] - view.obstacles[k, 1]
-        keep = view.obstacles[k, 2] + numbers.clearance + view.stopping[i]
-    else:
-        j = k - count
-        x, y = view.p[i, 0] - view.p[j, 0], view.p[i, 1] - view.p[j, 1]
-        keep = numbers.agent_distance + view.stopping[i] + view.stopping[j]
-    distance = np.sqrt(x * x + y * y)
-    if distance > 0.0:
-        return distance - keep, x / distance, y / distance
-    return -keep, 1.0 if i >= k - count else -1.0, 0.0
-
-
-@allocation_free
-def excess(numbers, view, i, k, a, x, y):
-    """How far w = (x, y) and the ball around it stick out of thing ``k``'s disc [m/s]; not positive inside.
-
-    Outside S, where the gap is negative, it must not become more so.
-    """
-    gap, normal_x, normal_y = gap_to(numbers, view, i, k)
-    share = 1.0 if k < view.obstacles.shape[0] else 0.5
-    room, centre = view.stopping[i] + share * max(gap, 0.0), a * view.h
-    x, y = x - centre * normal_x, y - centre * normal_y
-    return np.sqrt(x * x + y * y) + spread_of(numbers, view, i) - np.sqrt(2.0 * a * room + centre * centre)
-
-
-@allocation_free
-def stays_safe(numbers, view, i, x, y):
-    """Whether every state that w = (x, y) [m/s] may lead agent ``i`` to is in S."""
-    worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
-    a = braking(numbers, worst)
-    if worst > max(numbers.speed_cap, speed_of(numbers, view, i)) + TINY or not a > 0.0:
-        return False
-    need = worst * (0.5 * worst / a + view.h)
-    for k in range(view.obstacles.shape[0] + view.p.shape[0]):
-        other = k != view.obstacles.shape[0] + i
-        if other and near(numbers, view, i, k, need) and excess(numbers, view, i, k, a, x, y) > TINY:
-            return False
-    return True
-
-
-@allocation_free
-def most_pressing(numbers, view, i, need):
-    """The thing with the least gap among those that leave less room than ``need`` [m]; -1: there is none."""
-    least, found = np.inf, -1
-    for k in range(view.obstacles.shape[0] + view.p.shape[0]):
-        if k != view.obstacles.shape[0] + i and near(numbers, view, i, k, need):
-            gap = gap_to(numbers, view, i, k)[0]
-            if gap < least:
-                least, found = gap, k
-    return found
+    interventions: np.ndarray  # (N,) substeps in which it changed the force, or the reference velocity
+    change: np.ndarray  # (N,) integral of |u - wish| dt, or m |v_r - wish| of every mission step [N s]
+    breaches: np.ndarray  # (N, 5) substeps in which an assumption did not hold, in the order of ASSUMPTIONS
 
 
 @allocation_free
@@ -257,40 +133,26 @@ def within(x, y, centre_x, centre_y, radius):
 
 
 @allocation_free
-def most_violated(numbers, view, i, a, need, x, y):
-    """(thing, excess): the disc that w = (x, y) is farthest out of [m/s]; -1 where it is in all of them."""
-    worst, found = 0.0, -1
-    for k in range(view.obstacles.shape[0] + view.p.shape[0]):
-        if k != view.obstacles.shape[0] + i and near(numbers, view, i, k, need):
-            over = excess(numbers, view, i, k, a, x, y)
-            if over > worst:
-                worst, found = over, k
-    return found, worst
-
-
-@allocation_free
 def nearest_safe(numbers, view, i, x, y):
     """The wish (x, y) [m/s] projected on the disc that it is farthest out of, time and again; one thing needs one round.
 
-    The result is within what the actuators reach; whether it is safe is for :func:`stays_safe` to say.
+    The result is within what the actuators reach; whether it is safe is for :func:`~marlbc_mj.core.stopping.stays_safe` to say.
     """
     authority = view.h * numbers.force_limit / numbers.mass
     speed = min(numbers.speed_cap, speed_of(numbers, view, i) + authority)
     a = braking(numbers, speed)
-    need = speed * (0.5 * speed / a + view.h) if a > 0.0 else 0.0
+    need = reach_of(numbers, view, speed) if a > 0.0 else 0.0
     fastest = max(speed - spread_of(numbers, view, i) - TINY, 0.0)
     x, y = within(x, y, view.v[i, 0], view.v[i, 1], authority)
     for _ in range(ROUNDS):
-        k, over = -1, 0.0
+        k = -1
         if a > 0.0:
-            k, over = most_violated(numbers, view, i, a, need, x, y)
+            k = most_violated(numbers, view, i, a, need, x, y)[0]
         if k < 0 and x * x + y * y <= fastest * fastest:
             break
         x, y = within(x, y, 0.0, 0.0, fastest)
         if k >= 0:
-            _, normal_x, normal_y = gap_to(numbers, view, i, k)
-            centre_x, centre_y = a * view.h * normal_x, a * view.h * normal_y
-            radius = np.sqrt((x - centre_x) ** 2 + (y - centre_y) ** 2) - over
+            centre_x, centre_y, radius = disc_of(numbers, view, i, k, a, x, y)
             x, y = within(x, y, centre_x, centre_y, max(radius - TINY, 0.0))
         x, y = within(x, y, view.v[i, 0], view.v[i, 1], authority)
     return x, y
@@ -299,23 +161,29 @@ def nearest_safe(numbers, view, i, x, y):
 @allocation_free
 def last_resort(numbers, view, i, k):
     """Braking with all there is, down to rest; of an agent that is slow already, what is nearest to rest and safe, and where
-    nothing is, a retreat from thing ``k``, as far as f may push meanwhile.
+    nothing is, a retreat from thing ``k``, as far as f may push meanwhile. Rest is that of thing ``k``, if it moves.
     """
     authority = view.h * numbers.force_limit / numbers.mass
-    x, y = within(0.0, 0.0, view.v[i, 0], view.v[i, 1], authority)
-    if k < 0 or x != 0.0 or y != 0.0 or stays_safe(numbers, view, i, 0.0, 0.0):
+    pace_x, pace_y = pace_of(view, k)
+    x, y = within(pace_x, pace_y, view.v[i, 0], view.v[i, 1], authority)
+    if k < 0 or x != pace_x or y != pace_y or stays_safe(numbers, view, i, pace_x, pace_y):
         return x, y
-    x, y = nearest_safe(numbers, view, i, 0.0, 0.0)
+    x, y = nearest_safe(numbers, view, i, pace_x, pace_y)
     if stays_safe(numbers, view, i, x, y):
         return x, y
     _, normal_x, normal_y = gap_to(numbers, view, i, k)
     retreat = spread_of(numbers, view, i)
-    return within(retreat * normal_x, retreat * normal_y, view.v[i, 0], view.v[i, 1], authority)
+    if moves(view, k):
+        retreat += 2.0 * view.h * numbers.obstacle_acceleration
+    return within(pace_x + retreat * normal_x, pace_y + retreat * normal_y, view.v[i, 0], view.v[i, 1], authority)
 
 
 @allocation_free
 def safe_velocity(numbers, view, i, k, x, y):
-    """The first of {the wish (x, y) projected; its tangential part; braking} that stays safe: w [m/s] of agent ``i``."""
+    """The first of {the wish (x, y) projected; its tangential part; braking} that stays safe: w [m/s] of agent ``i``.
+
+    Where obstacles move, braking may not stay safe either: then it is the one of first and last that is less far out.
+    """
     next_x, next_y = nearest_safe(numbers, view, i, x, y)
     if stays_safe(numbers, view, i, next_x, next_y):
         return next_x, next_y
@@ -324,39 +192,60 @@ def safe_velocity(numbers, view, i, k, x, y):
         inwards = min((x - view.v[i, 0]) * normal_x + (y - view.v[i, 1]) * normal_y, 0.0)
         along_x, along_y = x - inwards * normal_x, y - inwards * normal_y
         authority = view.h * numbers.force_limit / numbers.mass
-        next_x, next_y = within(along_x, along_y, view.v[i, 0], view.v[i, 1], authority)
-        if stays_safe(numbers, view, i, next_x, next_y):
+        along_x, along_y = within(along_x, along_y, view.v[i, 0], view.v[i, 1], authority)
+        if stays_safe(numbers, view, i, along_x, along_y):
+            return along_x, along_y
+    last_x, last_y = last_resort(numbers, view, i, k)
+    if view.obstacles.shape[1] > 3:
+        over = farthest_out(numbers, view, i, last_x, last_y)
+        if farthest_out(numbers, view, i, next_x, next_y) < over:
             return next_x, next_y
-    return last_resort(numbers, view, i, k)
+    return last_x, last_y
+
+
+@allocation_free
+def farthest_out(numbers, view, i, x, y):
+    """How far w = (x, y) is out of the disc that it is farthest out of [m/s]; 0 where it is in all of them."""
+    worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
+    return most_violated(numbers, view, i, max(braking(numbers, worst), 0.0), reach_of(numbers, view, worst), x, y)[1]
 
 
 @allocation_free
 def watch_assumptions(numbers, view, i, last, breaches):
     """Count for agent ``i`` a speed beyond the cap, and a force beyond its bound since the ``last`` substep (2, 2): v and u.
 
-    All that is not u shows in m (v+ - v) / h - u: disturbance, contact, lag and loss of actuators.
+    All that is not u shows in m (v+ - v) / h - u: disturbance, contact, lag and loss of actuators. What of it is friction against
+    the motion does not count: it only takes agents nearer to rest, which is in every disc.
     """
     x, y = view.moving[i, 0], view.moving[i, 1]
-    if x * x + y * y > (numbers.speed_cap + TINY) ** 2:
+    speed = np.sqrt(x * x + y * y)
+    if speed * speed > (numbers.speed_cap + TINY) ** 2:
         breaches[SPEED_BROKEN] += 1.0
     per = numbers.mass / view.h
     other_x, other_y = per * (x - last[0, 0]) - last[1, 0], per * (y - last[0, 1]) - last[1, 1]
-    speed = np.sqrt(last[0, 0] ** 2 + last[0, 1] ** 2)
-    if other_x**2 + other_y**2 > (force_bound(numbers, speed) + 1e-6 * numbers.force_limit) ** 2:
+    if numbers.friction > 0.0:
+        along_x, along_y = (x / speed, y / speed) if speed > 0.0 else (0.0, 0.0)
+        taken = min(max(-(other_x * along_x + other_y * along_y), 0.0), numbers.friction)
+        other_x, other_y = other_x + taken * along_x, other_y + taken * along_y
+    before = np.sqrt(last[0, 0] ** 2 + last[0, 1] ** 2)
+    allowed = force_bound(numbers, before) + 1e-6 * numbers.force_limit + 2.0 * per * numbers.velocity_error
+    if other_x**2 + other_y**2 > allowed**2:
         breaches[FORCE_BROKEN] += 1.0
 
 
 @allocation_free
-def shield_agent(numbers, view, i, force, counts):
-    """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit."""
+def shield_agent(numbers, view, i, longest, force, counts):
+    """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit.
+
+    ``longest`` [m] is the team's greatest stopping distance.
+    """
     per = view.h / numbers.mass
     x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
     worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
-    a = braking(numbers, worst)
-    need = max(worst * (0.5 * worst / a + view.h) if a > 0.0 else FAR, view.stopping[i])
-    k = most_pressing(numbers, view, i, need)
+    need = max(reach_of(numbers, view, worst), view.stopping[i])
+    k = most_pressing(numbers, view, i, need) if anything_near(numbers, view, i, longest, need) else -1
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
-        counts.breaches[i, STATE_BROKEN] += 1.0
+        counts.breaches[i, MOTION_BROKEN if moves(view, k) else STATE_BROKEN] += 1.0
     if (k < 0 and worst <= numbers.speed_cap) or stays_safe(numbers, view, i, x, y):
         return
     x, y = safe_velocity(numbers, view, i, k, x, y)
@@ -367,8 +256,19 @@ def shield_agent(numbers, view, i, force, counts):
 
 
 @allocation_free
+def fill_stopping(numbers, view):
+    """Stopping distances L_i of one team, into the view; returns the greatest [m]."""
+    longest = 0.0
+    for i in range(view.p.shape[0]):
+        view.stopping[i] = stopping_distance(numbers, speed_of(numbers, view, i))
+        longest = max(longest, view.stopping[i])
+    return longest
+
+
+@allocation_free
 def shield_team(numbers, view, last, force, counts):
-    """Shield the forces (N, 2) [N] of one team, which all agents choose at once, knowing each other's present state.
+    """Shield the forces (N, 2) [N] of one team, which all agents choose at once, knowing each other's present state or, where
+    messages are late, the half-planes in its place.
 
     Args:
         numbers: the shield's.
@@ -377,12 +277,39 @@ def shield_team(numbers, view, last, force, counts):
         force: (N, 2) what controllers wish; in place.
         counts: rows of this team; added to.
     """
-    for i in range(view.p.shape[0]):
-        view.stopping[i] = stopping_distance(numbers, speed_of(numbers, view, i))
+    longest = fill_stopping(numbers, view)
+    if view.grid.shape[0] > 0:
+        if view.obstacles.shape[1] > 3:
+            fill(view.obstacles, view.grid[: room(view.obstacles.shape[0])])
+        fill(view.p, view.grid[room(view.obstacles.shape[0]) :])
     for i in range(view.p.shape[0]):
         watch_assumptions(numbers, view, i, last[i], counts.breaches[i])
         for axis in range(2):
             force[i, axis] = clip(force[i, axis], numbers.box)
-        shield_agent(numbers, view, i, force[i], counts)
+        shield_agent(numbers, view, i, longest, force[i], counts)
         for axis in range(2):
             last[i, 0, axis], last[i, 1, axis] = view.moving[i, axis], force[i, axis]
+
+
+@allocation_free
+def restrain_references(numbers, braking_limit, duration, at, obstacles, previous, v_r):
+    """Change reference velocities ``v_r`` (N, 2) [m/s], in place: references, a tube around each, can brake before anything.
+
+    See :func:`marlbc_mj.core.braking.restrain`, which agents go through one after the other.
+
+    Args:
+        numbers: the shield's.
+        braking_limit: acceleration limit of references [m/s^2].
+        duration: of a mission step [s].
+        at: (N, 2) references [m].
+        obstacles: (K, 3) x, y, radius [m].
+        previous: (N, 2) v_r of the mission step before [m/s]; what was chosen afterwards.
+        v_r: (N, 2) wishes within the limits of speed and acceleration.
+    """
+    kept, between = numbers.clearance + numbers.tube, numbers.agent_distance + 2.0 * numbers.tube
+    barrier = Barrier(0.0, 0.0, 0.0, np.inf, braking_limit, duration, kept, between)
+    for i in range(v_r.shape[0]):
+        before_x, before_y = previous[i, 0], previous[i, 1]
+        previous[i, 0], previous[i, 1] = v_r[i, 0], v_r[i, 1]
+        restrain(i, (before_x, before_y), barrier, at, obstacles, previous)
+        v_r[i, 0], v_r[i, 1] = previous[i, 0], previous[i, 1]

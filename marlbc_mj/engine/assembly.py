@@ -35,7 +35,8 @@ def assemble(scenario: Scenario, limit: float) -> str:
 
     Args:
         scenario: which robot, how many, what obstacles, which substep.
-        limit: force range of every motor [N]; infinite removes the ranges, for laws that ignore the actuator.
+        limit: force range of every motor [N]; infinite, for laws that ignore the actuator, removes those of a robot that has no
+            mass and no force limit of its own.
 
     Raises:
         ConfigurationError: unknown robot, or a limit that is not positive.
@@ -84,10 +85,11 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
         geom.rgba = agent_color(agent) if robot.mass is None or not geom.material else geom.rgba
         if robot.mass is None:
             geom.mass *= mass / total
+    most = limit if robot.mass is None else min(limit, robot.force_limit)  # what a robot's motors give, no law can change
     for name in robot.motors:
         motor = child.actuator(name)
-        bounded = np.isfinite(limit)
-        motor.ctrlrange = motor.forcerange = (-limit, limit) if bounded else (0.0, 0.0)
+        bounded = np.isfinite(most)
+        motor.ctrlrange = motor.forcerange = (-most, most) if bounded else (0.0, 0.0)
         motor.ctrllimited = motor.forcelimited = int(bounded)
     spec.attach(child, prefix=agent_prefix(agent), frame=spec.worldbody.add_frame())
 

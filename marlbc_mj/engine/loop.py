@@ -4,7 +4,7 @@ The compiled loop runs it for every world; the Python path runs the same source 
 objects; the dm_control task calls its parts from composer's hooks. Its order:
 
 1. :func:`begin`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
-   (``actual``), limited, and held;
+   (``actual``), limited, and held; a shield of references may change it, :func:`shield_references`;
 2. for every substep h, :func:`apply`: force from the current errors and weights, weights by explicit Euler, drag at the current
    (p, v), the robot's controls; MuJoCo's step; :func:`settle`: what was reached is measured, p_r += h v_r;
 3. :func:`finish`: obstacles that move are put where they are then; clearances, formation identifier and reward follow from the
@@ -21,7 +21,9 @@ from marlbc_mj.core.imperfections import sense, weaken
 from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
-from marlbc_mj.core.shield import ShieldCounts, ShieldView, shield_team
+from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_stopping, restrain_references, shield_team
+from marlbc_mj.core.stamps import Mail, exchange
+from marlbc_mj.core.stopping import TINY, ShieldView
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
@@ -107,11 +109,16 @@ class Team(NamedTuple):
     force: np.ndarray  # (B, N, 2) of the last substep: the law's, then what the actuators gave [N]
     workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.plan.workspace_rows
     grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 where none pays
-    interventions: np.ndarray  # (B, N) substeps of the episode in which the shield changed the force; (B, 0) without a shield
+    interventions: np.ndarray  # (B, N) substeps of the episode in which the shield changed something; (B, 0) without a shield
     force_change: np.ndarray  # (B, N) integral of what it changed [N s]
-    breaches: np.ndarray  # (B, N, 3) substeps in which its assumptions did not hold, see ShieldCounts
+    breaches: np.ndarray  # (B, N, A) substeps in which its assumptions did not hold, see ShieldCounts
     last_substep: np.ndarray  # (B, N, 2, 2) v and u of the substep before [m/s], [N]
     stopping: np.ndarray  # (B, N) scratch: stopping distances [m]
+    stamps: np.ndarray  # (B, N, N, 2) live stamps, see marlbc_mj.core.stamps; (B, 0, 0, 2) where all agents know all
+    planes: np.ndarray  # (B, N, N, 2, 3) their half-planes
+    memory: np.ndarray  # (B, R, N, 3) the past of a shield: p, stopping distance [m]
+    said: np.ndarray  # (B, R, N, N) stamps that agents named then
+    tracks: np.ndarray  # (B, K, 5) scratch of a shield: obstacles that move, where they are now; (B, 0, 5) where all are at rest
 
 
 class Record(NamedTuple):
@@ -233,15 +240,65 @@ def set_forces(b, t, h, native, plant, team):
     return 0
 
 
+@allocation_free
+def shield_references(b, mission, behaviors, plant, team):
+    """After :func:`begin`: change v_r of world ``b``, as little as braking in time needs, if its shield is one of references."""
+    numbers, v_r = plant.shield[0], team.reference_velocity[b]
+    if team.interventions.shape[1] == 0 or not numbers.tube > 0.0:
+        return
+    wish, at, duration = team.force[b], team.reference[b], mission.mission_step
+    for i in range(v_r.shape[0]):
+        for axis in range(2):
+            wish[i, axis] = v_r[i, axis]
+    braking = behaviors.acceleration_limit
+    restrain_references(numbers, braking, duration, at, team.obstacles[b], team.drag[b], v_r)
+    for i in range(v_r.shape[0]):
+        x, y = v_r[i, 0] - wish[i, 0], v_r[i, 1] - wish[i, 1]
+        change = np.sqrt(x * x + y * y)
+        if change > TINY:
+            team.interventions[b, i] += mission.substeps
+            team.force_change[b, i] += numbers.mass * change
+        for k in range(team.obstacles.shape[1]):
+            x, y = at[i, 0] - team.obstacles[b, k, 0], at[i, 1] - team.obstacles[b, k, 1]
+            kept = team.obstacles[b, k, 2] + numbers.clearance + numbers.tube - numbers.slack
+            if x * x + y * y < kept * kept:
+                team.breaches[b, i, STATE_BROKEN] += mission.substeps
+                break
+
+
+@allocation_free
+def exchange_messages(b, count, view, numbers, team):
+    """What agents of world ``b`` know of each other by messages, ``count`` substeps after the mission began."""
+    fill_stopping(numbers, view)
+    latency, seed = int(numbers.latency), team.noise_seed[b]
+    stamps, planes, memory, said = team.stamps[b], team.planes[b], team.memory[b], team.said[b]
+    exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, said))
+
+
 @inlined
-def shield_forces(b, h, plant, team):
-    """Replace the forces of world ``b`` by the nearest that keep the team able to stop, if it has a shield."""
-    if team.interventions.shape[1] > 0:
+def shield_forces(b, t, h, plant, team):
+    """Replace the forces of world ``b`` by the nearest that keep the team able to stop, if its shield is one of forces.
+
+    Where it is one of references, whether agents are within the tube around theirs is watched.
+    """
+    if team.last_substep.shape[1] > 0:
         known = team.sensed.shape[1] > 0
         p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
-        view = ShieldView(h, p, v, team.velocity[b], team.obstacles[b], team.stopping[b])
+        obstacles = team.obstacles[b]
+        if team.tracks.shape[1] > 0:
+            obstacles = team.tracks[b]
+            move(t, team.anchors[b], team.motions[b], obstacles)
+        view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b])
+        if team.stamps.shape[1] > 0:
+            exchange_messages(b, round(t / h), view, plant.shield[0], team)
         counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
         shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
+    elif team.interventions.shape[1] > 0:
+        tube = plant.shield[0].tube
+        for i in range(team.position.shape[1]):
+            x, y = team.position[b, i, 0] - team.reference[b, i, 0], team.position[b, i, 1] - team.reference[b, i, 1]
+            if x * x + y * y > tube * tube:
+                team.breaches[b, i, TUBE_BROKEN] += 1.0
 
 
 @inlined
@@ -256,7 +313,7 @@ def apply(b, k, mission, native, plant, team):
     failed = set_forces(b, t, h, native, plant, team)
     if not failed:
         force = team.force[b]
-        shield_forces(b, h, plant, team)
+        shield_forces(b, t, h, plant, team)
         if plant.loss > 0.0:
             weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
@@ -317,6 +374,7 @@ def finish(b, mission, team):
 def mission_step(b, orders, given, mission, behaviors, native, plant, team, record):
     """One mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
     begin(b, orders, given, mission, behaviors, team)
+    shield_references(b, mission, behaviors, plant, team)
     team.status[b] = 0
     for k in range(mission.substeps):
         failed = apply(b, k, mission, native, plant, team)

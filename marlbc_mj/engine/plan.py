@@ -12,7 +12,8 @@ from marlbc_mj.controllers import Controller, largest_stable_substep
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
-from marlbc_mj.core.shield import NO_SHIELD, Shield, ShieldNumbers, as_records
+from marlbc_mj.core.shield import Shield
+from marlbc_mj.core.stopping import NO_SHIELD, ShieldNumbers, as_records
 from marlbc_mj.engine.assembly import agent_prefix, assemble
 from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
@@ -42,11 +43,21 @@ class Plan:
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     disturbance_params: np.ndarray  # (P,)
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
-    shielded: bool = False  # whether plant.shield is used
+    shield: Shield | bool | None = None  # as it was asked for
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is made anew: the addresses of laws and of MuJoCo's model are those of one process."""
-        return make_plan, (self.scenario, self.controller)
+        return make_plan, (self.scenario, self.controller, self.shield)
+
+    @property
+    def shielded(self) -> bool:
+        """Whether plant.shield is used."""
+        return bool(self.shield)
+
+    @property
+    def mailed(self) -> bool:
+        """Whether agents with a shield know of each other by messages that may be late."""
+        return isinstance(self.shield, Shield) and self.shield.mailed
 
     @property
     def grid_room(self) -> int:
@@ -108,7 +119,7 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
             "through only; choose a robot without contact"
         )
     limit = scenario.force_limit if controller.limited else np.inf
-    numbers = resolve(Shield() if shield is True else shield, scenario, limit) if shield else NO_SHIELD
+    numbers = resolve(Shield() if shield is True else shield, scenario, limit, controller) if shield else NO_SHIELD
     xml = assemble(scenario, limit)
     model = mujoco.MjModel.from_xml_string(xml)
     return Plan(
@@ -123,7 +134,7 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
         initial_state=np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in range(scenario.agents)]),
         disturbance_params=laws.pack_gains(scenario.disturbance.law, scenario.disturbance.params(), laws.DISTURBANCE),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
-        shielded=bool(shield),
+        shield=shield,
     )
 
 

@@ -1,46 +1,67 @@
 """A shield's assumptions, taken from a scenario where they are left open, and checked before anything runs."""
 
+from statistics import NormalDist
+
 import numpy as np
 
-from marlbc_mj.core.shield import ForceBound, Shield, ShieldNumbers, retreat_drift, stopping_distance
+from marlbc_mj.controllers import PD, SORLC, Controller
+from marlbc_mj.core.motion import obstacles_at
+from marlbc_mj.core.shield import Shield
+from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, following_distance, retreat_drift, stopping_distance
 from marlbc_mj.robots import Robot, make_robot
-from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios import Draw, Scenario
+from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
 
 GREATEST_SHARE = 0.25
 """Of the force limit, that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating keep S."""
+GREATEST_ERROR = 0.5
+"""Of the force limit, that f and the robot's own error may take there: up to it a retreat takes back what a stop costs."""
 CREEP = 2.0
 """Retreats at rest, each with its :func:`drift`, that the margin has room for where several things press at once."""
 FASTEST = 1e3  # speed cap where f does not grow with the speed [m/s]
 LEAST_CREEP = 1e-5  # more, for the drift of a slow motion that ends [m]
+TUBE_SLACK = 1.05  # of a computed tube: the substep's share, which the response in continuous time leaves out
 
 
-def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
-    """The assumptions of a shield for one scenario, as numbers.
+def resolve(shield: Shield, scenario: Scenario, limit: float, controller: Controller | None = None) -> ShieldNumbers:
+    """The assumptions of a shield for one scenario, as numbers: of forces, or of references where forces are not known to act.
 
     Args:
         shield: what is assumed; None in a field takes the scenario's.
         scenario: the problem instance.
         limit: of the actuators per axis [N]; infinite for an unlimited law.
+        controller: that follows references; it matters for a tube around them only.
 
     Raises:
         ConfigurationError: an assumption that does not hold, with the number that breaks it.
     """
     robot = make_robot(scenario.robot)
-    _check_plant(shield, scenario, robot)
+    known = robot.force_error is not None or shield.force_error is not None
+    level = shield.level or ("reference" if shield.tube is not None or not known else "force")
+    _check_sensors(shield, scenario)
+    numbers = _of_forces(shield, scenario, robot, limit) if level == "force" else _of_references(shield, scenario, controller)
+    starts = np.array(scenario.starts, dtype=np.float64)
+    check_draw(numbers, Draw(starts, scenario.obstacle_array(), 1.0, motion_array(scenario.motions)))
+    return numbers
+
+
+def _of_forces(shield: Shield, scenario: Scenario, robot: Robot, limit: float) -> ShieldNumbers:
+    """Numbers of a shield of forces."""
+    if robot.force_error is None and shield.force_error is None:
+        raise ConfigurationError(_missing(robot))
     force = scenario.force_limit if shield.force_limit is None else shield.force_limit
     if not 0.0 < force <= limit:
         raise ConfigurationError(
             f"shield: the force limit must be positive and at most the actuators' {limit:g} N, got {force:g} N"
         )
-    bound = _force_bound(shield, scenario, robot)
-    _check_bound(bound, force, scenario)
+    bound = _disturbance_bound(shield, scenario)
+    error = robot.force_error if shield.force_error is None else shield.force_error
+    assert error is not None
+    _check_bound(bound, error, force, scenario)
+    bound = bound._replace(constant=bound.constant + error)
     cap = _speed_cap(bound, force) if shield.speed_cap is None else shield.speed_cap
-    if not bound.at(cap) < force:
-        raise ConfigurationError(
-            f"shield: at the speed cap of {cap:g} m/s the disturbance may be {bound.at(cap):.3g} N, so a force limit of "
-            f"{force:g} N leaves nothing to brake with; lower speed_cap"
-        )
+    _check_braking(shield, scenario, bound, force, cap)
     kept = scenario.safe_distance if shield.clearance is None else shield.clearance
     between = 2.0 * robot.radius if shield.agent_distance is None else shield.agent_distance
     numbers = ShieldNumbers(
@@ -51,29 +72,138 @@ def resolve(shield: Shield, scenario: Scenario, limit: float) -> ShieldNumbers:
         speed_cap=float(cap),
         clearance=float(kept),
         agent_distance=float(between),
-        velocity_error=float(shield.velocity_error),
+        velocity_error=float(shield.velocity_error + robot.slip),
+        friction=float(robot.friction),
+        obstacle_speed=float(shield.obstacle_speed) if scenario.moving else 0.0,
+        obstacle_acceleration=float(shield.obstacle_acceleration) if scenario.moving else 0.0,
+        **_messages(shield, scenario),
     )
-    creep = LEAST_CREEP + CREEP * retreat_drift(numbers, scenario.substep, 0.0)
-    numbers = numbers._replace(
+    slipping = numbers._replace(constant=numbers.constant + scenario.mass * robot.slip / scenario.substep)
+    creep = LEAST_CREEP + CREEP * retreat_drift(slipping, scenario.substep, 0.0)
+    return numbers._replace(
         clearance=numbers.clearance + shield.margin + creep + shield.position_error,
         agent_distance=numbers.agent_distance + shield.margin + 2.0 * (creep + shield.position_error),
         slack=creep,
     )
-    check_start(numbers, np.array(scenario.starts, dtype=np.float64), scenario.obstacle_array())
-    return numbers
 
 
-def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
-    """Raise ConfigurationError for a plant that the stopping ball does not describe."""
-    if robot.force_error is None and shield.force_error is None:
+def _of_references(shield: Shield, scenario: Scenario, controller: Controller | None) -> ShieldNumbers:
+    """Numbers of a shield of references, which brake with the scenario's acceleration limit; robots are within a tube of them."""
+    robot = make_robot(scenario.robot)
+    if shield.mailed:
         raise ConfigurationError(
-            f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
-            "it within one substep, in every direction, besides the planar force and the disturbance"
+            "shield: messages may be late in a shield of forces only; references are chosen one after the other, all knowing all"
         )
     if scenario.moving:
         raise ConfigurationError(
-            f"shield: obstacles of scenario {scenario.name!r} move; only obstacles at rest are kept clear of"
+            f"shield: obstacles of scenario {scenario.name!r} move; a shield of references keeps clear of obstacles at rest only"
         )
+    if scenario.reference != "virtual" or not np.isfinite(scenario.acceleration_limit):
+        raise ConfigurationError(
+            f"shield: references of scenario {scenario.name!r} cannot be shielded: they must be virtual and of limited "
+            f"acceleration, got {scenario.reference!r} and {scenario.acceleration_limit:g} m/s^2"
+        )
+    tube = _find_tube(shield, scenario, robot, controller)
+    kept = scenario.safe_distance if shield.clearance is None else shield.clearance
+    between = 2.0 * robot.radius if shield.agent_distance is None else shield.agent_distance
+    return ShieldNumbers(
+        force_limit=float(scenario.mass * scenario.acceleration_limit),
+        box=np.inf,
+        mass=float(scenario.mass),
+        constant=0.0,
+        linear=0.0,
+        quadratic=0.0,
+        speed_cap=float(scenario.speed_limit),
+        clearance=float(kept + shield.margin + shield.position_error),
+        agent_distance=float(between + shield.margin + 2.0 * shield.position_error),
+        velocity_error=0.0,
+        slack=LEAST_CREEP,
+        tube=float(tube),
+    )
+
+
+def _messages(shield: Shield, scenario: Scenario) -> dict[str, float]:
+    """Latency [substeps], loss and the silent agent, of messages between agents."""
+    substeps = shield.latency / scenario.substep
+    if abs(substeps - round(substeps)) > 1e-9 * max(1.0, substeps):
+        raise ConfigurationError(
+            f"shield: the latency of {shield.latency:g} s must be a whole multiple of the substep {scenario.substep:g} s"
+        )
+    if not -1 <= shield.silent < scenario.agents:
+        raise ConfigurationError(f"shield: silent must be -1 (none) or 0 to {scenario.agents - 1}, got {shield.silent}")
+    loss = shield.message_loss
+    quantile = -np.inf if loss == 0.0 else np.inf if loss == 1.0 else NormalDist().inv_cdf(loss)
+    return {"latency": float(round(substeps)), "quantile": float(quantile), "silent": float(shield.silent)}
+
+
+def _missing(robot: Robot) -> str:
+    """What a robot lacks for a shield."""
+    return (
+        f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
+        "it within one substep, in every direction, besides the planar force and the disturbance; and so is its tube, how far "
+        "[m] it may be from its reference; `python -m marlbc_mj.studies.shield_robots ROBOT` measures both"
+    )
+
+
+def _find_tube(shield: Shield, scenario: Scenario, robot: Robot, controller: Controller | None) -> float:
+    """How far agents may be from their references [m]: given, computed for a direct robot, or measured, in this order."""
+    if shield.tube is not None:
+        return shield.tube
+    if robot.direct and not robot.contact and controller is not None:
+        return tracking_tube(scenario, controller, _disturbance_bound(shield, scenario))
+    if robot.tube is None:
+        raise ConfigurationError(_missing(robot))
+    gains = controller.linear_gains if isinstance(controller, PD | SORLC) else None
+    if gains not in (robot.gains, PD().linear_gains):
+        raise ConfigurationError(
+            f"shield: robot {robot.name!r} stays within {robot.tube:g} m of its reference under PD and SORLC with the gains "
+            f"{robot.gains} or {PD().linear_gains}, but {type(controller).__name__} has {gains}; give Shield(tube=...)"
+        )
+    return robot.tube
+
+
+def tracking_tube(scenario: Scenario, controller: Controller, bound: ForceBound) -> float:
+    """How far a point mass under PD, or SORLC without networks, may be from a reference of limited acceleration [m].
+
+    The error obeys e'' + k_v e' + k_p e = f / m, and e' jumps by at most A T in every mission step. With k_v^2 >= 4 k_p the
+    response g to a unit jump is positive, has one peak G and the integral 1 / k_p. So |e| <= (B / m + A) / k_p + A T G, as
+    long as the force m (k_p e + k_v e') is below its limit, which is checked.
+
+    Raises:
+        ConfigurationError: another controller, underdamped gains, or a force beyond the limit.
+    """
+    if not (isinstance(controller, PD) or (isinstance(controller, SORLC) and controller.basis == "off")):
+        raise ConfigurationError(
+            f"shield: no tube is known for {type(controller).__name__}: only for PD and SORLC(basis='off'); give Shield(tube=...)"
+        )
+    k_p, k_v = (gain * scenario.unit_force / scenario.mass for gain in controller.linear_gains)
+    if k_v**2 < 4.0 * k_p:
+        raise ConfigurationError(f"shield: gains {k_p:g} and {k_v:g} overshoot; a tube needs k_v^2 >= 4 k_p")
+    jump, brake = scenario.mission_step, scenario.acceleration_limit
+    pull = bound.at(scenario.speed_limit) / scenario.mass + brake
+    tube = TUBE_SLACK * (pull / k_p + brake * jump * _peak(k_p, k_v))
+    error_rate = TUBE_SLACK * (2.0 * _peak(k_p, k_v) * pull + brake * jump)
+    force = scenario.mass * (k_p * tube + k_v * error_rate)
+    if not force <= scenario.force_limit:
+        raise ConfigurationError(
+            f"shield: following references may take {force:.3g} N, more than the force limit of {scenario.force_limit:g} N; "
+            "give Shield(tube=...)"
+        )
+    return float(tube)
+
+
+def _peak(k_p: float, k_v: float) -> float:
+    """Greatest value of the response g to a unit jump of e' [s], for k_v^2 >= 4 k_p."""
+    root = np.sqrt(max(k_v**2 - 4.0 * k_p, 0.0))
+    if root < 1e-6 * k_v:
+        return float(2.0 / (np.e * k_v))
+    fast, slow = 0.5 * (k_v + root), 0.5 * (k_v - root)
+    at = np.log(fast / slow) / root
+    return float((np.exp(-slow * at) - np.exp(-fast * at)) / root)
+
+
+def _check_sensors(shield: Shield, scenario: Scenario) -> None:
+    """Raise ConfigurationError for sensors whose errors are not said."""
     errors = scenario.imperfections
     blurred = (errors.position_noise > 0 or errors.delay > 0) and shield.position_error == 0
     if blurred or ((errors.velocity_noise > 0 or errors.delay > 0) and shield.velocity_error == 0):
@@ -84,31 +214,49 @@ def _check_plant(shield: Shield, scenario: Scenario, robot: Robot) -> None:
         )
 
 
-def _force_bound(shield: Shield, scenario: Scenario, robot: Robot) -> ForceBound:
-    """Bound of all that is not u: the disturbance at the greatest scale that is drawn, and the robot's own error."""
-    error = robot.force_error if shield.force_error is None else shield.force_error
-    assert error is not None
-    bound = shield.disturbance
-    if bound is None:
-        offered = getattr(scenario.disturbance, "force_bound", None)
-        if offered is None:
-            raise ConfigurationError(
-                f"shield: disturbance {type(scenario.disturbance).__name__} has no force_bound(); "
-                "give Shield(disturbance=ForceBound(...))"
-            )
-        scale = max(map(abs, scenario.perturbation.drag_scale))
-        bound = ForceBound(*(scale * number for number in offered()))
-    return bound._replace(constant=bound.constant + error)
-
-
-def _check_bound(bound: ForceBound, force: float, scenario: Scenario) -> None:
-    """Raise ConfigurationError for a disturbance too strong for the force limit."""
-    speed = scenario.substep * force / scenario.mass
-    if bound.at(speed) > GREATEST_SHARE * force:
+def _disturbance_bound(shield: Shield, scenario: Scenario) -> ForceBound:
+    """Bound of the disturbance at the greatest scale that is drawn."""
+    if shield.disturbance is not None:
+        return shield.disturbance
+    offered = getattr(scenario.disturbance, "force_bound", None)
+    if offered is None:
         raise ConfigurationError(
-            f"shield: at {speed:.3g} m/s, which the force limit of {force:g} N reaches within a substep, the disturbance may be "
-            f"{bound.at(speed):.3g} N; it must be at most {GREATEST_SHARE * force:.3g} N, {GREATEST_SHARE:g} of the limit"
+            f"shield: disturbance {type(scenario.disturbance).__name__} has no force_bound(); "
+            "give Shield(disturbance=ForceBound(...))"
         )
+    scale = max(map(abs, scenario.perturbation.drag_scale))
+    return ForceBound(*(scale * number for number in offered()))
+
+
+def _check_bound(bound: ForceBound, error: float, force: float, scenario: Scenario) -> None:
+    """Raise ConfigurationError for a disturbance, or a disturbance and a robot's own error, too strong for the force limit."""
+    speed = scenario.substep * force / scenario.mass
+    for size, share, what in (
+        (bound.at(speed), GREATEST_SHARE, "the disturbance"),
+        (bound.at(speed) + error, GREATEST_ERROR, "the disturbance and the robot's own error"),
+    ):
+        if size > share * force:
+            raise ConfigurationError(
+                f"shield: at {speed:.3g} m/s, which the force limit of {force:g} N reaches within a substep, {what} may be "
+                f"{size:.3g} N; it must be at most {share * force:.3g} N, {share:g} of the limit"
+            )
+
+
+def _check_braking(shield: Shield, scenario: Scenario, bound: ForceBound, force: float, cap: float) -> None:
+    """Raise ConfigurationError where nothing is left to brake with at the speed cap, or to follow an obstacle with."""
+    if not bound.at(cap) < force:
+        raise ConfigurationError(
+            f"shield: at the speed cap of {cap:g} m/s the disturbance may be {bound.at(cap):.3g} N, so a force limit of "
+            f"{force:g} N leaves nothing to brake with; lower speed_cap"
+        )
+    if scenario.moving:
+        fastest = cap + 2.0 * shield.obstacle_speed
+        left = force - bound.at(fastest) - scenario.mass * shield.obstacle_acceleration
+        if not left > 0.0:
+            raise ConfigurationError(
+                f"shield: beside an obstacle that moves, agents may have {fastest:g} m/s, where the disturbance and an "
+                f"acceleration of {shield.obstacle_acceleration:g} m/s^2 leave {left:.3g} N of the force limit of {force:g} N"
+            )
 
 
 def _speed_cap(bound: ForceBound, force: float) -> float:
@@ -120,18 +268,39 @@ def _speed_cap(bound: ForceBound, force: float) -> float:
     return min(half / bound.linear, FASTEST) if bound.linear > 0.0 else FASTEST
 
 
-def check_start(numbers: ShieldNumbers, starts: np.ndarray, obstacles: np.ndarray) -> None:
-    """Raise ConfigurationError unless agents at rest at ``starts`` (N, 2) [m] among ``obstacles`` (K, 3) are in the safe set."""
+def check_draw(numbers: ShieldNumbers, draw: Draw) -> None:
+    """Raise ConfigurationError unless agents at rest at a draw's starts are in the safe set, and obstacles move as is assumed."""
+    speeds = _check_motions(numbers, draw.motions) if len(draw.motions) else np.zeros(len(draw.obstacles))
+    starts, obstacles = draw.starts, obstacles_at(0.0, draw.obstacles, draw.motions)
     stop = stopping_distance(numbers, numbers.velocity_error)
+    follow = np.array([max(stop, following_distance(numbers, speed + numbers.velocity_error)) for speed in speeds.tolist()])
+    kept = numbers.clearance + numbers.tube + follow
     gaps = np.linalg.norm(starts[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
-    for i, k in np.argwhere(gaps < numbers.clearance + stop)[:1].tolist():
+    for i, k in np.argwhere(gaps < kept)[:1].tolist():
         raise ConfigurationError(
             f"shield: agent {i + 1} starts at a clearance of {gaps[i, k]:.3f} m from obstacle {k + 1}, where at least "
-            f"{numbers.clearance + stop:.3f} m is kept"
+            f"{kept[k]:.3f} m is kept"
         )
+    least = numbers.agent_distance + 2.0 * (numbers.tube + stop)
     between = np.linalg.norm(starts[:, None] - starts[None], axis=-1) + np.diag(np.full(len(starts), np.inf))
-    for i, j in np.argwhere(between < numbers.agent_distance + 2.0 * stop)[:1].tolist():
+    for i, j in np.argwhere(between < least)[:1].tolist():
         raise ConfigurationError(
-            f"shield: agents {i + 1} and {j + 1} start {between[i, j]:.3f} m apart, where at least "
-            f"{numbers.agent_distance + 2.0 * stop:.3f} m is kept"
+            f"shield: agents {i + 1} and {j + 1} start {between[i, j]:.3f} m apart, where at least {least:.3f} m is kept"
         )
+
+
+def _check_motions(numbers: ShieldNumbers, motions: np.ndarray) -> np.ndarray:
+    """(K,) greatest speeds [m/s] of obstacles that move as ``motions`` (K, 6).
+
+    Raises:
+        ConfigurationError: one is faster, or changes its velocity faster, than is assumed.
+    """
+    swing = np.hypot(motions[:, 2], motions[:, 3]) * np.abs(motions[:, 4])
+    speeds, accelerations = np.hypot(motions[:, 0], motions[:, 1]) + swing, swing * np.abs(motions[:, 4])
+    for name, unit, values in (("obstacle_speed", "m/s", speeds), ("obstacle_acceleration", "m/s^2", accelerations)):
+        k = int(values.argmax())
+        if values[k] > getattr(numbers, name):
+            raise ConfigurationError(
+                f"shield: obstacle {k + 1} has up to {values[k]:.3g} {unit}, more than {name} = {getattr(numbers, name):g} {unit}"
+            )
+    return np.asarray(speeds)

@@ -11,14 +11,15 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.imperfections import sense
 from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
+from marlbc_mj.core.stamps import NEVER_STAMPED, REMEMBERED
 from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.loop import Record, Team, judge, valid_orders
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
-from marlbc_mj.engine.shielding import check_start
+from marlbc_mj.engine.shielding import check_draw
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping")
+SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "tracks")
 """Fields of a team that carry nothing from one mission step to the next."""
 
 
@@ -28,6 +29,10 @@ def make_team(plan: Plan, worlds: int) -> Team:
     agents, count, moving = scenario.agents, len(scenario.obstacles), scenario.moving
     each, pairs, tracks = (worlds, agents), (worlds, agents, 2), (worlds, count if moving else 0)
     shielded = (worlds, agents if plan.shielded else 0)
+    forces = (worlds, agents if plan.shielded and plan.plant.shield[0].tube == 0.0 else 0)
+    numbers = plan.plant.shield[0]
+    each_other = agents if forces[1] and plan.mailed else 0
+    mailed, ring = (worlds, each_other, each_other), int(numbers.latency) + REMEMBERED if each_other else 0
     return Team(
         steps=np.zeros(worlds, dtype=np.int64),
         position=np.zeros(pairs),
@@ -56,8 +61,13 @@ def make_team(plan: Plan, worlds: int) -> Team:
         interventions=np.zeros(shielded),
         force_change=np.zeros(shielded),
         breaches=np.zeros((*shielded, len(ASSUMPTIONS))),
-        last_substep=np.full((*shielded, 2, 2), np.nan),
-        stopping=np.zeros(shielded),
+        last_substep=np.full((*forces, 2, 2), np.nan),
+        stopping=np.zeros(forces),
+        stamps=np.full((*mailed, 2), NEVER_STAMPED),
+        planes=np.zeros((*mailed, 2, 3)),
+        memory=np.zeros((worlds, ring, mailed[1], 3)),
+        said=np.full((worlds, ring, *mailed[1:]), NEVER_STAMPED),
+        tracks=np.zeros((worlds, count if moving and forces[1] else 0, MOVING)),
     )
 
 
@@ -77,7 +87,7 @@ def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarra
     draw = plan.scenario.draw(rng)
     _check_solid(plan, draw.obstacles)
     if plan.shielded:
-        check_start(plan.plant.shield[0], draw.starts, draw.obstacles)
+        check_draw(plan.plant.shield[0], draw)
     team.obstacles[b, :, :3] = draw.obstacles
     if team.motions.shape[1]:
         team.anchors[b], team.motions[b] = draw.obstacles, draw.motions
@@ -111,6 +121,7 @@ def place(
     team.robot[b] = plan.robot.state_row()
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
+    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED
     judge(b, plan.mission, team)
 
 
@@ -122,6 +133,7 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     """
     plant, reading = plan.plant, plan.robot.reading
     team.last_substep[b] = np.nan
+    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED  # everyone is told of the new places
     base = plant.qpos_index.ravel()
     data.qpos[base] = np.ravel(position)
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from marlbc_mj.recording.log import EpisodeLog
-from marlbc_mj.util.palette import AGENT_COLORS, SAFE_DISTANCE_COLOR, command_color, ink_on
+from marlbc_mj.util.palette import AGENT_COLORS, LINK_COLOR, SAFE_DISTANCE_COLOR, SHIELD_COLOR, command_color, ink_on
 
 FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
 HEADER, FOOTER = 48, 80  # heights of the bars
@@ -171,6 +171,11 @@ class Pen:
             self.draw.line([v * self.scale for v in (start, y, start + 6, y)], color, round(2 * self.scale))
         self.x += 26 + gap
 
+    def stroke(self, y: float, color: str, *, gap: float = 0.0) -> None:
+        """Draw a short line, and move on."""
+        self.draw.line([v * self.scale for v in (self.x, y, self.x + 26, y)], color, round(2 * self.scale))
+        self.x += 26 + gap
+
 
 def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
     y = 0.5 * HEADER
@@ -199,10 +204,11 @@ def _draw_footer(pen: Pen, log: EpisodeLog, commands: Sequence[str], formation: 
         pen.pill(_spelled(command), 28, 14, command_color(command), width=widest, gap=gap)
     pen.x = pen.width - 24 - pen.length(state, 15, True)
     pen.text(state, 28, 15, INK, bold=True)
-    _draw_legend(pen, list(dict.fromkeys(b for name in log.commands for b in name.split(">"))))
+    behaviors = list(dict.fromkeys(b for name in log.commands for b in name.split(">")))
+    _draw_legend(pen, behaviors, shielded=log.shield.shape[1] > 0, links=log.link.shape[1] > 0)
 
 
-def _draw_legend(pen: Pen, behaviors: Sequence[str]) -> None:
+def _draw_legend(pen: Pen, behaviors: Sequence[str], *, shielded: bool, links: bool) -> None:
     pen.x = 24.0
     for behavior in behaviors:
         pen.dot(60, 6, command_color(behavior), gap=8)
@@ -211,7 +217,13 @@ def _draw_legend(pen: Pen, behaviors: Sequence[str]) -> None:
     pen.dashes(60, SAFE_DISTANCE_COLOR, gap=8)
     pen.text("safe distance", 60, 13, MUTED, gap=24)
     pen.dot(60, 4, GHOST_COLOR, gap=8)
-    pen.text("reference", 60, 13, MUTED)
+    pen.text("reference", 60, 13, MUTED, gap=24)
+    if shielded:
+        pen.dot(60, 6, SHIELD_COLOR, gap=8)
+        pen.text("shield acts", 60, 13, MUTED, gap=24)
+    if links:
+        pen.stroke(60, LINK_COLOR, gap=8)
+        pen.text("link, faded if stale", 60, 13, MUTED)
 
 
 def _spelled(command: str) -> str:

@@ -6,14 +6,19 @@ import numpy as np
 
 from marlbc_mj.controllers import Controller
 from marlbc_mj.core.motion import nearest_places, obstacles_at
+from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.engine.loop import fill_clearance, verdict
 from marlbc_mj.engine.plan import make_mission, make_plan
+from marlbc_mj.engine.team import shield_counts
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import NO_POSE, Trajectory, body_poses
 from marlbc_mj.supervisors.communication import Hearing
 
 NO_HEARING = Hearing(np.zeros((1, 0, 0), dtype=np.bool_), np.zeros((1, 0, 0)))
 """Of one mission step in which agents did not talk, or all heard everything at once."""
+
+NO_SHIELD_ROWS = np.zeros((0, 2 + len(ASSUMPTIONS)))
+"""What a shield did in a team that has none."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,15 @@ class EpisodeLog:
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
     link: np.ndarray = field(default_factory=lambda: NO_HEARING.link)  # (M, N, N) bool, see Hearing; (M, 0, 0) without
     age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) of what agents know of each other [s]
+    shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) by the end of each mission step, columns
+    # as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
+
+    def intervened(self, step: int) -> np.ndarray:
+        """(N,) bool: whose force or reference the shield changed in a mission step; (0,) without a shield."""
+        if self.shield.shape[1] == 0:
+            return np.zeros(0, dtype=bool)
+        before = self.shield[step - 1, :, 0] if step > 0 else 0.0
+        return np.asarray(self.shield[step, :, 0] > before)
 
     def obstacles_at(self, time: float) -> np.ndarray:
         """(K, 3) x, y, radius [m] at ``time`` [s]."""
@@ -90,7 +104,14 @@ def from_world(world: World, b: int = 0) -> EpisodeLog:
         reward=state.reward[b : b + 1].copy(),
         decision_ms=np.zeros(1),
         pose=body_poses(world, b)[None],
+        shield=shield_rows(_counts_of(world, b), 1),
     )
+
+
+def _counts_of(world: World, b: int) -> ShieldCounts | None:
+    """What the shield of world ``b`` did, (1, N) each."""
+    counts = shield_counts(world.state)
+    return None if counts is None else ShieldCounts(*(rows[b : b + 1] for rows in counts))
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:
@@ -123,8 +144,16 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         reward=trajectory.reward,
         decision_ms=trajectory.decision_ms,
         pose=trajectory.pose,
+        shield=shield_rows(trajectory.shield, len(position)),
         **hearing_columns(trajectory.hearing, len(position)),
     )
+
+
+def shield_rows(counts: ShieldCounts | None, steps: int) -> np.ndarray:
+    """(M, N, 7) as EpisodeLog has them, from counts of M rows; (``steps``, 0, 7) of no shield."""
+    if counts is None:
+        return np.zeros((steps, *NO_SHIELD_ROWS.shape))
+    return np.concatenate([counts.interventions[..., None], counts.change[..., None], counts.breaches], axis=-1)
 
 
 def hearing_columns(hearing: Hearing | None, steps: int) -> dict[str, np.ndarray]:

@@ -26,7 +26,7 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
-from marlbc_mj.recording.log import EpisodeLog, hearing_columns
+from marlbc_mj.recording.log import EpisodeLog, hearing_columns, shield_rows
 from marlbc_mj.recording.rerun_file import write_rerun
 from marlbc_mj.recording.writer import METADATA, MODEL
 from marlbc_mj.supervisors.communication import Hearing
@@ -93,6 +93,10 @@ def _check_log(log: EpisodeLog) -> None:
             raise ValueError(f"{name} is not finite")
     if log.pose.shape[:2] not in ((steps, 0), (steps, agents)) or log.pose.shape[2:] != (7,) or not np.isfinite(log.pose).all():
         raise ValueError(f"pose has shape {log.pose.shape}, or is not finite")
+    shield = log.shield
+    shapes_of_shield = (steps, 0, shield.shape[-1]), (steps, agents, len(schemas.SHIELD.columns))
+    if shield.shape not in shapes_of_shield or not (shield >= 0).all():
+        raise ValueError(f"shield has shape {shield.shape}, or negative counts")
     for name in ("link", "age"):
         if getattr(log, name).shape not in ((steps, 0, 0), (steps, agents, agents)):
             raise ValueError(f"{name} has shape {getattr(log, name).shape}")
@@ -278,7 +282,7 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
     """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
-    some = [topic for topic in (schemas.POSE, schemas.COMMUNICATION) if topic.name in _topics_used(reader)]
+    some = [topic for topic in (schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD) if topic.name in _topics_used(reader)]
     found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *some)}
     for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
         found[channel.topic].append(json.loads(message.data))
@@ -302,7 +306,7 @@ def _topics_used(reader: McapReader) -> set[str]:
 
 def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
     """The arrays of EpisodeLog from decoded messages."""
-    pose = schemas.POSE
+    pose, shield, steps = schemas.POSE, schemas.SHIELD, len(found["/state"])
 
     def agents(topic: str, *names: str) -> np.ndarray:
         # Infinite numbers are left out of the JSON, and only a clearance can be.
@@ -323,9 +327,15 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
         "command": agents("/priorities", "index")[..., 0],
         "reward": scalar("/metrics", "reward"),
         "decision_ms": scalar("/metrics", "decision_ms"),
-        "pose": agents(pose.name, *pose.columns) if pose.name in found else np.zeros((len(found["/state"]), 0, 7)),
-        **hearing_columns(_hearing(found), len(found["/state"])),
+        "pose": agents(pose.name, *pose.columns) if pose.name in found else np.zeros((steps, 0, 7)),
+        "shield": _shield_rows(found[shield.name]) if shield.name in found else shield_rows(None, steps),
+        **hearing_columns(_hearing(found), steps),
     }
+
+
+def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:
+    """(M, N, 7) as EpisodeLog has them; columns that an older log lacks are 0."""
+    return np.array([[[float(row.get(name, 0.0)) for name in schemas.SHIELD.columns] for row in m["agents"]] for m in messages])
 
 
 def _hearing(found: dict[str, list[dict[str, Any]]]) -> Hearing | None:

@@ -113,11 +113,13 @@ SHIELD = Topic(
     "marlbc.Shield",
     "what the shield did and saw since the episode began, at the end of a mission step",
     {
-        "interventions": MessageField("number", "substeps in which it changed the force"),
-        "change": MessageField("number", "integral of |u - wish| dt [N s]"),
+        "interventions": MessageField("number", "substeps in which it changed the force, or the reference velocity"),
+        "change": MessageField("number", "integral of |u - wish| dt, or sum of m |v_r - wish| [N s]"),
         "speed": MessageField("number", "substeps beyond the speed cap that it assumes"),
         "force": MessageField("number", "substeps with a disturbance beyond the bound that it assumes"),
         "state": MessageField("number", "substeps outside the set of states from which agents can stop in time"),
+        "motion": MessageField("number", "the same, because of an obstacle that moves"),
+        "tube": MessageField("number", "substeps farther from the reference than it assumes"),
     },
 )
 COMMUNICATION = Topic(

@@ -14,14 +14,15 @@ from marlbc_mj.recording.links import links_of_log
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.marks import Mark, Trail, add, ball, dashed_circle, flat_disc, make_trail, ribbon
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, agent_color, command_color, rgba
+from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, SHIELD_COLOR, agent_color, command_color, rgba
 from marlbc_mj.util.text import one_line
 
 BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
 BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
 RIM = 0.14  # width of the white rim around it, in drawn radii
-LINK_WIDTH, LINK_HEIGHT = 0.16, 0.058  # of the strip between two agents that hear each other, above trails and below halos [m]
+LINK_WIDTH = 0.13  # of the strip between two agents that hear each other [m]
+LINK_HEIGHT = 0.5  # of that strip, in drawn radii of the first: above the trails
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
 
 
@@ -58,6 +59,10 @@ class Stage:
     def commands(self, time: float) -> list[str]:
         """Every agent's command at ``time`` [s], "OA>FM" for example."""
         return [self.log.commands[k] for k in self.log.command[self.step(time)]]
+
+    def shielded(self, time: float) -> list[int]:
+        """Agents whose shield changes what they do in the mission step of ``time`` [s]."""
+        return [int(i) for i in np.flatnonzero(self.log.intervened(self.step(time)))]
 
     def pose(self, time: float) -> None:
         """Move the model's agents and obstacles to where they are at ``time`` [s]."""
@@ -97,19 +102,18 @@ class Stage:
         if not self.log.link.shape[1]:
             return []
         here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
-        size = LINK_WIDTH * self.scale, LINK_HEIGHT * self.scale
         return [
-            ribbon(here[i], here[j], *size, tuple(color), self.scale)
+            ribbon(here[i], here[j], LINK_WIDTH * self.scale, LINK_HEIGHT * self.radii[i], tuple(color), self.scale)
             for (i, j), color in zip(links.ends.tolist(), links.colors().tolist(), strict=True)
         ]
 
     def _agents(self, time: float) -> list[Mark]:
-        """Halos in the color of the command, and the references as ghosts."""
+        """Halos in the color of the command, their rims in the shield's where it acts, and the references as ghosts."""
         position, reference = (self.sample(v, time) for v in (self.log.position, self.log.reference))
-        marks, unit = [], self.scale
+        marks, unit, shielded = [], self.scale, self.shielded(time)
         for i, command in enumerate(self.commands(time)):
-            radius = float(self.radii[i])
-            marks.append(flat_disc(position[i], HALO * radius, 0.06 * unit, rgba("#FFFFFF"), unit))
+            radius, rim = float(self.radii[i]), SHIELD_COLOR if i in shielded else "#FFFFFF"
+            marks.append(flat_disc(position[i], HALO * radius, 0.06 * unit, rgba(rim), unit))
             marks.append(flat_disc(position[i], (HALO - RIM) * radius, 0.09 * unit, rgba(command_color(command)), unit))
             far = bool(np.hypot(*(reference[i] - position[i])) > radius)
             if far:

@@ -123,6 +123,8 @@ def _texts(stage: Stage, time: float) -> list[tuple[int, int, str, str]]:
     """Time and priorities, and which keys there are."""
     commands = stage.commands(time)
     names = "\n".join(["time", *(f"agent {i + 1}" for i in range(len(commands)))])
-    values = "\n".join([f"{time:.1f} s", *commands])
+    shielded = stage.shielded(time)
+    acting = [f"{command}  shield" if i in shielded else command for i, command in enumerate(commands)]
+    values = "\n".join([f"{time:.1f} s", *acting])
     font, grid = mujoco.mjtFontScale.mjFONTSCALE_150, mujoco.mjtGridPos
     return [(font, grid.mjGRID_TOPLEFT, names, values), (font, grid.mjGRID_BOTTOMLEFT, KEYS, "")]

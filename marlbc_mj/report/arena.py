@@ -14,6 +14,7 @@ from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.method_names import source_of
 from marlbc_mj.util.palette import command_color
 from marlbc_mj.util.stretches import stretches
 
@@ -36,7 +37,7 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
         _draw_arena(axes, episode)
         _draw_paths(axes, episode, 1.2 if columns == 1 else 0.8)
         if columns > 1:
-            pl.panel_label(axes, f"{episode.supervisor} + {episode.controller}")
+            pl.panel_label(axes, label_of(episode, episodes))
     for axes in panels.flat[len(episodes) :]:
         axes.set_visible(False)
     panels[0, 0].set(xlim=box[:2], ylim=box[2:])
@@ -48,6 +49,13 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
         axes.tick_params(labelbottom=True)
     _legend(figure, episodes)
     return figure
+
+
+def label_of(episode: Trajectory, episodes: Sequence[Trajectory]) -> str:
+    """What tells an episode from the others of a figure: its supervisor, its controller, or both."""
+    names = [source_of(name).display for name in (episode.supervisor, episode.controller)]
+    differ = [len({one.supervisor for one in episodes}) > 1, len({one.controller for one in episodes}) > 1]
+    return ", ".join(name for name, kept in zip(names, differ, strict=True) if kept) or ", ".join(names)
 
 
 def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float, float, float]:

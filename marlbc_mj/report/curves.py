@@ -6,20 +6,23 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from marlbc_mj.controllers.sorlc import STATE, Weights, weights
 from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.util.palette import command_color
+from marlbc_mj.report.method_names import source_of
+from marlbc_mj.util.palette import AGENT_COLORS, command_color
 from marlbc_mj.util.stretches import stretches
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
 _ZOOM = 2.0  # width of the window that shows single force pulses [s]
 _PULSE = 1.0  # the same for one pulse [s]
+_AXIS_COLORS = (AGENT_COLORS[0], AGENT_COLORS[1])  # of the x and the y axis, where one agent is shown alone
 _FLAT = 1e-9  # relative change below which a weight counts as constant
-_SMALL_WEIGHT = 1e-2  # smaller norms are drawn in units of a power of ten
+_SMALLEST_NORM = 1e-6  # share of the largest below which a norm is not drawn on a logarithmic axis
 
 _SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "va": "center_baseline", "annotation_clip": False}
 """Options of the text beside a strip."""
@@ -28,23 +31,43 @@ _SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "va": "c
 def priorities(episodes: Sequence[Trajectory]) -> Figure:
     """Each agent's command over time: color and height of a strip show its highest behavior.
 
-    One episode fills one column of text; several are panels, two per row.
+    Below the agents a grey strip shows how many switches the team made in each second. One episode fills one column of text;
+    several are panels, two per row, with one scale for all grey strips.
     """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
     margins = pl.Margins(left=0.52, right=0.52, top=0.4 if columns == 1 else 0.46, across=0.98, between=0.3)
     width = pl.SINGLE if columns == 1 else pl.DOUBLE
-    each = 0.28 * episodes[0].scenario.agents if columns == 1 else 0.17 * episodes[0].scenario.agents
+    lanes = episodes[0].scenario.agents + 1
+    each = 0.28 * lanes if columns == 1 else 0.17 * lanes
+    most = max(1, *(int(switch_rate(episode).max()) for episode in episodes))
     height = margins.top + margins.bottom + rows * each + (rows - 1) * margins.between
     figure, panels = pl.panels(width, height, rows, columns, margins, sharex=True)
     for axes, episode in zip(panels.flat, episodes, strict=False):
         _draw_priorities(axes, episode)
+        _draw_switch_rate(axes, episode, most)
         if columns > 1:
-            pl.panel_label(axes, episode.supervisor)
+            pl.panel_label(axes, source_of(episode.supervisor).display)
     _hide_rest(panels, len(episodes))
     handles = {h.get_label(): h for h in pl.command_handles(episodes[0].scenario.orders.commands, 4)}
-    pl.legend_above(figure, [handles[head] for head in _heads(episodes[0])])
+    shown = [handles[head] for head in _heads(episodes[0])]
+    shown.append(Line2D([], [], color=pl.GREY, linewidth=4, label=f"switches per s of the team (full height: {most})"))
+    pl.legend_above(figure, shown)
     return figure
+
+
+def switch_rate(trajectory: Trajectory) -> np.ndarray:
+    """Switches of all agents in each whole second (S,)."""
+    step, agents = trajectory.scenario.mission_step, trajectory.scenario.agents
+    at = (1 + np.flatnonzero(np.diff(trajectory.command, axis=0).ravel()) // agents) * step
+    return np.bincount(at.astype(int), minlength=int(np.ceil(trajectory.scenario.duration)))
+
+
+def _draw_switch_rate(axes: Axes, trajectory: Trajectory, most: int) -> None:
+    """A bar per second below the lowest agent's strip."""
+    rate = switch_rate(trajectory)
+    axes.bar(np.arange(len(rate)), rate / most, width=1.0, bottom=-_LANE, align="edge", color=pl.GREY, linewidth=0)
+    axes.annotate(f"{rate.max()}/s", (1, -_LANE + 0.35), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
 
 
 def _hide_rest(panels: np.ndarray, used: int) -> None:
@@ -76,8 +99,9 @@ def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
         count = int((np.diff(trajectory.command[:, i]) != 0).sum())
         axes.annotate(f"{count}", (1, base + 0.35), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
     axes.annotate("switches", (1, agents * _LANE - 0.1), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
-    axes.set(xlim=(0, trajectory.scenario.duration), ylim=(0, agents * _LANE - 0.25))
-    axes.set_yticks([(agents - 1 - i) * _LANE + 0.35 for i in range(agents)], [f"agent {i + 1}" for i in range(agents)])
+    axes.set(xlim=(0, trajectory.scenario.duration), ylim=(-_LANE, agents * _LANE - 0.25))
+    rows = [f"agent {i + 1}" for i in range(agents)]
+    axes.set_yticks([(agents - 1 - i) * _LANE + 0.35 for i in range(agents + 1)], [*rows, "rate"])
     axes.tick_params(axis="y", length=0)
     axes.spines["left"].set_visible(False)
 
@@ -133,44 +157,51 @@ def busiest(trajectory: Trajectory) -> slice:
 
 
 def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
-    """One agent's force, one column per framework, each on its own scale; the limit is dashed.
+    """One agent's force, one column per framework, on one scale: over the episode, and around the largest force of all.
 
-    Two rows show the axes over the episode; the third shows both around the largest force of all these episodes.
+    The scale is linear up to the limit and logarithmic beyond, so that forces within it and far above it are both visible.
     """
-    margins = pl.Margins(left=0.5, top=0.24, across=0.52, between=0.42)
-    figure, panels = pl.panels(pl.DOUBLE, 3.9, 3, len(episodes), margins, sharex="row", sharey="col")
-    color = pl.agent_line(agent)["color"]
+    limit = episodes[0].scenario.force_limit
+    margins = pl.Margins(left=0.56, right=0.42, top=0.42, across=0.24, between=0.42)
+    figure, panels = pl.panels(pl.DOUBLE, 3.4, 2, len(episodes), margins, sharex="row", sharey=True)
     wildest = max(episodes, key=lambda episode: float(np.abs(episode.force[:, agent]).max()))
-    peak = wildest.time[np.abs(wildest.force[:, agent]).max(axis=1).argmax()]
+    largest = np.abs(wildest.force[:, agent]).max(axis=1)
+    peak = wildest.time[largest.argmax()]
     for column, episode in enumerate(episodes):
-        limit = episode.scenario.force_limit
-        for axis in range(2):
-            axes = panels[axis, column]
-            axes.plot(*pl.envelope(episode.time, episode.force[:, agent, axis]), color=color, linewidth=0.7)
-            for bound in (-limit, limit):
-                axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
-            pl.panel_label(axes, f"{episode.controller}, $u_{'xy'[axis]}$")
-        reach = 1.12 * max(limit, float(np.abs(episode.force[:, agent]).max()))
-        panels[0, column].set(xlim=(0, episode.scenario.duration), ylim=(-reach, reach))
-        panels[1, column].set(xlim=(0, episode.scenario.duration))
-        _draw_pulse(panels[2, column], episode, agent, peak)
+        name = source_of(episode.controller).display
+        everything = episode.time >= 0.0
+        window = (episode.time >= peak - 0.2 * _PULSE) & (episode.time <= peak + 0.8 * _PULSE)
+        for row, (shown, suffix) in enumerate(((everything, ""), (window, f", {_PULSE:g} s"))):
+            _draw_both_axes(panels[row, column], episode, agent, shown)
+            pl.panel_label(panels[row, column], name + suffix)
+    reach = 1.5 * max(limit, float(largest.max()))
+    panels[0, 0].set_yscale("symlog", linthresh=limit, linscale=1.5)
+    panels[0, 0].set(ylim=(-reach, reach), yticks=_force_ticks(limit, reach))
+    panels[0, 0].yaxis.set_major_formatter("{x:g}")
+    for axes in panels[:, -1]:
+        axes.annotate(f"limit\n{limit:g} N", (1.0, limit), (3, 0), xycoords=("axes fraction", "data"), **_SMALL)
     for axes in panels[:, 0]:
         axes.set_ylabel("force [N]")
-    panels[2, -1].legend(loc="lower right", bbox_to_anchor=(1.0, 0.95), ncols=2, borderpad=0.0, columnspacing=1.0)
+    for axes in panels[-1]:
+        axes.set_xlabel("time [s]")
+    pl.legend_above(figure, panels[-1, 0].lines[:2])
     return figure
 
 
-def _draw_pulse(axes: Axes, episode: Trajectory, agent: int, peak: float) -> None:
-    """Both axes of the force over ``_PULSE`` seconds around ``peak``."""
-    window = (episode.time >= peak - 0.2 * _PULSE) & (episode.time <= peak + 0.8 * _PULSE)
-    color, time = pl.agent_line(agent)["color"], episode.time[window]
+def _force_ticks(limit: float, reach: float) -> list[float]:
+    """0, the limit, and its tenfolds up to ``reach``, both signs."""
+    sizes = [limit * 10.0**k for k in range(1 + int(np.log10(reach / limit)))]
+    return [-size for size in reversed(sizes)] + [0.0, *sizes]
+
+
+def _draw_both_axes(axes: Axes, episode: Trajectory, agent: int, shown: np.ndarray) -> None:
+    """Both axes of the force where ``shown`` (T,) is true, and the limit."""
+    time, force = episode.time[shown], episode.force[shown, agent]
     for axis in range(2):
-        style: dict[str, Any] = {"linestyle": ("-", (0, (2.5, 1)))[axis], "label": f"$u_{'xy'[axis]}$"}
-        axes.plot(time, episode.force[window, agent, axis], color=color, linewidth=0.9, **style)
+        axes.plot(*pl.envelope(time, force[:, axis]), color=_AXIS_COLORS[axis], linewidth=0.8, label=f"$u_{'xy'[axis]}$")
     for bound in (-episode.scenario.force_limit, episode.scenario.force_limit):
         axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
-    axes.set(xlim=(time[0], time[-1]), xlabel="time [s]")
-    pl.panel_label(axes, f"{episode.controller}, {_PULSE:g} s")
+    axes.set_xlim(time[0], time[-1] + episode.scenario.substep)
 
 
 def errors(trajectory: Trajectory) -> Figure:
@@ -215,20 +246,33 @@ def weight_errors(trajectory: Trajectory) -> Figure:
 
 def _weight_figure(trajectory: Trajectory, change: Callable[[np.ndarray], np.ndarray], label: str) -> Figure:
     read = network_weights(trajectory)
-    figure, panels = pl.panels(pl.DOUBLE, 2.0, 1, 3, pl.Margins(left=0.46, top=0.42, across=0.62), sharex=True)
+    figure, panels = pl.panels(pl.DOUBLE, 2.0, 1, 3, pl.Margins(left=0.6, top=0.42, across=0.66))
     time = np.arange(len(trajectory.controller_state)) * trajectory.scenario.mission_step
     named = (("identifier", "f", read.identifier), ("actor", "a", read.actor), ("critic", "c", read.critic))
     for axes, (name, symbol, matrix) in zip(panels[0], named, strict=True):
-        norms = np.linalg.norm(change(matrix), axis=(-2, -1))  # (M, N)
-        power = np.floor(np.log10(norms.max())) if 0.0 < norms.max() < _SMALL_WEIGHT else 0.0
-        norms, unit = norms * 10.0**-power, f" [$10^{{{power:.0f}}}$]" if power else ""
+        norms = np.maximum(np.linalg.norm(change(matrix), axis=(-2, -1)), 1e-300)  # (M, N)
         for i in range(norms.shape[1]):
             axes.plot(*pl.envelope(time, norms[:, i]), **pl.agent_line(i))
-        axes.set(xlabel="time [s]", ylabel=label.replace("{0}", symbol).replace("{}", symbol) + unit)
-        axes.set(xlim=(0, trajectory.scenario.duration), ylim=(0, 1.08 * float(norms.max()) or 1.0))
+        axes.set(xlabel="time [s]", ylabel=label.replace("{0}", symbol).replace("{}", symbol))
+        _scale_norms(axes, time, norms)
         pl.panel_label(axes, name)
     pl.legend_above(figure, panels[0, 0].lines)
     return figure
+
+
+def _scale_norms(axes: Axes, time: np.ndarray, norms: np.ndarray) -> None:
+    """Axes that show what changes: the part of the episode in which it does, and a logarithm where it spans decades."""
+    last = norms[-1] if norms[-1].max() > 1e-12 * norms.max() else np.zeros_like(norms[-1])
+    moving = np.flatnonzero((np.abs(norms - last) > 1e-3 * np.abs(norms - last).max()).any(axis=1))
+    end = time[min(len(time) - 1, int(1.1 * moving[-1]) + 1)] if len(moving) else time[-1]
+    axes.set_xlim(0, end)
+    positive = norms[(time <= end)[:, np.newaxis] & (norms > _SMALLEST_NORM * norms.max())]
+    low, high = float(positive.min()), float(norms.max())
+    if high > 30.0 * low:
+        axes.set(yscale="log", ylim=(0.7 * low, 1.5 * high))
+    else:
+        room = 0.08 * (high - low) or 0.1 * high
+        axes.set_ylim(low - room, high + room)
 
 
 def network_weights(trajectory: Trajectory) -> Weights:

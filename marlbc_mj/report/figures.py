@@ -21,6 +21,7 @@ from marlbc_mj.report.curves import (
     weight_norms,
 )
 from marlbc_mj.report.formats import listed
+from marlbc_mj.report.method_names import source_of
 from marlbc_mj.report.paper_tables import one_per_controller, one_per_supervisor
 from marlbc_mj.report.pareto import coincident, pareto
 from marlbc_mj.results.summary import Result
@@ -32,17 +33,21 @@ _AGENT = 3  # index of the agent in Figure 9
 _PATHS = "colored by the highest behavior in force; black casing: inside the safe distance."
 _STRIPS = (
     "color and height of a strip show the highest behavior in force (OA: avoid the obstacle, FM: keep the formation, FR: form "
-    "the column); beside it the number of switches."
+    "the column); beside it the number of switches. Grey: switches of the whole team in each second, and the most of them."
 )
 _FORCES = (
     "Applied force. Left and middle: light, everything the force reaches within a pixel column; dark, its mean. "
     "Right: both axes in the two seconds in which the forces change most."
 )
 _PARETO = (
-    "Control cost against what it buys. Formation error: mean distance of an agent from its slot in the first formation, "
-    "relative to the centroid [m]. Dashed: LQR, whose gains minimise the paper's cost in regulation."
+    "Control cost against what it buys. Colors are supervisors, shapes are controllers. Formation error: mean distance of an "
+    "agent from its slot in the first formation, relative to the centroid [m]. Dashed: LQR, whose gains minimise the cost of the "
+    "paper in regulation."
 )
-_CONTROL = "with each framework's controller, below around the largest of them all; scales differ, dashed: SORLC's limit."
+_CONTROL = (
+    "with each framework's controller, below around the largest of them all. One scale: linear up to SORLC's limit (dashed), "
+    "logarithmic beyond."
+)
 
 
 class Plot(NamedTuple):
@@ -98,7 +103,8 @@ def _controller_figures(laws: Mapping[str, Trajectory], supervisor: str) -> list
         found.append(Plot("figure5_weight_errors_sorlc", text, partial(weight_errors, own)))
     for number, name in ((6, "sorlc"), (7, "rlc")):
         if name in laws:
-            text = f"Figure {number}: tracking errors of {name} under the {supervisor} supervisor, each pixel column its largest."
+            law, over = source_of(name).display, source_of(supervisor).display
+            text = f"Figure {number}: tracking errors of {law}, supervisor: {over}. Each pixel column shows its largest."
             found.append(Plot(f"figure{number}_tracking_{name}", text, partial(errors, laws[name]), narrow=True))
     return found
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.method_names import source_of
 from marlbc_mj.report.paper_tables import LIMITED, one_per_controller, one_per_supervisor
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
@@ -18,7 +19,8 @@ from marlbc_mj.util.palette import AGENT_COLORS
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
 _COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
 
-_INK = "#1A1A1A"
+_INK, _PAPER = "#1A1A1A", "#FFFFFF"
+_COST_UNIT = "[s, SI squared]"  # the paper adds m^2, (m/s)^2 and N^2
 _TOGETHER = 0.01  # marks closer than this share of every axis are one
 _PANELS = {
     "return": "upper left is better",
@@ -85,18 +87,22 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
     supervisor_names = list(dict.fromkeys(result.supervisor for result in ran))
 
     def of_supervisor(result: Result) -> dict[str, Any]:
-        return _style(supervisor_names.index(result.supervisor), 0, False)
+        k = supervisor_names.index(result.supervisor)
+        return {**_style(k, 0, False), "markersize": _sizes(len(supervisor_names))[k]}
 
-    def of_law(result: Result) -> dict[str, Any]:
+    def of_law(result: Result) -> dict[str, Any]:  # without color, which means a supervisor
         k = laws.index(_law(result))
-        return {**_style(k, k, result.controller in twins), "markersize": max(4.0, 7.5 - k)}  # laws that coincide stay visible
+        face = _PAPER if result.controller in twins else _INK
+        return {**_style(0, k, False), "markerfacecolor": face, "markersize": _sizes(len(laws))[k], "alpha": 0.75}
 
     def of_both(result: Result) -> dict[str, Any]:
         return _style(supervisor_names.index(result.supervisor), laws.index(_law(result)), result.controller in twins)
 
-    named = [_entry(name, **_style(k, 0, False)) for k, name in enumerate(supervisor_names)]
-    marked = [_entry(law, **_style(k, k, False)) for k, law in enumerate(laws)]
-    plain = [_entry(law, **{**_style(0, k, False), "markerfacecolor": "#D0D0D0"}) for k, law in enumerate(laws)]
+    named = [_entry(source_of(name).display, **_style(k, 0, False)) for k, name in enumerate(supervisor_names)]
+    marked = [_entry(source_of(law).display, **{**_style(0, k, False), "markerfacecolor": _INK}) for k, law in enumerate(laws)]
+    plain = [
+        _entry(source_of(law).display, **{**_style(0, k, False), "markerfacecolor": "#D0D0D0"}) for k, law in enumerate(laws)
+    ]
     limit = [_entry("open: no force limit", **{**_style(0, 0, True), "markeredgecolor": _INK})] if twins else []
     title = [_entry("supervisor:", marker="none")], [_entry("controller:", marker="none")]
     if len(ran) == len(supervisors) + len(controllers) - 1 and min(len(supervisors), len(controllers)) > 1:
@@ -105,6 +111,11 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
             Group(controllers, title[1] + marked + limit, of_law),
         ]
     return [Group(ran, title[0] + named + title[1] + plain + limit, of_both)]
+
+
+def _sizes(count: int) -> np.ndarray:
+    """Sizes of marks from the first, drawn below, to the last, drawn above: those that coincide stay visible as rings."""
+    return np.linspace(8.0, 4.0, count)
 
 
 def _draw_group(row: np.ndarray, group: Group) -> None:
@@ -117,7 +128,7 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
     for axes, (name, better) in zip(row, _PANELS.items(), strict=True):
         for result in group.results:
             axes.plot(_cost(result), SCORES[name].read(_metrics(result)), linestyle="none", clip_on=False, **group.style(result))
-        axes.set(xscale="log", xlim=limits, xlabel=f"{cost.quantity}, {cost.aggregation}", ylabel=SCORES[name].label)
+        axes.set(xscale="log", xlim=limits, xlabel=f"{cost.quantity}, {cost.aggregation} {_COST_UNIT}", ylabel=SCORES[name].label)
         axes.set_title(better, loc="left", fontsize=7, color=pl.GREY)
         axes.margins(y=0.12)
         axes.grid(color="#E4E4E4", linewidth=0.4)

@@ -9,7 +9,7 @@ from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
 from marlbc_mj.robots.disc import DISC, disc
 from marlbc_mj.robots.omni import OMNI, omni
 from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
-from marlbc_mj.robots.user import is_file, load
+from marlbc_mj.robots.user import Stamp, is_file, load, stamp_of
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
@@ -22,7 +22,15 @@ ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
 """Factory and one line of description by name."""
 
 _make = cache(lambda factory: factory())
-_load = cache(load)
+_loaded: dict[str, tuple[Stamp, Robot]] = {}
+
+
+def _load(name: str) -> Robot:
+    """The robot of a user's file; anew after an edit there, and where another current folder makes the name another file's."""
+    stamp = stamp_of(name)
+    if name not in _loaded or _loaded[name][0] != stamp:
+        _loaded[name] = stamp, load(name)
+    return _loaded[name][1]
 
 
 def make_robot(name: str) -> Robot:

@@ -68,9 +68,10 @@ class Robot:
     substep: float = np.inf  # largest that its contacts and inner loops take [s]
     height: float = 0.0  # that it flies at [m]
     contact: bool = False  # obstacles and other agents are solid
-    force_error: float | None = (
-        None  # bound of what moves it besides u and f, at once and in every direction [N]; None: no shield
-    )
+    force_error: float | None = None  # bound of what moves it besides u and f, in every direction [N]; None: not known
+    slip: float = 0.0  # by which its velocity may lag behind its force, in contact with the ground [m/s]
+    friction: float = 0.0  # Coulomb friction that only slows it down, and that force_error leaves out [N]
+    tube: float | None = None  # measured: how far it may be from its reference with its own gains [m]; None: not known
     ground: bool = False  # stands on the arena's ground by its own geoms' contact; else its MJCF has a floor, or it flies
     prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
 

@@ -81,6 +81,7 @@ def crazyflie() -> Robot:
         length=0.2,
         substep=0.0025,
         contact=True,
+        tube=0.15,  # 0.12 m measured, see studies/shield_robots
         prepare=_prepare,
         height=params["height"],
     )

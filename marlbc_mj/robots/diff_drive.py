@@ -96,4 +96,5 @@ def diff_drive() -> Robot:
         length=0.6,
         substep=0.0025,
         contact=True,
+        tube=0.3,  # 0.23 m measured, see studies/shield_robots
     )

@@ -69,4 +69,6 @@ def omni() -> Robot:
         length=0.5,
         substep=0.0025,
         contact=True,
+        force_error=3.0,  # as studies/shield_robots measures it: 2.3 N that last, and a force that the wheels pass on late
+        slip=0.004,
     )

@@ -10,43 +10,12 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from marlbc_mj.robots.motors import check_motors, posed
 from marlbc_mj.util.errors import ConfigurationError
 
 _SLIDE, _FREE = int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_FREE)
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _PARALLEL = 1e-6
-
-
-class Motor(NamedTuple):
-    """An actuator that pushes a base along x or y and does nothing else."""
-
-    name: str
-    scale: float  # planar force per actuator force [N/N]
-    low: float  # of the planar force, by every limit on the way [N]
-    high: float
-
-
-class Reason(NamedTuple):
-    """An actuator along x or y whose force is not its control, and why."""
-
-    name: str
-    why: str
-
-
-def posed(model: mujoco.MjModel, turn: float = 0.0) -> mujoco.MjData:
-    """The model at its reference pose; with a ``turn`` [rad or m] every joint is moved by that much."""
-    data = mujoco.MjData(model)
-    if turn:
-        mujoco.mj_integratePos(model, data.qpos, np.full(model.nv, turn), 1.0)
-    mujoco.mj_forward(model, data)
-    return data
-
-
-def effects(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """(actuators, nv): generalized force of each actuator at force 1."""
-    effect = np.zeros((model.nu, model.nv))
-    mujoco.mju_sparse2dense(effect, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    return effect
 
 
 # Bases -------------------------------------------------------------------------------------------------------------------------
@@ -82,7 +51,7 @@ def find_base(model: mujoco.MjModel, root: int) -> Base:
         body = children[0]
     if len(found) < 2:
         raise ConfigurationError(f"body {model.body(root).name!r} needs a free joint, or slide joints along x and y of the world")
-    _refuse_turning_slides(model, found)
+    _refuse_turning_slides(model, tuple(found.values()))
     along_x, along_y = found[0], found[1]
     dofs = int(model.jnt_dofadr[along_x]), int(model.jnt_dofadr[along_y])
     return Base(body, (model.joint(along_x).name, model.joint(along_y).name), dofs)
@@ -94,9 +63,9 @@ def _along(direction: np.ndarray) -> int | None:
     return at if at < 2 and abs(abs(direction[at]) - 1.0) < _PARALLEL else None
 
 
-def _refuse_turning_slides(model: mujoco.MjModel, found: dict[int, int]) -> None:
+def _refuse_turning_slides(model: mujoco.MjModel, slides: Sequence[int]) -> None:
     """Raise ConfigurationError where a joint before the slides turns them."""
-    last = max(found.values())
+    last = max(slides)
     tree = model.body_rootid[model.jnt_bodyid]
     for j in range(last):
         if model.jnt_type[j] != _SLIDE and tree[j] == tree[last] and model.jnt_bodyid[j] <= model.jnt_bodyid[last]:
@@ -146,93 +115,12 @@ def _copied(value: Any) -> Any:
     return value.copy() if isinstance(value, np.ndarray) else value
 
 
-# Motors ------------------------------------------------------------------------------------------------------------------------
-
-
-def find_motors(model: mujoco.MjModel, base: Base) -> tuple[Motor, Motor] | Reason | None:
-    """The motors of x and y, however the robot is turned.
-
-    A reason where an axis has none but an actuator that is no plain motor; None where nothing pushes along an axis.
-    """
-    upright, turned = effects(model, posed(model)), effects(model, posed(model, 0.4))
-    found: list[Motor] = []
-    for dof in base.dofs:
-        pushing = [u for u in range(model.nu) if _pushes(upright[u], turned[u], dof)]
-        plain = [u for u in pushing if no_motor(model, u) is None]
-        if not pushing:
-            return None
-        if not plain:
-            return Reason(model.actuator(pushing[0]).name, no_motor(model, pushing[0]) or "")
-        found.append(_motor(model, plain[0], dof, float(upright[plain[0], dof])))
-    return found[0], found[1]
-
-
-def _pushes(effect: np.ndarray, turned: np.ndarray, dof: int) -> bool:
-    """Whether an actuator acts on one degree of freedom alone, and alike in both poses."""
-    others = np.delete(effect, dof)
-    return bool(
-        abs(effect[dof]) > 1e-9 and np.allclose(others, 0.0, atol=1e-8 * abs(effect[dof])) and np.allclose(effect, turned)
-    )
-
-
-def no_motor(model: mujoco.MjModel, u: int) -> str | None:
-    """Why an actuator's force is not its control times a constant; None for a motor."""
-    if model.actuator_dyntype[u] != mujoco.mjtDyn.mjDYN_NONE:
-        kind = mujoco.mjtDyn(int(model.actuator_dyntype[u])).name.removeprefix("mjDYN_").lower()
-        return f"its force follows its control through dynamics of type {kind!r}"
-    if model.actuator_gaintype[u] != mujoco.mjtGain.mjGAIN_FIXED:
-        return "its gain depends on its position or velocity"
-    if model.actuator_biastype[u] != mujoco.mjtBias.mjBIAS_NONE and model.actuator_biasprm[u].any():
-        position, velocity = model.actuator_biasprm[u, 1:3]
-        if position:
-            return "it is a position servo: its force depends on where the joint is"
-        if velocity:
-            return "it is a velocity servo or a damper: its force depends on how fast the joint is"
-        return "it pushes even at control 0"
-    if model.actuator_gainprm[u, 0] == 0.0:
-        return "its gain is zero"
-    if np.any(getattr(model, "actuator_delay", np.zeros(model.nu))[u]):
-        return "its control acts after a delay"
-    if np.any(getattr(model, "actuator_damping", np.zeros(model.nu))[u]):
-        return "it damps the joint that it drives"
-    return None
-
-
-def _motor(model: mujoco.MjModel, u: int, dof: int, effect: float) -> Motor:
-    """Every limit between control and base: ctrlrange, forcerange, and actuatorfrcrange of tendon and joint."""
-    gain = float(model.actuator_gainprm[u, 0])
-    limits = np.array([-np.inf, np.inf])
-    if model.actuator_ctrllimited[u]:
-        limits = np.sort(gain * model.actuator_ctrlrange[u])
-    if model.actuator_forcelimited[u]:
-        limits = np.clip(limits, *model.actuator_forcerange[u])
-    if _on_tendon(model, u) and model.tendon_actfrclimited[model.actuator_trnid[u, 0]]:
-        limits = np.clip(limits, *model.tendon_actfrcrange[model.actuator_trnid[u, 0]])
-    limits = np.sort(effect * limits)
-    joint = int(model.dof_jntid[dof])
-    if model.jnt_actfrclimited[joint]:
-        limits = np.clip(limits, *model.jnt_actfrcrange[joint])
-    return Motor(model.actuator(u).name, effect, float(limits[0]), float(limits[1]))
-
-
-def _on_tendon(model: mujoco.MjModel, u: int) -> bool:
-    return bool(model.actuator_trntype[u] == mujoco.mjtTrn.mjTRN_TENDON)
-
-
-def largest_force(motors: tuple[Motor, Motor]) -> float:
-    """What both motors can give in every direction [N].
-
-    Raises:
-        ConfigurationError: a motor without a limit, or one that cannot push both ways.
-    """
-    for motor in motors:
-        if not np.isfinite((motor.low, motor.high)).all():
-            raise ConfigurationError(f"motor {motor.name!r} has no limit; it needs a ctrlrange, or a forcerange")
-        if not motor.low < 0.0 < motor.high:
-            raise ConfigurationError(
-                f"motor {motor.name!r} pushes from {motor.low:g} to {motor.high:g} N only; it must push both ways along its axis"
-            )
-    return min(min(-motor.low, motor.high) for motor in motors)
+def moved_masses(model: mujoco.MjModel, base: Base) -> tuple[float, float]:
+    """What a force along x and one along y accelerate: all that the joint carries, and its own ``armature`` [kg]."""
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, posed(model), matrix)
+    along_x, along_y = (float(matrix[dof, dof]) for dof in base.dofs)
+    return along_x, along_y
 
 
 # One form for all direct robots ------------------------------------------------------------------------------------------------
@@ -247,11 +135,12 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
     model = spec.copy().compile()
     data = posed(model)
     if len(joints) == 2:
+        _refuse_turning_slides(model, [model.joint(name).id for name in joints])
         for axis, name in enumerate(joints):
             _straighten_slide(spec, model, data, name, axis, float(data.body(body).xpos[axis]))
     model = spec.copy().compile()
     base = base_of(model, body, joints)
-    for axis, found in enumerate(check_motors(model, base, motors)):
+    for axis, found in enumerate(check_motors(model, base.dofs, motors)):
         actuator = spec.actuator(found.name)
         gain = float(model.actuator_gainprm[model.actuator(found.name).id, 0])
         if found.scale != 1.0 or gain != 1.0:
@@ -267,8 +156,9 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
 
 
 def check_slides(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
-    """Raise ConfigurationError unless two joints slide along +x and +y: unknown dynamics push there."""
+    """Raise ConfigurationError unless two joints slide along +x and +y, however the robot turns: unknown dynamics push there."""
     model = spec.copy().compile()
+    _refuse_turning_slides(model, [model.joint(name).id for name in joints])
     directions = posed(model).xaxis
     for axis, name in enumerate(joints):
         k = model.joint(name).id
@@ -288,25 +178,6 @@ def base_of(model: mujoco.MjModel, body: str, joints: Sequence[str]) -> Base:
     """The base that a robot names."""
     first = [int(model.jnt_dofadr[model.joint(name).id]) for name in joints]
     return Base(model.body(body).id, tuple(joints), (first[0], first[-1] if len(first) == 2 else first[0] + 1))
-
-
-def check_motors(model: mujoco.MjModel, base: Base, motors: Sequence[str]) -> tuple[Motor, Motor]:
-    """The motors that a direct robot names.
-
-    Raises:
-        ConfigurationError: one is no plain motor, or does not push along its axis alone.
-    """
-    upright, turned = effects(model, posed(model)), effects(model, posed(model, 0.4))
-    found: list[Motor] = []
-    for axis, (name, dof) in enumerate(zip(motors, base.dofs, strict=True)):
-        u = model.actuator(name).id
-        why = no_motor(model, u)
-        if why is not None:
-            raise ConfigurationError(f"actuator {name!r} is no motor: {why}")
-        if not _pushes(upright[u], turned[u], dof):
-            raise ConfigurationError(f"motors[{axis}] {name!r} does not push along {'xy'[axis]} alone; motors name those of x, y")
-        found.append(_motor(model, u, dof, float(upright[u, dof])))
-    return found[0], found[1]
 
 
 def _straighten_slide(

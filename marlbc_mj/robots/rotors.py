@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
+from marlbc_mj.robots.motors import effects, no_motor
 from marlbc_mj.robots.multirotor import MOST_ROTORS
-from marlbc_mj.robots.planar import effects, no_motor
 from marlbc_mj.util.errors import ConfigurationError
 
 HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # of the height [1/s^2, 1/s]
@@ -32,7 +32,7 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
     """Gains and state of the two laws for a robot at rest, and its mass.
 
     Raises:
-        ConfigurationError: the rotors cannot give thrust and three moments, or are too many.
+        ConfigurationError: the rotors cannot give thrust and moments about x and y, or are too many.
     """
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -51,6 +51,15 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
     return RotorNumbers(params, {"axis": (0.0, 0.0, 1.0), "thrust": mass * gravity}, mass)
 
 
+def agility(params: dict[str, Any]) -> float:
+    """Angular acceleration about x and y that the rotors can give in either sense while they hold the weight [rad/s^2]."""
+    shares, least, most = (np.array(params[name]) for name in ("moment_share", "least", "most"))
+    hover = params["mass"] * params["gravity"] * np.array(params["thrust_share"])
+    room, turning = np.minimum(most - hover, hover - least), np.abs(shares[:, :2])
+    moments = [float((room[used > 1e-12] / used[used > 1e-12]).min()) for used in turning.T]
+    return max(float((np.array(moments) / params["inertia"][:2]).min()), 0.0)
+
+
 def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:
     """The gains that are one number or row per rotor, padded with zeros to MOST_ROTORS."""
     if model.nu > MOST_ROTORS:
@@ -61,9 +70,10 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
             raise ConfigurationError(f"{name}: actuator {model.actuator(u).name!r} is no motor: {why}")
     effect = effects(model, data)
     rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
-    if np.linalg.matrix_rank(rotors, tol=1e-9) < 4:
-        raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and three moments")
-    shares = np.linalg.pinv(rotors)
+    if np.linalg.matrix_rank(rotors[:3], tol=1e-9) < 3:
+        raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and moments about x and y")
+    turning = np.linalg.matrix_rank(rotors, tol=1e-9) == 4  # else the heading is left to itself
+    shares = np.linalg.pinv(rotors) if turning else np.pad(np.linalg.pinv(rotors[:3]), ((0, 0), (0, 1)))
     least, most = _control_limits(model)
     lift = rotors[0] / model.actuator_gainprm[:, 0]
     own = {"thrust_share": shares[:, 0], "moment_share": shares[:, 1:], "least": least, "most": most, "lift": lift}
@@ -72,9 +82,9 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
 
 
 def _control_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Least and most control (rotors,) by ``ctrlrange`` and, where it is tighter, by ``forcerange``."""
+    """Least and most control (rotors,) that ``ctrlrange`` and ``forcerange`` let through."""
     limits = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
     by_force = np.sort(model.actuator_forcerange / model.actuator_gainprm[:, :1], axis=1)
-    tighter = (model.actuator_forcelimited == 1)[:, None] & (np.abs(by_force) < np.abs(limits) * (1 - 1e-9))
-    least, most = np.where(tighter, by_force, limits).T
+    by_force = np.where(model.actuator_forcelimited[:, None], by_force, (-np.inf, np.inf))
+    least, most = np.clip(limits, by_force[:, :1], by_force[:, 1:]).T
     return least, most

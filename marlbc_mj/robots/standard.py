@@ -19,6 +19,7 @@ import numpy as np
 from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.files import check_files
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.modules import beside
 from marlbc_mj.util.text import one_line
 
 _TRIAL_TIME = 60.0  # that compiling a robot may take [s]
@@ -41,20 +42,20 @@ for _ in range(2):
 
 
 def standard_text(path: Path) -> str:
-    """The MJCF of a user's file in standard form.
+    """The MJCF of a user's file in standard form; it is read again where a file in its folder has changed.
 
     Raises:
         ConfigurationError: what is wrong with the file, in one line.
     """
     try:
-        found = path.stat()
+        path.stat()
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    return _standard_text(path, found.st_mtime_ns, found.st_size)
+    return _standard_text(path, path.resolve(), beside(path, ""))
 
 
 @lru_cache(maxsize=32)
-def _standard_text(path: Path, changed: int, size: int) -> str:
+def _standard_text(path: Path, place: Path, state: tuple[tuple[str, int, int], ...]) -> str:
     check_files(path)
     _try_out(path)
     with quiet():

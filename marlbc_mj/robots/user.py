@@ -15,17 +15,19 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.robots.base import Robot
+from marlbc_mj.robots.motors import Reason, check_motors, effects, find_motors, largest_force, no_motor, posed
 from marlbc_mj.robots.multirotor import REPORT, rotor_drive, rotor_reading
-from marlbc_mj.robots.planar import Reason, base_of, check_motors, find_base, find_motors, largest_force, posed, slides_first
-from marlbc_mj.robots.rotors import Attitude, rotor_numbers
+from marlbc_mj.robots.planar import Base, base_of, find_base, moved_masses, slides_first
+from marlbc_mj.robots.rotors import Attitude, agility, rotor_numbers
 from marlbc_mj.robots.standard import standard_text
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import guarded, load_module, made, split_name
+from marlbc_mj.util.modules import beside, guarded, load_module, made, split_name
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
 _WAY_OUT = "write a Python file with a drive and a reading"
 _UNDRIVEN = "{}: its actuators neither push along x and y nor lift and turn; " + _WAY_OUT
+_MOST_TILTING = 1.0  # acceleration of a rotorcraft's references whose rotors turn it as fast as FLIGHT wants [m/s^2]
 FLIGHT = Attitude((250.0, 250.0, 230.0), (20.0, 20.0, 25.0), 0.08)
 """A brisk attitude loop and thrust lag for rotorcraft that no one has identified: a small quadrotor's, rounded."""
 
@@ -54,6 +56,20 @@ def find(name: str) -> Path:
     return path
 
 
+Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
+"""Where a robot's file is, and the state of what is beside it."""
+
+
+def stamp_of(name: str) -> Stamp:
+    """Which file a name means now, and in which state it and what it may use are: another value after an edit.
+
+    Raises:
+        ConfigurationError: there is no such file.
+    """
+    path = find(name).resolve()
+    return path, beside(path, *SUFFIXES)
+
+
 def load(name: str) -> Robot:
     """The robot of a file; its name is the path, so that scenarios and logs find it again.
 
@@ -72,7 +88,7 @@ def _from_python(path: Path, name: str) -> Robot:
     robot = replace(robot, name=name)
     model = robot.spec().compile() if robot.shipped else check_mjcf(robot.mjcf)
     if robot.direct and robot.mass is not None and not robot.shipped:
-        most = largest_force(check_motors(model, base_of(model, robot.body, robot.joints), robot.motors))
+        most = largest_force(check_motors(model, base_of(model, robot.body, robot.joints).dofs, robot.motors))
         if robot.force_limit > most * (1 + 1e-9):
             raise ConfigurationError(
                 f"robot {name!r}: force_limit is {robot.force_limit:g} N, but {robot.mjcf.name} lets its motors give {most:g} N"
@@ -125,7 +141,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
     root = _moving_root(path, model)
     try:
         base = find_base(model, root)
-        motors = find_motors(model, base)
+        motors = find_motors(model, base.dofs)
         limit = largest_force(motors) if isinstance(motors, tuple) and not isinstance(motors, Reason) else np.inf
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from error
@@ -135,16 +151,29 @@ def from_mjcf(path: Path, name: str) -> Robot:
         "body": model.body(base.body).name,
         "joints": base.joints,
         "prepare": _slides_first,
-        **_size(model, data, root),
+        **_size(model, data, root, base),
     }
     if isinstance(motors, Reason):
         raise ConfigurationError(f"{path}: actuator {motors.name!r} is no motor: {motors.why}; {_WAY_OUT}")
     if motors is not None:
         turning = f"; {', '.join(moved)} taken after the slides, so that it turns about itself" if moved else ""
         return _direct({**fields, "description": f"two motors along x and y{turning}"}, (motors[0].name, motors[1].name), limit)
+    _refuse_legs_and_wheels(path, model, base)
     if len(base.joints) == 1:
         return _flying(fields, path, spec)
     raise ConfigurationError(_UNDRIVEN.format(path))
+
+
+def _refuse_legs_and_wheels(path: Path, model: mujoco.MjModel, base: Base) -> None:
+    """Raise ConfigurationError, with an example, where every actuator moves something on the base and none the base itself."""
+    own = np.flatnonzero(model.dof_bodyid == base.body)
+    if np.abs(effects(model, posed(model))[:, own]).max(initial=0.0) > 0.0:
+        return
+    first, why = model.actuator(0).name, no_motor(model, 0)
+    raise ConfigurationError(
+        f"{path}: none of its {model.nu} actuators pushes its base {model.body(base.body).name!r}; they move what is on it, as "
+        f"legs and wheels do: {first!r} for example{f' ({why})' if why else ''}; {_WAY_OUT}"
+    )
 
 
 def _moving_root(path: Path, model: mujoco.MjModel) -> int:
@@ -168,8 +197,8 @@ def _slides_first(spec: mujoco.MjSpec) -> None:
     slides_first(spec)
 
 
-def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> dict[str, Any]:
-    """Radius seen from above and mass of the moving body and all below it, and what it touches."""
+def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int, base: Base) -> dict[str, Any]:
+    """Radius seen from above of the moving body and all below it, what a planar force accelerates, and what it touches."""
     carried = {root}
     for b in range(root + 1, model.nbody):
         carried |= {b} if model.body_parentid[b] in carried else set()
@@ -178,7 +207,7 @@ def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int) -> dict[str, An
     radius = float(max(reach, default=0.1)) or 0.1
     touches = bool(model.geom_contype[own].any())
     floor = bool((model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE).any())
-    size = {"radius": radius, "length": 2.0 * radius, "mass": float(model.body_subtreemass[root]), "substep": 0.0025}
+    size = {"radius": radius, "length": 2.0 * radius, "mass": max(moved_masses(model, base)), "substep": 0.0025}
     return {**size, "contact": touches, "ground": touches and not floor}
 
 
@@ -195,10 +224,23 @@ def _direct(fields: dict[str, Any], motors: tuple[str, str], limit: float) -> Ro
 
 
 def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
+    """A rotorcraft whose attitude, and with it all that tilts it, is as slow as its rotors' moments ask for."""
     try:
         params, state, mass = rotor_numbers(spec, fields["body"], FLIGHT)
     except ConfigurationError as error:
         raise ConfigurationError(f"{_UNDRIVEN.format(path)} ({error})") from error
+    able = agility(params) if params["gravity"] > 0.0 else 0.0  # angular acceleration [rad/s^2]
+    if not able > 0.0:
+        weight = f"its weight of {mass * params['gravity']:g} N"
+        raise ConfigurationError(
+            f"{path}: rotors fly by tilting against gravity, but its rotors cannot both hold {weight} and turn it"
+        )
+    heading = (
+        "" if any(turn for _, _, turn in params["moment_share"]) else "; none turns its heading alone, which is left to itself"
+    )
+    share = float(np.sqrt(min(1.0, able * params["gravity"] / (max(FLIGHT.stiffness) * _MOST_TILTING))))
+    for name, power in (("stiffness", 1.0), ("damping", 0.5)):
+        params[name] = tuple(share**power * gain for gain in params[name])
     return Robot(
         **{**fields, "mass": mass},
         drive=rotor_drive,
@@ -206,10 +248,10 @@ def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
         params=params,
         state=state,
         report=REPORT,
-        description="rotors that lift and turn",
-        force_limit=0.3 * mass * params["gravity"],
-        speed_limit=1.0,
-        acceleration_limit=1.0,
-        gains=(9.0, 6.0),
+        description=f"rotors that lift and turn{heading}",
+        force_limit=0.3 * share * mass * params["gravity"],
+        speed_limit=np.sqrt(share),
+        acceleration_limit=share * _MOST_TILTING,
+        gains=(9.0 * share, 6.0 * np.sqrt(share)),
         height=params["height"],
     )

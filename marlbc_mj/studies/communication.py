@@ -22,7 +22,7 @@ from marlbc_mj.studies.draws import DrawsJob, fly_draws
 from marlbc_mj.studies.episodes import check_free
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.supervisors.communication import Consensus, Flooding, Radio
+from marlbc_mj.supervisors.communication import Consensus, Flooding, Layer, Radio
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
@@ -33,7 +33,7 @@ DELAYS = (0.0, 0.1, 0.3)  # [s]
 LOSSES = (0.0, 0.2, 0.5)
 
 
-class Case(NamedTuple):
+class NetworkCase(NamedTuple):
     """How a team communicates in one row of the table."""
 
     range: float  # in distances between neighbors
@@ -48,9 +48,9 @@ class Case(NamedTuple):
 
 
 CASES = (
-    *(Case(*numbers) for numbers in product(RANGES, DELAYS, LOSSES)),
-    Case(np.inf, 0.0, 0.0, silent=True),
-    Case(1.2, 0.1, 0.2, silent=True),
+    *(NetworkCase(*numbers) for numbers in product(RANGES, DELAYS, LOSSES)),
+    NetworkCase(np.inf, 0.0, 0.0, silent=True),
+    NetworkCase(1.2, 0.1, 0.2, silent=True),
 )
 """Every range, delay and loss; then a silent agent, with good and with bad communication."""
 
@@ -64,20 +64,20 @@ def neighbor_distance(scenario: Scenario) -> float:
 
 @dataclass(frozen=True)
 class CommunicationStudy:
-    """One distributed supervisor in every :class:`Case` on the same draws of every mission."""
+    """One distributed supervisor in every :class:`NetworkCase` on the same draws of every mission."""
 
     missions: tuple[Scenario, ...]
     supervisor: str
     seeds: tuple[int, ...]
     controller: str = "sorlc"
     shield: bool = False
-    cases: tuple[Case, ...] = CASES
+    cases: tuple[NetworkCase, ...] = CASES
 
     def __post_init__(self) -> None:
         make_supervisor(self.supervisor, self.controller)
         self.jobs()  # a case that a mission cannot have is refused here
 
-    def pairs(self) -> list[tuple[Scenario, Case]]:
+    def pairs(self) -> list[tuple[Scenario, NetworkCase]]:
         """Mission and case of every job."""
         return list(product(self.missions, self.cases))
 
@@ -113,7 +113,7 @@ def fly_together(job: DrawsJob) -> list[Metrics | None]:
     return [measure(trajectory) for trajectory in flown]
 
 
-def case_row(mission: Scenario, case: Case, metrics: Sequence[Metrics | None]) -> dict[str, Any]:
+def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | None]) -> dict[str, Any]:
     """The numbers of one row; shares have Wilson's interval beside them."""
     rates = outcome_rates(metrics, mission)
     flown = [one for one in metrics if one is not None]
@@ -158,22 +158,22 @@ TEAMS = (
 )
 """Name, places (N, 2) [m] and range [m] of teams that stand still."""
 RATE = 0.05  # between two broadcasts [s]
-CLOSE = 0.01  # agreement of consensus: every estimate is that close to the mean of all places [m]
+AGREED = 0.01  # agreement of consensus: every estimate is that close to the mean of all places [m]
 PATIENCE = 4000  # mission steps after which nobody waits any longer
 
 
 def time_to_agree(place: np.ndarray, settings: Communication, seed: int = 0) -> float:
     """How long agents at places (N, 2) [m], which say where they are, take to agree [s]; infinite beyond ``PATIENCE``.
 
-    Under flooding everyone must know all places, under consensus everyone's estimate of their mean must be within ``CLOSE``.
+    Under flooding everyone must know all places, under consensus everyone's estimate of their mean must be within ``AGREED``.
     """
     radio = Radio(settings, len(place), RATE)
-    layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
+    layer: Layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
     memory, mean = layer.start(1, 2), place.mean(axis=0)
     for k in range(PATIENCE):
         (heard, stamp), memory = layer.exchange(np.array([k * RATE]), place[None], place[None], memory, np.array([seed]))
         flooded = settings.protocol == "flooding" and np.isfinite(stamp).all()
-        close = settings.protocol == "consensus" and np.linalg.norm(heard[0, :, 0] - mean, axis=-1).max() <= CLOSE
+        close = settings.protocol == "consensus" and np.linalg.norm(heard[0, :, 0] - mean, axis=-1).max() <= AGREED
         if flooded or close:
             return k * RATE
     return float("inf")

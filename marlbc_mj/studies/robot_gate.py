@@ -18,7 +18,7 @@ from marlbc_mj.report.table import pipe_table
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.robots import ROBOTS, Robot, make_robot
-from marlbc_mj.robots.planar import posed
+from marlbc_mj.robots.motors import posed
 from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, counting, run_study

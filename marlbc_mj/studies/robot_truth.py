@@ -11,7 +11,7 @@ from marlbc_mj.core import laws
 from marlbc_mj.engine.assembly import agent_prefix
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import Robot
-from marlbc_mj.robots.planar import effects, posed
+from marlbc_mj.robots.motors import effects, posed
 
 
 class Truth(NamedTuple):

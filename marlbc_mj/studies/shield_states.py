@@ -9,19 +9,22 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.laws import compiled
-from marlbc_mj.core.shield import (
+from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts, shield_team
+from marlbc_mj.core.stopping import (
     ForceBound,
-    ShieldCounts,
     ShieldNumbers,
     ShieldView,
     force_bound,
     gap_to,
+    moves,
+    pace_of,
     retreat_drift,
-    shield_team,
     stopping_distance,
+    stopping_of,
 )
 
 ROUNDING = 1e-9  # [m]
+ASSUMED = len(ASSUMPTIONS)
 
 
 class Trial(NamedTuple):
@@ -33,6 +36,9 @@ class Trial(NamedTuple):
     mass: float = 1.0  # [kg]
     substep: float = 0.005  # [s]
     things: int = 1  # obstacles and neighbors that press at once, at most
+    obstacle_speed: float = 0.0  # of obstacles that move, at most; 0: they are at rest [m/s]
+    obstacle_acceleration: float = 0.0  # of those [m/s^2]
+    believed_acceleration: float | None = None  # None: theirs itself [m/s^2]
     believed: ForceBound | None = None  # None: the bound itself
     believed_force: float | None = None  # None: the limit itself [N]
 
@@ -40,11 +46,13 @@ class Trial(NamedTuple):
         """The shield's: it keeps 0.5 m from obstacles and 1 m between agents."""
         believed = self.bound if self.believed is None else self.believed
         force = self.force_limit if self.believed_force is None else self.believed_force
-        return ShieldNumbers(force, force, self.mass, *believed, self.speed_cap, 0.5, 1.0, 0.0)
+        acceleration = self.obstacle_acceleration if self.believed_acceleration is None else self.believed_acceleration
+        numbers = ShieldNumbers(force, force, self.mass, *believed, self.speed_cap, 0.5, 1.0, 0.0)
+        return numbers._replace(obstacle_speed=self.obstacle_speed, obstacle_acceleration=acceleration)
 
     def truth(self) -> ShieldNumbers:
         """The plant's."""
-        return self._replace(believed=None, believed_force=None).numbers()
+        return self._replace(believed=None, believed_force=None, believed_acceleration=None).numbers()
 
 
 def leave_rate(trial: Trial, states: int, seed: int = 0) -> float:
@@ -57,10 +65,10 @@ def leave_rate(trial: Trial, states: int, seed: int = 0) -> float:
 
 @compiled
 def _leave_rate(numbers, truth, h, things, states, rng):
-    left, agents, obstacles = 0, 2, np.zeros((max(things - 1, 1), 3))
+    left, agents, obstacles = 0, 2, np.zeros((max(things - 1, 1), 5 if truth.obstacle_speed > 0.0 else 3))
     p, v, stopping, force = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
-    last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, 3))
-    view = ShieldView(h, p, v, v, obstacles, stopping)
+    last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, ASSUMED))
+    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)))
     counts = ShieldCounts(interventions, change, breaches)
     for _ in range(states):
         _draw_state(rng, numbers, h, things, view)
@@ -76,6 +84,8 @@ def _leave_rate(numbers, truth, h, things, states, rng):
         for i in range(agents):
             for axis in range(2):
                 p[i, axis] += h * v[i, axis]
+        if truth.obstacle_speed > 0.0:
+            _move_obstacles(rng, truth, h, obstacles)
         left += _is_outside(numbers, view, allowed)
     return left / states
 
@@ -95,7 +105,10 @@ def _draw_state(rng, numbers, h, things, view):
     _place(rng, view.p[1], view, -1.0 if alone else far if things == 1 else -1.0, 1.0 + view.stopping[0] + view.stopping[1])
     for k in range(view.obstacles.shape[0]):
         radius = 0.0 if rng.random() < 0.3 else 5.0 * rng.random()
-        _place(rng, view.obstacles[k], view, far if alone else -1.0, radius + 0.5 + view.stopping[0])
+        if moves(view, k):
+            pace, angle = numbers.obstacle_speed * rng.random(), 2.0 * np.pi * rng.random()
+            view.obstacles[k, 3], view.obstacles[k, 4] = pace * np.cos(angle), pace * np.sin(angle)
+        _place(rng, view.obstacles[k], view, far if alone else -1.0, radius + 0.5 + stopping_of(numbers, view, 0, k))
         view.obstacles[k, 2] = radius
     if things > 1:  # the second agent must be in S as well
         for k in range(view.obstacles.shape[0]):
@@ -113,6 +126,20 @@ def _place(rng, out, view, far, least):
     if rng.random() < 0.5:  # ahead
         angle = np.arctan2(view.v[0, 1], view.v[0, 0]) + 0.3 * (rng.random() - 0.5)
     out[0], out[1] = distance * np.cos(angle), distance * np.sin(angle)
+
+
+@compiled
+def _move_obstacles(rng, truth, h, obstacles):
+    """Obstacles go on for a substep, and change their velocity as fast as they may, no faster than they may be."""
+    for k in range(obstacles.shape[0]):
+        angle, change = 2.0 * np.pi * rng.random(), truth.obstacle_acceleration
+        x, y = change * np.cos(angle), change * np.sin(angle)
+        if (obstacles[k, 3] + h * x) ** 2 + (obstacles[k, 4] + h * y) ** 2 > truth.obstacle_speed**2:
+            x, y = 0.0, 0.0
+        obstacles[k, 0] += h * obstacles[k, 3] + 0.5 * h * h * x
+        obstacles[k, 1] += h * obstacles[k, 4] + 0.5 * h * h * y
+        obstacles[k, 3] += h * x
+        obstacles[k, 4] += h * y
 
 
 @compiled
@@ -140,7 +167,8 @@ def _push(rng, numbers, truth, view, i, force):
     if k != view.obstacles.shape[0] + i and rng.random() < 0.8:
         _, normal_x, normal_y = gap_to(numbers, view, i, k)
         centre = view.h * (truth.force_limit - force_bound(truth, speed)) / truth.mass
-        away_x, away_y = x - centre * normal_x, y - centre * normal_y
+        pace_x, pace_y = pace_of(view, k)
+        away_x, away_y = x - pace_x - centre * normal_x, y - pace_y - centre * normal_y
         distance = np.sqrt(away_x**2 + away_y**2)
         if distance > 0.0:
             towards_x, towards_y = away_x / distance, away_y / distance
@@ -169,9 +197,13 @@ def report_states() -> None:
     trials = {
         "drag x 5, one thing": right,
         "drag x 5, four things": right._replace(things=4),
+        "drag x 5, one obstacle that moves": right._replace(obstacle_speed=2.0, obstacle_acceleration=2.0),
         "wind of 20 N, one thing": right._replace(bound=ForceBound(20.0, 1.0)),
         "wrong: brakes 10 % too strong": right._replace(believed_force=1.1 * right.force_limit),
         "wrong: half of the bound": right._replace(believed=ForceBound(linear=0.5 * drag.linear)),
+        "wrong: obstacles that do not accelerate": right._replace(
+            obstacle_speed=2.0, obstacle_acceleration=20.0, believed_acceleration=0.0
+        ),
     }
     for name, trial in trials.items():
         print(f"{name}: {leave_rate(trial, states):.3g} of {states} states left", flush=True)

@@ -147,7 +147,7 @@ class Broadcast(NamedTuple):
 class Flood(NamedTuple):
     """Memory of :class:`Flooding`. Arrays are never written to again, so that broadcasts under way can share them."""
 
-    count: np.ndarray  # (B,) int64, mission step of the last exchange
+    step: np.ndarray  # (B,) int64, mission step of the last exchange
     due: np.ndarray  # (B,) int64, mission step of the next broadcast
     heard: np.ndarray  # of Knowledge
     stamp: np.ndarray
@@ -175,7 +175,7 @@ class Flooding:
         if settings == IDEAL:
             return self._ideal(time, position, message)
         count = radio.count(time)
-        memory = self.forget(memory, count <= memory.count)
+        memory = self.forget(memory, count <= memory.step)
         knowledge, under_way = _deliver(_with_own(memory, time, message), count, memory.under_way)
         link, due = radio.link(time, position), count >= memory.due
         if due.any():
@@ -198,8 +198,7 @@ class Flooding:
             return memory
         fresh = self.start(len(teams), memory.heard.shape[3])
         under_way = tuple(sent._replace(hears=sent.hears & ~teams[:, None, None]) for sent in memory.under_way)
-        others = (_where(teams, new, old) for new, old in zip(fresh[:-1], memory[:-1], strict=True))
-        return Flood(*others, under_way)
+        return memory._replace(under_way=under_way, **_forgotten(teams, fresh, memory))
 
 
 def _with_own(memory: Flood, time: np.ndarray, message: np.ndarray) -> Knowledge:
@@ -255,7 +254,7 @@ class Handshakes(NamedTuple):
 class Estimates(NamedTuple):
     """Memory of :class:`Consensus`."""
 
-    count: np.ndarray  # (B,) int64, mission step of the last exchange
+    step: np.ndarray  # (B,) int64, mission step of the last exchange
     due: np.ndarray  # (B,) int64, mission step of the next round
     estimate: np.ndarray  # (B, N, M) x
     message: np.ndarray  # (B, N, M) m at the last exchange
@@ -282,8 +281,8 @@ class Consensus:
     ) -> tuple[Knowledge, Estimates]:
         radio, settings = self.radio, self.radio.communication
         count = radio.count(time)
-        memory = self.forget(memory, count <= memory.count)
-        shared = memory._replace(count=count, estimate=memory.estimate + message - memory.message, message=message)
+        memory = self.forget(memory, count <= memory.step)
+        shared = memory._replace(step=count, estimate=memory.estimate + message - memory.message, message=message)
         shared = _shake(shared._replace(link=radio.link(time, position)), time)
         due, duration = count >= memory.due, 2 * radio.steps(settings.delay)
         if due.any():
@@ -301,8 +300,7 @@ class Consensus:
             return memory
         fresh = self.start(len(teams), memory.message.shape[2])
         under_way = Handshakes(*(_where(teams, new, old) for new, old in zip(fresh.under_way, memory.under_way, strict=True)))
-        others = (_where(teams, new, old) for new, old in zip(fresh[:-1], memory[:-1], strict=True))
-        return Estimates(*others, under_way)
+        return memory._replace(under_way=under_way, **_forgotten(teams, fresh, memory))
 
 
 def _begin(shared: Estimates, arrives: np.ndarray, duration: int) -> Handshakes:
@@ -313,17 +311,23 @@ def _begin(shared: Estimates, arrives: np.ndarray, duration: int) -> Handshakes:
     met = link & arrives & arrives.transpose(0, 2, 1)
     weight = weight * met
     change = weight @ shared.estimate - weight.sum(axis=2)[..., None] * shared.estimate
-    return Handshakes(shared.count + duration, met.any(axis=2), change)
+    return Handshakes(shared.step + duration, met.any(axis=2), change)
 
 
 def _shake(shared: Estimates, time: np.ndarray) -> Estimates:
     """The estimates of B teams after the round that is under way, where it has ended by ``time`` (B,) [s]."""
     arrival, met, change = shared.under_way
-    ended = arrival <= shared.count
+    ended = arrival <= shared.step
     estimate = shared.estimate + change * ended[:, None, None]
     stamp = np.where((met & ended[:, None])[:, :, None], time[:, None, None], shared.stamp)
     left = Handshakes(arrival, met & ~ended[:, None], change * ~ended[:, None, None])
     return shared._replace(estimate=estimate, stamp=stamp, under_way=left)
+
+
+def _forgotten(teams: np.ndarray, fresh: Flood | Estimates, memory: Flood | Estimates) -> dict[str, Any]:
+    """Arrays of a memory by name, those of ``teams`` (B,) as a ``fresh`` one has them."""
+    names = [name for name in memory._fields if name != "under_way"]
+    return {name: _where(teams, getattr(fresh, name), getattr(memory, name)) for name in names}
 
 
 def _where(teams: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:

@@ -1,9 +1,14 @@
 """A user's Python file as a module: the same one in every process, whatever the current folder is, and anew after an edit."""
 
 import importlib.util
+import os
 import sys
 import zlib
+from base64 import b32decode, b32encode
 from collections.abc import Callable
+from contextlib import suppress
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -12,6 +17,10 @@ from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
+_PREFIX = "marlbc_user_"
+_LONGEST_PLACE = 160  # of a module's name: file names of the cache of compiled code hold it
+_MOST_BESIDE = 500
+"""More files beside a user's file than these are not looked at for changes."""
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -25,8 +34,23 @@ def names_attribute(name: str) -> bool:
     return bool(split_name(name)[1])
 
 
+def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, time of the last change and size of the files in a file's folder, itself included: another tuple after an edit.
+
+    Args:
+        path: the file.
+        suffixes: endings of the files that count.
+    """
+    found = []
+    for each in sorted(each for suffix in suffixes for each in path.resolve().parent.glob(f"*{suffix}"))[:_MOST_BESIDE]:
+        with suppress(OSError):
+            status = each.stat()
+            found.append((str(each), status.st_mtime_ns, status.st_size))
+    return tuple(found)
+
+
 def load_module(path: Path) -> ModuleType:
-    """Run a user's Python file, whose folder it may import from; a file that has not changed is not run again.
+    """Run a user's Python file, whose folder it may import from; it is not run again unless a Python file there has changed.
 
     Raises:
         ConfigurationError: the file is not there, or what it raised.
@@ -36,7 +60,8 @@ def load_module(path: Path) -> ModuleType:
         content = path.read_bytes()
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    name, stamp = f"marlbc_user_{path.stem}_{zlib.crc32(str(path).encode()):08x}", zlib.crc32(content)
+    name = _module_name(path)
+    stamp = zlib.crc32(content), beside(path, _SUFFIX)
     known = sys.modules.get(name)
     if known is not None and getattr(known, "__marlbc_stamp__", None) == stamp:
         return known
@@ -52,6 +77,41 @@ def load_module(path: Path) -> ModuleType:
         sys.modules.pop(name, None)
         raise
     return module
+
+
+def _module_name(path: Path) -> str:
+    """A name that says where the file is, so that a pickle of what is in it can be read in another process."""
+    place = b32encode(os.fsencode(path)).decode().rstrip("=").lower()
+    if len(place) > _LONGEST_PLACE:
+        place = f"{zlib.crc32(os.fsencode(path)):08x}"
+    return f"{_PREFIX}{path.stem}_{place}"
+
+
+class _UserFiles(MetaPathFinder, Loader):
+    """Finds the module of a user's file by its name, where a pickle asks for it."""
+
+    def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
+        file = _file_of(fullname)
+        return None if file is None else importlib.util.spec_from_loader(fullname, self, origin=str(file))
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        return load_module(Path(spec.origin)) if spec.origin else None
+
+    def exec_module(self, module: ModuleType) -> None:
+        """The file has been run."""
+
+
+def _file_of(name: str) -> Path | None:
+    """The file that a module's name means; None if it is none of a user's file, or the file is not there."""
+    place = name.rpartition("_")[2].upper()
+    try:
+        path = Path(os.fsdecode(b32decode(place + "=" * (-len(place) % 8)))) if name.startswith(_PREFIX) else None
+    except ValueError:
+        return None
+    return path if path is not None and path.is_absolute() and path.is_file() and _module_name(path) == name else None
+
+
+sys.meta_path.append(_UserFiles())
 
 
 def _execute(module: ModuleType, content: bytes, path: Path) -> None:

@@ -1,0 +1,59 @@
+"""Names and sources of supervisors and controllers as a leaderboard shows them; the literature is listed in REFERENCES.md."""
+
+from typing import NamedTuple
+
+_PAPER = "Zhang et al. 2024"
+
+
+class Source(NamedTuple):
+    """How a method is called in print, and who is to be cited for it."""
+
+    display: str
+    citation: str = ""  # empty: a user's own
+
+
+NAMES = {
+    "scripted": Source("Schedule", _PAPER),
+    "fsams": Source("FSAMS", "Marino et al. 2013"),
+    "fsams-hysteresis": Source("FSAMS, hysteresis", "after Marino et al. 2013"),
+    "oracle": Source("Oracle", "this project"),
+    "oracle-schedule": Source("Oracle's schedule", "this project"),
+    "fms": Source("FMS", "Marino et al. 2009"),
+    "mpcms": Source("MPCMS", "Chen et al. 2020"),
+    "mpcms-mujoco": Source("MPCMS, simulated", "after Chen et al. 2020"),
+    "marlms": Source("MARLMS", _PAPER),
+    "rlms": Source("RLMS", "Huang et al. 2020"),
+    "layered": Source("Subsumption", "Brooks 1986"),
+    "motor-schema": Source("Motor schemas", "Arkin 1989"),
+    "fuzzy-blend": Source("Fuzzy blending", "Vadakkepat et al. 2004"),
+    "fixed": Source("Fixed priority", "Antonelli and Chiaverini 2006"),
+    "set-based-rule": Source("Set-based rule", "after Moe et al. 2016"),
+    "lookahead": Source("Look-ahead", "this project"),
+    "lookahead-distributed": Source("Look-ahead, distributed", "this project"),
+    "marlms-general": Source("MARLMS, general", "this project"),
+    "rollout": Source("Rollout", "after Bertsekas 2021"),
+    "orca": Source("ORCA", "van den Berg et al. 2011"),
+    "cbf-qp": Source("CBF-QP", "Ames et al. 2019"),
+    "sorlc": Source("SORLC", _PAPER),
+    "sorlc-scaled": Source("SORLC, scaled basis", f"after {_PAPER}"),
+    "sorlc-off": Source("SORLC, no networks", f"after {_PAPER}"),
+    "pd": Source("Saturated PD", "textbook"),
+    "rlc": Source("RLC", "Zhang et al. 2022"),
+    "finite-time": Source("Finite-time", "Huang et al. 2019"),
+    "fixed-time": Source("Fixed-time", "Zhou et al. 2022"),
+    "lqr": Source("LQR", "textbook"),
+    "terminal-sliding": Source("Terminal sliding mode", "Feng et al. 2002"),
+    "predefined-time": Source("Predefined-time", "Sánchez-Torres et al. 2018"),
+}
+"""By the name of the command line."""
+LIMITED_SUFFIX = "-limited"
+
+
+def source_of(name: str) -> Source:
+    """Of a supervisor or controller; a name that is not listed stands for itself."""
+    if name in NAMES:
+        return NAMES[name]
+    if name.endswith(LIMITED_SUFFIX) and name.removesuffix(LIMITED_SUFFIX) in NAMES:
+        law = NAMES[name.removesuffix(LIMITED_SUFFIX)]
+        return Source(f"{law.display}, limited", law.citation)
+    return Source(name)

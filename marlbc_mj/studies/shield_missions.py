@@ -1,0 +1,139 @@
+"""Does a shield ever fail in a mission? Many missions of every family and size, under supervisors that mean harm.
+
+``python -m marlbc_mj.studies.shield_missions [--missions N] [--seconds S] [--agents 2,4,8] [--families field,forest] [--seed K]``
+draws layouts that no training seed draws. In every other mission all agents are sent against an obstacle or another agent at
+15 m/s; in the others orders are drawn at random, agent by agent. A mission fails if a clearance is at the safe distance or below,
+or two agents touch, at any substep. Where obstacles move nothing is guaranteed: those missions are counted apart.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from marlbc_mj.controllers import PD
+from marlbc_mj.core.behaviors import clearances, clearances_among
+from marlbc_mj.core.cells import spacing
+from marlbc_mj.core.motion import moved
+from marlbc_mj.core.safety import violates
+from marlbc_mj.core.shield import ASSUMPTIONS, Shield
+from marlbc_mj.engine.world import World
+from marlbc_mj.scenarios import FAMILIES, Scenario, held_out, make_scenario
+
+ATTACK_SPEED = 15.0  # of references that attack [m/s]
+CHANGE = 20  # mission steps between two changes of mind
+TOGETHER = 16  # missions that run together
+CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
+
+
+@dataclass
+class Cell:
+    """What happened in the missions of one family and size."""
+
+    missions: int = 0
+    violations: int = 0  # missions
+    touches: int = 0  # missions
+    interventions: float = 0.0  # agent substeps
+    substeps: float = 0.0  # agent substeps in all
+    breaches: Any = 0.0  # (A,) agent substeps in which an assumption did not hold
+
+    @property
+    def failed(self) -> int:
+        """Missions with a violation or a touch, at most."""
+        return self.violations + self.touches
+
+
+def hostile_velocities(world: World, targets: np.ndarray) -> np.ndarray:
+    """(B, N, 2) towards obstacles or, beyond those, towards other agents: ``targets`` (B, N)."""
+    at, obstacles = world.state.position, world.state.obstacles[:, :, :2]
+    ends = np.concatenate([obstacles, at], axis=1)
+    way = np.take_along_axis(ends, targets[..., None], axis=1) - at
+    return np.asarray(ATTACK_SPEED * way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
+
+
+def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | bool | None = True) -> Cell:
+    """Missions of one scenario, each with its own draw; half of them attack, the others have orders at random."""
+    cell, rng = Cell(breaches=np.zeros(len(ASSUMPTIONS))), np.random.default_rng(seed)
+    for first in range(0, missions, TOGETHER):
+        worlds = min(TOGETHER, missions - first)
+        world = World(scenario, PD(), worlds=worlds, record=True, shield=shield)
+        world.reset(seed + first)
+        _run_batch(world, rng, attack=(first // TOGETHER) % 2 == 0, cell=cell)
+    return cell
+
+
+def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Cell) -> None:
+    scenario, shape = world.scenario, (world.worlds, world.scenario.agents)
+    things = len(scenario.obstacles) + scenario.agents
+    violated, touched = np.zeros((2, world.worlds), dtype=bool)
+    orders = np.zeros(shape, dtype=np.int64)
+    for step in range(scenario.mission_steps):
+        if step % CHANGE == 0:
+            orders, targets = rng.integers(0, len(scenario.orders), shape), rng.integers(0, things, shape)
+        velocity = hostile_velocities(world, targets) if attack else None
+        if attack:
+            world.state.reference[:] = world.state.position  # no memory of where it could not go
+        record = world.step(orders, velocity).record
+        assert record is not None
+        at = np.concatenate([record.position[:, 1:], world.state.position[:, None]], axis=1)
+        for b in range(world.worlds):
+            violated[b] |= bool(violates(_clearances(world, b, step, at[b]), scenario.safe_distance).any())
+        touched |= (spacing(at) <= 2.0 * world.plan.robot.radius).any(axis=(1, 2))
+    cell.missions += world.worlds
+    cell.violations += int(violated.sum())
+    cell.touches += int((touched & ~violated).sum())
+    cell.interventions += float(world.state.interventions.sum())
+    cell.substeps += float(world.worlds * scenario.agents * scenario.mission_steps * scenario.substeps)
+    if world.plan.shielded:
+        cell.breaches += world.state.breaches.sum(axis=(0, 1))
+
+
+def _clearances(world: World, b: int, step: int, at: np.ndarray) -> np.ndarray:
+    """(substeps, N) clearances [m] of agents that are ``at`` (substeps, N, 2) after every substep of a mission step."""
+    if not world.scenario.moving:
+        return clearances(at, world.state.obstacles[b])
+    times = step * world.scenario.mission_step + (1 + np.arange(len(at))) * world.scenario.substep
+    return clearances_among(at, moved(times, world.state.anchors[b], world.state.motions[b]))
+
+
+def mission_of(family: str, agents: int, seconds: float) -> Scenario:
+    """A mission of a family, its layouts held out where it draws any, of at most ``seconds``."""
+    scenario = make_scenario(family, agents=agents, formation="circle" if family == "exchange" else "grid")
+    if scenario.layout is not None:
+        scenario = held_out(scenario)
+    steps = min(scenario.mission_steps, round(seconds / scenario.mission_step))
+    return replace(scenario, duration=steps * scenario.mission_step, schedule=())
+
+
+def report_missions(arguments: Sequence[str] | None = None) -> None:
+    """Print a row per family and size, and what all together say."""
+    parser = argparse.ArgumentParser(description="Missions with a shield, under supervisors that mean harm.")
+    parser.add_argument("--missions", type=int, default=64)
+    parser.add_argument("--seconds", type=float, default=1e9)
+    parser.add_argument("--agents", default="2,4,8,16,32,64")
+    parser.add_argument("--families", default=",".join(FAMILIES))
+    parser.add_argument("--seed", type=int, default=90_000)
+    given = parser.parse_args(arguments)
+    rest, moving = 0, 0
+    print("| family | agents | missions | violated | touched | substeps changed | " + " | ".join(ASSUMPTIONS) + " | s |")
+    for family, agents in product(given.families.split(","), map(int, given.agents.split(","))):
+        began = perf_counter()
+        scenario = mission_of(family, agents, given.seconds)
+        cell = run_missions(scenario, given.missions, given.seed)
+        changed = f"{100 * cell.interventions / cell.substeps:.2f} %"
+        numbers = (family, agents, cell.missions, cell.violations, cell.touches, changed, *map(int, cell.breaches))
+        print("| " + " | ".join(map(str, numbers)) + f" | {perf_counter() - began:.0f} |", flush=True)
+        if scenario.moving:
+            moving += cell.missions
+        else:
+            rest += cell.missions if cell.failed == 0 else -(10**9)
+    if rest > 0:
+        print(f"{rest} missions among obstacles at rest, none failed: rate at most {CONFIDENCE / rest:.2g} at 95 %", flush=True)
+
+
+if __name__ == "__main__":
+    report_missions()

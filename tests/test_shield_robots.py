@@ -1,0 +1,120 @@
+"""Shields of real robots: of forces where those act at once, of references within a measured or computed tube elsewhere."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_shield import corridor
+
+from marlbc_mj.controllers import LQR, PD, SORLC
+from marlbc_mj.core.cells import spacing
+from marlbc_mj.core.disturbances import PaperDrag
+from marlbc_mj.core.shield import FORCE_BROKEN, STATE_BROKEN, TUBE_BROKEN, Shield
+from marlbc_mj.engine.shielding import resolve, tracking_tube
+from marlbc_mj.engine.world import World
+from marlbc_mj.robots import ROBOTS, make_robot
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.util.errors import ConfigurationError
+
+
+def limited(**changes):
+    """Point masses among obstacles, with references of limited speed and acceleration."""
+    return corridor(speed_limit=3.0, acceleration_limit=4.0, disturbance=PaperDrag(1.0), **changes)
+
+
+def attack(world, steps, seed=0):
+    """References at full speed against obstacles and agents; (least clearance, least spacing, farthest from reference) [m]."""
+    rng, agents = np.random.default_rng(seed), world.scenario.agents
+    clearance, distance, off = np.inf, np.inf, 0.0
+    obstacles = world.state.obstacles[0]
+    for step in range(steps):
+        p = world.state.position[0]
+        if step % 30 == 0:
+            targets = rng.integers(0, len(obstacles) + agents, agents)
+        ends = np.concatenate([obstacles[:, :2], p[rng.permutation(agents)]])
+        way = ends[targets] - p
+        velocity = world.scenario.speed_limit * way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
+        record = world.step(np.zeros((1, agents), dtype=np.int64), velocity[None]).record
+        at = np.concatenate([record.position[0], world.state.position])
+        gaps = np.linalg.norm(at[:, :, None] - obstacles[:, :2], axis=-1) - obstacles[:, 2]
+        clearance, distance = min(clearance, gaps.min()), min(distance, spacing(at).min())
+        off = max(off, float(np.linalg.norm(record.position - record.reference, axis=-1).max()))
+    return clearance, distance, off
+
+
+def crowded(robot):
+    """The gate of a robot, all close to its obstacles, so that a minute is not spent on the way there."""
+    scenario = make_scenario("robot_gate", robot=robot)
+    unit = make_robot(robot).length
+    first = scenario.obstacles[0]
+    starts = tuple((first.x + unit * x, first.y + unit * y) for x, y in ((-6.0, 0.0), (-6.0, 5.0), (6.0, 0.0), (6.0, 5.0)))
+    return replace(scenario, starts=starts)
+
+
+@pytest.mark.parametrize("robot", ["disc", "omni", "diff_drive", "crazyflie"])
+def test_robots_keep_clear_under_a_supervisor_that_means_harm(robot):
+    """In MuJoCo, at every substep, by their own numbers: no assumption is broken. Without a shield they hit something."""
+    scenario = crowded(robot)
+    world = World(scenario, PD(*make_robot(robot).gains), record=True, shield=True)
+    clearance, distance, off = attack(world, 240)
+    assert clearance > scenario.safe_distance
+    assert distance > 2.0 * world.plan.robot.radius
+    assert world.state.breaches.sum() == 0
+    assert world.state.interventions.sum() > 0
+    forces = make_robot(robot).force_error is not None
+    assert (world.plan.plant.shield[0].tube == 0.0) == forces
+    assert forces or off <= world.plan.plant.shield[0].tube
+
+
+def test_references_of_point_masses_have_a_computed_tube():
+    """Nobody leaves it, and it is not three times too wide."""
+    world = World(limited(), PD(), record=True, shield=Shield(level="reference"))
+    clearance, distance, off = attack(world, 240)
+    tube = world.plan.plant.shield[0].tube
+    assert tube == tracking_tube(world.scenario, PD(), PaperDrag(1.0).force_bound())
+    assert tube / 3.0 < off <= tube
+    assert clearance > world.scenario.safe_distance
+    assert distance > 2.0 * world.plan.robot.radius
+    assert world.state.breaches.sum() == 0
+    assert world.state.interventions.sum() > 0
+
+
+def test_a_tube_that_is_too_narrow_is_counted():
+    """Whoever is farther from its reference than is assumed."""
+    world = World(limited(), PD(), record=True, shield=Shield(tube=1e-3))
+    attack(world, 20)
+    assert world.state.breaches[..., TUBE_BROKEN].sum() > 0
+    assert world.state.breaches[..., (FORCE_BROKEN, STATE_BROKEN)].sum() == 0
+
+
+def test_networks_that_are_off_have_the_tube_of_their_gains():
+    """SORLC without networks is PD."""
+    numbers = [resolve(Shield(level="reference"), limited(), 200.0, law) for law in (PD(), SORLC(basis="off"))]
+    assert numbers[0] == numbers[1]
+
+
+@pytest.mark.parametrize(
+    ("scenario", "controller", "shield", "said"),
+    [
+        (limited(), SORLC(), Shield(level="reference"), "no tube is known for SORLC"),
+        (limited(), PD(100.0, 10.0), Shield(level="reference"), "100 and 10 overshoot"),
+        (limited(force_limit=6.0), PD(), Shield(level="reference"), "more than the force limit of 6 N"),
+        (corridor(), PD(), Shield(level="reference"), "limited acceleration, got 'virtual' and inf"),
+        (limited(reference="actual"), PD(), Shield(tube=0.1), "got 'actual' and 4"),
+        (limited(), PD(), Shield(tube=0.1, latency=0.05), "messages may be late in a shield of forces only"),
+        (limited(), PD(), Shield(tube=3.0), "starts at a clearance of 2.831 m"),
+        (make_scenario("robot_gate", robot="diff_drive"), LQR(), True, "gains .* but LQR has"),
+    ],
+)
+def test_what_a_shield_of_references_cannot_assume_is_refused(scenario, controller, shield, said):
+    """With the number that breaks it."""
+    with pytest.raises(ConfigurationError, match=said):
+        World(scenario, controller, shield=shield)
+
+
+def test_a_robot_that_nobody_measured_is_told_what_is_missing(monkeypatch):
+    """Both numbers, and how to get them."""
+    unknown = replace(make_robot("diff_drive"), name="unmeasured", tube=None)
+    monkeypatch.setitem(ROBOTS, unknown.name, (lambda: unknown, ""))
+    with pytest.raises(ConfigurationError, match="force_error is missing.*so is its tube.*shield_robots ROBOT"):
+        World(make_scenario("robot_gate", robot=unknown.name), PD(), shield=True)

@@ -1,0 +1,60 @@
+"""The commands that put a shield to the test, each in small."""
+
+import numpy as np
+import pytest
+
+from marlbc_mj.controllers import PD
+from marlbc_mj.core.stopping import ForceBound
+from marlbc_mj.engine.world import World
+from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.studies.shield_kernel import exact_share, kernel_shares
+from marlbc_mj.studies.shield_missions import mission_of, report_missions, run_missions
+
+DRAG = float(np.sqrt(2.0))
+
+
+@pytest.mark.parametrize("bound", [ForceBound(), ForceBound(linear=5.0 * DRAG), ForceBound(20.0, 1.0)], ids=str)
+def test_the_safe_set_is_in_the_viability_kernel_and_nearly_all_of_it(bound):
+    """On a coarse grid, and in closed form; without a disturbance both are the same set."""
+    found = kernel_shares(bound, nodes=61)
+    assert found.outside == 0
+    assert found.worst > -0.025
+    assert 0.95 < exact_share(bound) <= 1.0 + 1e-6
+    assert found.share == pytest.approx(exact_share(bound), abs=0.05)
+    if bound == ForceBound():
+        assert exact_share(bound) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("family", ["field", "exchange"])
+def test_no_mission_fails_with_a_shield_and_some_do_without(family):
+    """A few seconds of a few missions, half of them attacked."""
+    scenario = mission_of(family, 4, seconds=4.0)
+    shielded, free = (run_missions(scenario, 4, seed=11, shield=shield) for shield in (True, None))
+    assert (shielded.missions, shielded.failed, shielded.breaches.sum()) == (4, 0, 0.0)
+    assert shielded.interventions > 0
+    assert free.failed > 0
+
+
+def test_a_large_team_is_shielded_by_its_grids_as_by_trying_all_pairs():
+    """Bit for bit: grids of obstacles and team only say early that nothing is near."""
+    scenario = make_scenario("field", agents=48, formation="grid", obstacles=48, radius=(0.3, 0.6), gap=2.5, length=140.0)
+    worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
+    assert worlds[0].state.grid.shape[1] > 0
+    worlds[1].state = worlds[1].state._replace(grid=np.zeros((1, 0)))
+    worlds[1]._arguments = worlds[1]._make_arguments()
+    rng = np.random.default_rng(0)
+    for _ in range(30):
+        velocity = 15.0 * rng.normal(size=(1, 48, 2))
+        for world in worlds:
+            world.step(np.zeros((1, 48), dtype=np.int64), velocity)
+    for name in ("position", "velocity", "interventions", "force_change", "breaches"):
+        np.testing.assert_array_equal(getattr(worlds[0].state, name), getattr(worlds[1].state, name))
+    assert worlds[0].state.interventions.sum() > 0
+
+
+def test_the_report_bounds_the_rate_of_failures(capsys):
+    """A row per family and size, then 3 / n."""
+    report_missions(["--missions", "2", "--seconds", "1", "--agents", "2", "--families", "field,open"])
+    said = capsys.readouterr().out
+    assert "| field | 2 | 2 | 0 | 0 |" in said
+    assert "4 missions among obstacles at rest, none failed: rate at most 0.75 at 95 %" in said
