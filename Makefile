@@ -1,9 +1,9 @@
-# make test | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
+# make test | fuzz | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test lint wheel docs gallery clean
+.PHONY: help venv benchmark test fuzz lint wheel docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -22,6 +22,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 help:
 	@echo 'make test        run the tests'
+	@echo 'make fuzz        thousands of wrong inputs; half an hour or more'
 	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
 	@echo 'make lint        ruff and mypy'
 	@echo 'make wheel       sdist and wheel, into dist'
@@ -35,6 +36,10 @@ benchmark: venv
 test: venv
 	@$(BIN)/python tests/warm_cache.py
 	@$(BIN)/python -m pytest -n auto --dist worksteal
+
+fuzz: venv
+	@$(BIN)/python tests/warm_cache.py
+	@$(BIN)/python tests/fuzz --out out/fuzz
 
 lint: venv
 	@status=0; \

@@ -15,7 +15,7 @@ from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, batched, carry_out
+from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, ask_supervisor, batched, carry_out, start_supervisor
 from marlbc_mj.supervisors.communication import Hearing, hearing
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -94,8 +94,8 @@ def run_episode(
         on_frame: called after every mission step, a log writer for example.
 
     Raises:
-        ConfigurationError: more than one world, or a decision of wrong shape or type.
-        SimulationError: the world diverged.
+        ConfigurationError: more than one world, one that keeps no substeps, or a decision of wrong shape or type.
+        SimulationError: the world diverged, or supervisor or law raised an error.
     """
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
@@ -138,11 +138,11 @@ def _play(
     world: World, supervisor: Supervisor, observation: Observation, on_frame: Callable[[Frame], None] | None = None
 ) -> tuple[list[list[Frame]], Observation]:
     """All worlds to the end of their episodes: the frames of each, and what is seen at the end."""
-    memory, done = supervisor.start(world.scenario, world.worlds), False
+    memory, done = start_supervisor(supervisor, world.scenario, world.worlds), False
     frames: list[list[Frame]] = [[] for _ in range(world.worlds)]
     while not done:
         began = perf_counter()
-        decision, memory = supervisor.decide(observation, memory)
+        decision, memory = ask_supervisor(supervisor, observation, memory)
         decision_ms = 1e3 * (perf_counter() - began) / world.worlds
         heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
         before = [(world.state.controller[b].copy(), body_poses(world, b)) for b in range(world.worlds)]
@@ -157,7 +157,8 @@ def _play(
 
 def _frame(b: int, seen: Observation, step: Step, others: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
     """Of world ``b``; ``others`` are controller state, decision time and pose."""
-    assert step.record is not None, "an episode needs World(record=True)"
+    if step.record is None:
+        raise ConfigurationError("an episode needs a World that keeps every substep: World(..., record=True)")
     record = Record(*(rows[b] for rows in step.record))
     shield = None if step.shield is None else ShieldCounts(*(rows[b] for rows in step.shield))
     links = None if heard is None else heard.team(b)

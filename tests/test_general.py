@@ -74,12 +74,12 @@ def test_a_lane_is_the_least_clearance_in_every_bin(seed: int) -> None:
     """Against a thousand samples per bin."""
     rng, sight = np.random.default_rng(seed), sight_of(1.5, 0.7)
     obstacles = np.concatenate([rng.uniform(-15.0, 15.0, (5, 2)), rng.uniform(0.0, 2.0, (5, 1)), rng.normal(size=(5, 2))], axis=1)
-    slot, lane = rng.normal(scale=3.0, size=2), np.empty(inputs.BINS)
+    slot, lane = rng.normal(scale=3.0, size=2), np.empty(inputs.LANE_BINS)
     inputs.fill_lane(slot, sight, obstacles, lane)
-    for k in range(inputs.BINS):
+    for k in range(inputs.LANE_BINS):
         t = np.linspace(sight.edges[k], sight.edges[k + 1], 1001)[:, None, None]
         gap = np.linalg.norm(slot + t * sight.path[1] - obstacles[:, :2] - t * obstacles[:, 3:], axis=-1) - obstacles[:, 2]
-        wanted = np.clip(gap.min() / sight.length - 1.0, inputs.NEAREST, inputs.FARTHEST)
+        wanted = np.clip(gap.min() / sight.length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
         assert wanted - 1e-3 <= lane[k] + 1e-12 <= wanted + 2e-12
 
 
@@ -87,8 +87,8 @@ def test_the_way_to_a_slot_sees_what_is_between() -> None:
     obstacles = np.array([[5.0, 0.5, 0.25]])
     at, slot = np.zeros(2), np.array([10.0, 0.0])
     assert inputs.way_clearance(at, slot, 1.0, obstacles) == pytest.approx(-0.75)
-    assert inputs.way_clearance(at, at, 1.0, obstacles) == inputs.FARTHEST
-    assert inputs.way_clearance(at, slot, 1.0, obstacles[:0]) == inputs.FARTHEST
+    assert inputs.way_clearance(at, at, 1.0, obstacles) == inputs.MOST_BEYOND
+    assert inputs.way_clearance(at, slot, 1.0, obstacles[:0]) == inputs.MOST_BEYOND
 
 
 def test_all_hearing_all_is_the_limit_of_hearing_each() -> None:
@@ -163,11 +163,11 @@ def test_the_column_and_its_age_are_inputs() -> None:
     for _ in range(20):
         observation = world.step(column).observation
     features = inputs.sense_features(observation, inputs.make_sight(scenario))[0]
-    assert (features[:, inputs.COLUMN] == 1.0).all()
+    assert (features[:, inputs.COLUMN_ENTRY] == 1.0).all()
     after = world.step(np.full((1, 4), scenario.orders.index("FM"))).observation
     features = inputs.sense_features(after, inputs.make_sight(scenario))[0]
-    assert (features[:, inputs.COLUMN] == 0.0).all()
-    assert (features[:, inputs.AGES] < 0.1).all()
+    assert (features[:, inputs.COLUMN_ENTRY] == 0.0).all()
+    assert (features[:, inputs.AGE_ENTRIES] < 0.1).all()
 
 
 @pytest.mark.parametrize(

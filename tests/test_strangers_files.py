@@ -328,6 +328,18 @@ def test_what_a_checkpoint_says_cannot_be_changed(tmp_path):
     ):
         assert content.count(old) == 1
         path.write_bytes(content.replace(old, new))
-        with pytest.raises(ConfigurationError, match="damaged"):
+        with pytest.raises(ConfigurationError, match="damaged|format 2"):
             read_arrays(path)
     assert description["sha256"] == digest(arrays, description) != digest(arrays, {**description, "margin": 0.75})
+
+
+def test_openings_as_wide_as_the_way_leave_no_walls():
+    draw = make_scenario("gates", width=40.0).draw(np.random.default_rng(0))
+    assert draw.obstacles.shape == (0, 3)
+
+
+def test_a_force_limit_that_mujoco_takes_for_zero_is_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", str(toml(tmp_path, OPEN + "force_limit = 5e-324\n")), "--out", str(tmp_path / "out")])
+    said = capsys.readouterr().err.strip()
+    assert stopped.value.code == 2 and "invalid force range" in said and len(said.splitlines()) == 1

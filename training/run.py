@@ -31,6 +31,8 @@ from marlbc_mj.util.provenance import provenance
 
 RESUME = "resume.safetensors"
 TABLES = ("eval.csv", "progress.csv")
+COUNTED = ("wall_s", "mission_steps")
+"""First columns of both tables."""
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
 TrainingScores = dict[str, float]
 """A line of eval.csv or progress.csv."""
@@ -133,8 +135,9 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
         run.trainer.restore(arrays, description["scalars"])
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random stream's own checks
         raise ConfigurationError(f"{path} does not fit the run that it was saved from: {error}") from error
-    run.evaluations, run.curve = (saved_rows(path, description[name]) for name in ("evaluations", "curve"))
-    run.wall = description["wall_s"]
+    run.evaluations = saved_rows(path, description["evaluations"], (*COUNTED, "return", "violation_time"))
+    run.curve = saved_rows(path, description["curve"], COUNTED)
+    run.wall = saved_rows(path, [{"wall_s": description["wall_s"]}], ())[0]["wall_s"]
     remove_leftovers(out)
     run.write_rows()
     return run.go(progress)

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,16 +73,25 @@ def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
     return config
 
 
-def saved_rows(path: Path, rows: list[Any]) -> list[dict[str, float]]:
-    """The lines of a run's table, from JSON data.
+def saved_rows(path: Path, rows: list[Any], columns: Iterable[str]) -> list[dict[str, float]]:
+    """The lines of a run's table, from JSON data: at least one, all with the same columns.
+
+    Args:
+        path: file of the saved run.
+        rows: what it says.
+        columns: some that every line must have.
 
     Raises:
         ConfigurationError: the data are not such lines.
     """
     try:
-        return [{str(name): float(value) for name, value in row.items()} for row in rows]
-    except (AttributeError, TypeError, ValueError) as error:
+        found = [{str(name): float(value) for name, value in row.items()} for row in rows]
+        names = set(found[0])
+        if not names.issuperset(columns) or any(set(row) != names for row in found):
+            raise ValueError(f"their columns are not the same, or not {', '.join(columns)} and others")
+    except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
         raise ConfigurationError(f"{path} is not a saved run: its tables are damaged, {error}") from error
+    return found
 
 
 def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:

@@ -1,12 +1,17 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
 import sys
+from importlib.metadata import version
 from typing import Annotated
 
 from tyro.conf import subcommand
 
+<<<<<<< HEAD
 from marlbc_mj import __version__
 from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, SafetyCommand
+=======
+from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand
+>>>>>>> main
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand
@@ -23,7 +28,7 @@ from marlbc_mj.cli.parsing import parse
 from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
-from marlbc_mj.cli.terminal import prepare_gl
+from marlbc_mj.cli.terminal import prepare_gl, suggest_cache
 from marlbc_mj.cli.training import TrainCommand
 
 Command = (
@@ -58,8 +63,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run, see :func:`~marlbc_mj.cli.ending.in_one_line`."""
     with in_one_line("marlbc"):
         if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
-            print(f"marlbc {__version__}")
+            print(f"marlbc {version('marlbc-mj')}")
             return
         command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
         prepare_gl(strict=isinstance(command, VideoCommand))
         command.run()
+        suggest_cache()

@@ -47,7 +47,7 @@ def in_one_line(prog: str) -> Iterator[None]:
             finally:
                 sys.stdout.flush()
     except MarlbcError as error:
-        _end(f"{prog}: {error}", error.exit_status)
+        _end(f"{prog}: {one_line(error)}", error.exit_status)
     except KeyboardInterrupt:
         _end(f"{prog}: interrupted", INTERRUPTED)
     except Terminated:

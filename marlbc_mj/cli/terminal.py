@@ -35,6 +35,14 @@ def prepare_gl(strict: bool) -> None:
         os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with another, MuJoCo itself could not be imported
 
 
+def suggest_cache() -> None:
+    """Say where compiled code could be kept, if this command has compiled some that it could not keep."""
+    compiling = sys.modules.get("marlbc_mj.core.compiling")  # not imported for this: most commands compile nothing
+    if compiling is not None and compiling.compiled_in_vain():
+        said = "compiled code cannot be kept here and is compiled by every command; set NUMBA_CACHE_DIR to a folder to write into"
+        print(f"marlbc: {said}", file=sys.stderr)
+
+
 @contextmanager
 def progress_bars() -> Iterator[Progress]:
     """A bar per stage, with rate and time left, on a terminal; silent elsewhere."""

@@ -42,6 +42,21 @@ CONTROLLER_PARTS = ("law", "limited", "linear_gains", "params", "initial_state")
 """What every controller has."""
 
 
+def require_controller(found: object, name: str = "controller") -> Controller:
+    """The object itself.
+
+    Raises:
+        ConfigurationError: it lacks a part of a controller, or its law cannot be called.
+    """
+    lacking = [each for each in CONTROLLER_PARTS if not hasattr(found, each)]
+    if lacking:
+        raise ConfigurationError(f"{name} is no controller: {type(found).__name__} lacks {', '.join(lacking)}")
+    controller = cast(Controller, found)
+    if not callable(controller.law):
+        raise ConfigurationError(f"{name} is no controller: its law is {controller.law!r}, which cannot be called")
+    return controller
+
+
 def make_controller(name: str) -> Controller:
     """A controller with its default gains, by name, or ``file.py:Name`` of a user's Python file.
 
@@ -49,11 +64,7 @@ def make_controller(name: str) -> Controller:
         ConfigurationError: unknown name, or a file that gives no controller.
     """
     if names_attribute(name):
-        controller = made(name, Controller)
-        lacking = [each for each in CONTROLLER_PARTS if not hasattr(controller, each)]
-        if lacking:
-            raise ConfigurationError(f"{name} is no controller: {type(controller).__name__} lacks {', '.join(lacking)}")
-        return cast(Controller, controller)
+        return require_controller(made(name, Controller), name)
     if name not in CONTROLLERS:
         raise unknown("controller", name, (*CONTROLLERS, "FILE.py:NAME"))
     return CONTROLLERS[name][0]()
@@ -72,4 +83,5 @@ __all__ = [
     "TerminalSliding",
     "largest_stable_substep",
     "make_controller",
+    "require_controller",
 ]

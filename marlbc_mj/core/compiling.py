@@ -1,5 +1,6 @@
 """How laws and the helpers that they call are compiled: by numba, on first use, cached on disk."""
 
+import dis
 import os
 import zlib
 from collections.abc import Callable, Iterator
@@ -95,6 +96,25 @@ def _used(function: Law, seen: set[int]) -> Iterator[str]:
             yield f"{name} {value.tobytes().hex() if isinstance(value, np.ndarray) else value}"
 
 
+def raising_line(function: Law, seen: set[int]) -> str | None:
+    """``file.py, line 12`` of a ``raise`` or an ``assert`` in a function or in a compiled helper that it calls; None without.
+
+    Args:
+        function: compiled or plain.
+        seen: functions that have been looked at, by ``id``.
+    """
+    function = plain(function)
+    if id(function) in seen or not isinstance(function, FunctionType):
+        return None
+    seen.add(id(function))
+    code = function.__code__
+    for each in dis.get_instructions(code):
+        if each.opname == "RAISE_VARARGS" and each.positions is not None:
+            return f"{Path(code.co_filename).name}, line {each.positions.lineno}"
+    used = (cast(Law, function.__globals__.get(name)) for name in code.co_names)
+    return next(filter(None, (raising_line(helper, seen) for helper in used if is_compiled(helper))), None)
+
+
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
     """Compile, and keep the result on disk where there is a place for it: not for a function typed at a prompt, nor without a
     writable folder.
@@ -103,13 +123,23 @@ def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
     try:
         law = numba.njit(cache=cache, **options)(function)
     except RuntimeError:
-        return cast(Law, numba.njit(**options)(function))
+        _unkept.append(numba.njit(**options)(function))
+        return cast(Law, _unkept[-1])
     if cache and is_compiled(law):
         index = law._cache._cache_file
         index._source_stamp = (index._source_stamp, *_stamp(function))
         law._cache.load_overload = _forgiving(law._cache.load_overload)
         law._cache.save_overload = _forgiving(law._cache.save_overload)
     return cast(Law, law)
+
+
+_unkept: list[Any] = []
+"""Functions whose compiled code has no place on disk."""
+
+
+def compiled_in_vain() -> bool:
+    """Whether something has been compiled that the next process must compile again: no folder for it can be written."""
+    return any(law.signatures for law in _unkept)
 
 
 def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:

@@ -33,7 +33,7 @@ import numba
 from numba.core.dispatcher import Dispatcher
 from numba.core.errors import NumbaError
 
-from marlbc_mj.core.compiling import Law, allocation_free, clip, compiled, inlined, is_compiled, plain, threaded
+from marlbc_mj.core.compiling import Law, allocation_free, clip, compiled, inlined, is_compiled, plain, raising_line, threaded
 from marlbc_mj.core.kinds import (
     BEHAVIOR,
     CONTROLLER,
@@ -62,24 +62,29 @@ from marlbc_mj.core.names import (
     refuse_undeclared,
     require_kind,
 )
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError
+from marlbc_mj.util.modules import blame
 
 
 def for_team(law: Law, signature: Any) -> Law:
     """The law for the Python path: on rows of float64, as the loop calls it; applied to every agent in turn, a behavior to one.
 
-    The function raises ConfigurationError where the law reads a name that it does not declare.
+    The function raises ConfigurationError where the law reads a name that it does not declare, and SimulationError where it
+    raises anything else.
     """
     team = on_rows(law, signature)
 
     def checked(*arguments: Any) -> Any:
         try:
             return team(*arguments)
-        except (AttributeError, KeyError) as error:
-            refuse_undeclared(law, error)
+        except MarlbcError:
             raise
+        except Exception as error:
+            if isinstance(error, AttributeError):
+                refuse_undeclared(law, error)
+            raise SimulationError(f"law {name_of(law)!r} fails: {blame(error)}") from error
 
-    return checked if any(names.shapes for names in interface(law)[1:]) else team
+    return checked
 
 
 def _declare(function: Law, signature: Any, gains: Declared, state: Declared = ()) -> Law:
@@ -159,12 +164,17 @@ def address(law: Law, signature: Any) -> int:
 
     Raises:
         ConfigurationError: the law is plain Python, was declared as another kind of law, reads a name that it does not declare,
-            or does not compile.
+            raises errors, which threads would lose, or does not compile.
     """
     name = name_of(law)
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
+    line = raising_line(law, set())
+    if line is not None:
+        raise ConfigurationError(
+            f"law {name!r} raises an error ({line}), which compiled code cannot; write NaN to an output instead: it ends the run"
+        )
     kind, entry = ON_ROWS[signature][0], _entry(law, signature)
     try:
         law.compile(_arguments(interface(law)))

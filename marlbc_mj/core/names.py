@@ -98,7 +98,7 @@ class Names:
         out = np.full(self.size, 0.0 if default is None else default)
         record = self.view(out)
         for name, value in given.items():
-            field, value = record[name], np.asarray(value, dtype=np.float64)
+            field, value = record[name], _floats(value, f"{owner.word} {name!r} of law {owner.law!r}")
             if value.shape not in ((), np.shape(field)):
                 raise ConfigurationError(
                     f"{owner.word} {name!r} of law {owner.law!r} has shape {np.shape(field)}, got {value.shape}"
@@ -110,9 +110,13 @@ class Names:
         """Numbers without names, for a law that declares none."""
         if self.shapes:
             raise ConfigurationError(
-                f"law {owner.law!r} takes its {owner.word}s by name, got {tuple(numbers)}; its names: {', '.join(self.names)}"
+                f"law {owner.law!r} takes its {owner.word}s by name, got {numbers if np.ndim(numbers) == 0 else tuple(numbers)}; "
+                f"its names: {', '.join(self.names)}"
             )
-        return np.array(numbers, dtype=np.float64)
+        row = _floats(numbers, f"the {owner.word}s of law {owner.law!r}")
+        if row.ndim != 1:
+            raise ConfigurationError(f"the {owner.word}s of law {owner.law!r} must be names with numbers, got {numbers!r}")
+        return row
 
     def _require(self, given: Mapping[str, Any], owner: Owner, complete: bool) -> None:
         """Raise ConfigurationError unless the names given are these."""
@@ -123,6 +127,14 @@ class Names:
         missing = [name for name in self.names if name not in given]
         if complete and missing:
             raise ConfigurationError(f"law {owner.law!r} is not given its {owner.word} {missing[0]!r}; its names: {there}")
+
+
+def _floats(value: Any, what: str) -> np.ndarray:
+    """A copy of a value as float64; ConfigurationError for one that is no number."""
+    try:
+        return np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ConfigurationError(f"{what} must be numbers, got {value!r}") from None
 
 
 Declared = Names | str | Iterable[str] | Mapping[str, Shape]

@@ -11,6 +11,7 @@ from marlbc_mj.robots.standard import quiet
 from marlbc_mj.scenarios import Obstacle, Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
+from marlbc_mj.util.text import one_line
 
 POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
 OBSTACLE_HEIGHT = 1.2  # [m]
@@ -39,7 +40,7 @@ def assemble(scenario: Scenario, limit: float) -> str:
             mass and no force limit of its own.
 
     Raises:
-        ConfigurationError: unknown robot, or a limit that is not positive.
+        ConfigurationError: unknown robot, one that MuJoCo does not take several times, or a limit that is not positive.
     """
     if not limit > 0:
         raise ConfigurationError(f"force limit must be positive, got {limit}")
@@ -55,8 +56,16 @@ def assemble(scenario: Scenario, limit: float) -> str:
         _add_obstacle(spec, k, obstacle, robot)
     _add_cameras(spec, scenario)
     with quiet():
-        spec.compile()
-        return str(spec.to_xml())
+        try:
+            spec.compile()
+            return str(spec.to_xml())
+        except (ValueError, mujoco.FatalError) as error:
+            raise unfit(scenario, error) from error
+
+
+def unfit(scenario: Scenario, error: Exception) -> ConfigurationError:
+    """The error for a robot that MuJoCo takes alone, but not as a team."""
+    return ConfigurationError(f"robot {scenario.robot!r} cannot be put into one world {scenario.agents} times: {one_line(error)}")
 
 
 def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:

@@ -2,19 +2,20 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import mujoco
 import numba
 import numpy as np
 
-from marlbc_mj.controllers import Controller, largest_stable_substep
+from marlbc_mj.controllers import Controller, largest_stable_substep, require_controller
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, Behavior
 from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.core.stopping import NO_SHIELD, ShieldNumbers, as_records
-from marlbc_mj.engine.assembly import agent_prefix, assemble
+from marlbc_mj.engine.assembly import agent_prefix, assemble, unfit
 from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
 from marlbc_mj.engine.loop import MissionRules, Native, Plant
@@ -23,6 +24,7 @@ from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.modules import guarded
 
 _JOINT_SIZE = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
 """Numbers of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
@@ -107,10 +109,13 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     """Check a scenario with a controller and assemble its model; ``shield=True`` is ``Shield()``.
 
     Raises:
-        ConfigurationError: unknown robot, a substep beyond the controller's stability limit, a law of the wrong kind, or a shield
-            whose assumptions do not hold.
+        ConfigurationError: no controller, or one whose code fails; unknown robot, a substep beyond the controller's stability
+            limit, a law of the wrong kind, or a shield whose assumptions do not hold.
     """
-    _check_substep(scenario, controller)
+    if not isinstance(scenario, Scenario):
+        raise ConfigurationError(f"scenario must be a Scenario, got {type(scenario).__name__}; make_scenario makes one by name")
+    who = f"controller {type(require_controller(controller)).__name__}"
+    guarded(lambda: _check_substep(scenario, controller), f"{who}: linear_gains")
     robot = make_robot(scenario.robot)
     robot.check(scenario)
     if robot.contact and scenario.moving:
@@ -121,7 +126,10 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     limit = scenario.force_limit if controller.limited else np.inf
     numbers = resolve(Shield() if shield is True else shield, scenario, limit, controller) if shield else NO_SHIELD
     xml = assemble(scenario, limit)
-    model = mujoco.MjModel.from_xml_string(xml)
+    try:
+        model = mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        raise unfit(scenario, error) from error
     return Plan(
         scenario=scenario,
         controller=controller,
@@ -131,11 +139,18 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
         mission=make_mission(scenario),
         behaviors=make_behaviors(scenario),
         plant=_make_plant(scenario, controller, limit, model, numbers),
-        initial_state=np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in range(scenario.agents)]),
-        disturbance_params=laws.pack_gains(scenario.disturbance.law, scenario.disturbance.params(), laws.DISTURBANCE),
+        initial_state=guarded(lambda: _initial_state(scenario, controller), f"{who}: initial_state()"),
+        disturbance_params=laws.pack_gains(
+            scenario.disturbance.law, guarded(scenario.disturbance.params, "the disturbance: params()"), laws.DISTURBANCE
+        ),
         solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
         shield=shield,
     )
+
+
+def _initial_state(scenario: Scenario, controller: Controller) -> np.ndarray:
+    """(N, S) controllers' state at t = 0."""
+    return np.stack([laws.pack_state(controller.law, controller.initial_state(i)) for i in range(scenario.agents)])
 
 
 def make_mission(scenario: Scenario) -> MissionRules:
@@ -175,7 +190,8 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:
-    gains = [controller.params(i, limit / scenario.unit_force) for i in range(scenario.agents)]
+    unit_limit, what = limit / scenario.unit_force, f"controller {type(controller).__name__}: params()"
+    gains = guarded(lambda: [controller.params(i, unit_limit) for i in range(scenario.agents)], what)
     params = [laws.pack_gains(controller.law, one, laws.CONTROLLER) for one in gains]
     qpos_index, qvel_index, ctrl_index = find_indices(model, scenario)
     return Plant(
@@ -241,7 +257,10 @@ def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndar
     Raises:
         ConfigurationError: a law that is not compiled, or not a behavior's.
     """
-    params = _padded([[laws.pack_gains(b.law, b.params(i), laws.BEHAVIOR) for i in range(agents)] for b in behaviors])
+    gains = [[guarded(partial(b.params, i), f"behavior {b.name}: params()") for i in range(agents)] for b in behaviors]
+    params = _padded(
+        [[laws.pack_gains(b.law, one, laws.BEHAVIOR) for one in own] for b, own in zip(behaviors, gains, strict=True)]
+    )
     if numba.config.DISABLE_JIT:
         return np.array([laws.for_team(b.law, laws.BEHAVIOR) for b in behaviors], dtype=object), params
     return np.array([laws.address(b.law, laws.BEHAVIOR) for b in behaviors], dtype=np.uint64), params

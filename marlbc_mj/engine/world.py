@@ -12,11 +12,13 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
+from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.modules import blame
 from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.text import one_line
 
@@ -232,9 +234,16 @@ class World:
         return returns
 
     def _play(self, returns: np.ndarray, sequence: np.ndarray, given: np.ndarray) -> int:
-        """The compiled loop, on one thread or on several; how many worlds failed."""
+        """The compiled loop, on one thread or on several; how many worlds failed.
+
+        Raises:
+            SimulationError: a law raised an error, for an assignment of the wrong shape for example.
+        """
         run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
-        return int(run(returns, sequence, given, self._arguments))
+        try:
+            return int(run(returns, sequence, given, self._arguments))
+        except Exception as error:
+            raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 
     def raise_if_diverged(self) -> None:
         """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
@@ -268,10 +277,12 @@ class World:
         if velocity.shape != shape:
             raise ConfigurationError(f"velocity must have shape {shape} (worlds, agents, axes), got {velocity.shape}")
         velocity = np.ascontiguousarray(velocity, dtype=np.float64)
-        bad = np.argwhere(~np.isfinite(velocity))
+        bad = np.argwhere(~(np.abs(velocity) < DIVERGED))
         if len(bad):
             b, i, axis = bad[0].tolist()
-            raise ConfigurationError(f"velocity must be finite, got {velocity[b, i, axis]} for world {b}, agent {i + 1}")
+            found = float(velocity[b, i, axis])
+            rule = f"below {DIVERGED:g} m/s" if np.isfinite(found) else "finite"
+            raise ConfigurationError(f"velocity must be {rule}, got {found} for world {b}, agent {i + 1}")
         return velocity
 
     def _read_record(self) -> Record | None:

@@ -21,9 +21,7 @@ from marlbc_mj.util.files import staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
 FORMAT = 3
-"""Version of the format. 2: a digest of the arrays, a signature of what a policy needs; 3: the digest covers the description."""
-READABLE = (2, FORMAT)
-"""Formats of files that this version can read."""
+"""Version of the format: a digest covers the arrays and their description."""
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]) -> None:
@@ -50,12 +48,10 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[st
 def digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
     """SHA-256 of contiguous arrays with their names, types and shapes, and of what is said about them, JSON data.
 
-    What ``description`` says about the digest itself is left out; format 2 left out all of it.
+    What ``description`` says about the digest itself is left out.
     """
-    sha = hashlib.sha256()
-    if description.get("format") != 2:
-        said = {name: value for name, value in description.items() if name != "sha256"}
-        sha.update(json.dumps(said, sort_keys=True).encode())
+    said = {name: value for name, value in description.items() if name != "sha256"}
+    sha = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
     for name in sorted(arrays):
         array = arrays[name]
         sha.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
@@ -67,8 +63,8 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the description that :func:`write_arrays` wrote; nothing in the file is ever executed.
 
     Raises:
-        ConfigurationError: no such file, an incomplete one, no checkpoint of this package, one of another format, or one whose
-            arrays have changed.
+        ConfigurationError: no such file, an incomplete one, no checkpoint of this package, one of another format, or one in
+            which any bit has changed.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -80,12 +76,22 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         description = json.loads(header or "")
     except (ValueError, RecursionError):
         raise ConfigurationError(f"{path} is no checkpoint of marlbc_mj: its header does not describe one") from None
-    if not isinstance(description, dict) or description.get("format") not in READABLE:
+    if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else description
         raise ConfigurationError(f"checkpoint {path} has format {found!r}; this version reads {FORMAT}")
-    if description.get("sha256") != digest(arrays, description):
+    if not _unchanged(arrays, description, header):
         raise ConfigurationError(f"checkpoint {path} is damaged: its arrays or its header are not those that were written")
     return arrays, description
+
+
+def _unchanged(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any], header: str | None) -> bool:
+    """Whether arrays and description fit their digest, and the header is spelled as :func:`write_arrays` spells it: ``1E-3`` for
+    ``1e-3`` is a changed bit, too.
+    """
+    try:
+        return description.get("sha256") == digest(arrays, description) and header == json.dumps(description)
+    except RecursionError:
+        return False
 
 
 def write_policy(path: Path, policy: Policy, description: dict[str, Any]) -> None:

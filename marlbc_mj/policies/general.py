@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general_inputs import INPUTS, LAYOUT, Sight, join_inputs
+from marlbc_mj.policies.general_inputs import INPUTS, INPUT_LAYOUT, Sight, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -82,7 +82,7 @@ def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]
     """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
     network = policy.network
     arrays = {f"weight{k}": w for k, w in enumerate(network.weights)} | {f"bias{k}": b for k, b in enumerate(network.biases)}
-    said = {**description, "kind": KIND, "layout": LAYOUT, "interval": INTERVAL, "margin": network.margin}
+    said = {**description, "kind": KIND, "layout": INPUT_LAYOUT, "interval": INTERVAL, "margin": network.margin}
     write_arrays(path, arrays, said)
     write_json(path.with_suffix(".json"), said)
 
@@ -106,7 +106,7 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
     arrays, description = read_arrays(path)
     if description.get("kind") != KIND:
         raise ConfigurationError(f"checkpoint {path} does not hold a general policy, but one of a single team")
-    for name, wanted in (("layout", LAYOUT), ("interval", INTERVAL)):
+    for name, wanted in (("layout", INPUT_LAYOUT), ("interval", INTERVAL)):
         if description.get(name) != wanted:
             raise ConfigurationError(
                 f"checkpoint {path} was trained on other inputs: its {name} is {description.get(name)}, this version's {wanted}"

@@ -21,31 +21,31 @@ from marlbc_mj.util.errors import ConfigurationError
 
 EDGES = (-5.0, -2.5, 0.0, 2.0, 4.0, 6.0, 9.0, 12.0, 15.0, 18.0, 21.0, 24.0)
 """Bounds of a lane's time bins, in settling times from now."""
-BINS = len(EDGES) - 1
-NEAREST, FARTHEST = -1.0, 3.0
+LANE_BINS = len(EDGES) - 1
+LEAST_BEYOND, MOST_BEYOND = -1.0, 3.0
 """Clearances beyond d_OA are clipped to this range [d_OA]."""
-FAR = 5.0
+COARSE = 5.0
 """The coarser of the two scales of slot errors, and of ages [d_OA], [T]."""
-OLD = 20.0
+COARSEST = 20.0
 """The coarsest scale of ages [T]."""
 
-LANES = 2 * BINS
+LANES = 2 * LANE_BINS
 """Entries 0 to LANES - 1: the lanes of the formation's slot and of the column's."""
 WAYS = LANES + 2
 """Entries up to WAYS - 1 are clearances: the lanes', then those of the straight ways to both slots."""
 ERRORS = WAYS + 4
 """Entries from WAYS to ERRORS - 1: distances from both slots, each on two scales."""
-COLUMN, AGES, OWN = ERRORS, ERRORS + 1, ERRORS + 3
+COLUMN_ENTRY, AGE_ENTRIES, CLEARANCE_ENTRY = ERRORS, ERRORS + 1, ERRORS + 3
 """Entries after these: whether the agent is in the column, the age of that on two scales, and its clearance now."""
-FEATURES = OWN + 1
+FEATURES = CLEARANCE_ENTRY + 1
 """F, entries that an agent senses; it sends all of them."""
-POOLED = 2 * FEATURES + (AGES + 2 - WAYS) + 2
+POOLED = 2 * FEATURES + (AGE_ENTRIES + 2 - WAYS) + 2
 """Entries that are pooled of what was heard: minima, means, maxima of errors and ages, share heard, age of the oldest."""
 INPUTS = FEATURES + POOLED
 """S, entries of a network's input."""
-LAYOUT: dict[str, float | list[float]] = {
+INPUT_LAYOUT: dict[str, float | list[float]] = {
     **{"version": 1, "features": FEATURES, "pooled": POOLED, "edges": list(EDGES)},
-    **{"nearest": NEAREST, "farthest": FARTHEST, "far": FAR, "old": OLD},
+    **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
 }
 """What a network's weights depend on; ``version`` is raised when entries change their meaning."""
 
@@ -55,7 +55,7 @@ class Sight(NamedTuple):
 
     slots: np.ndarray  # (2, N, 2) of formation and column around the desired centroid [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
-    edges: np.ndarray  # (BINS + 1,) of the lanes' time bins [s]
+    edges: np.ndarray  # (LANE_BINS + 1,) of the lanes' time bins [s]
     length: float  # d_OA [m]
     time: float  # T [s]
     is_column: np.ndarray  # (C,) bool, commands that end in the column
@@ -97,7 +97,7 @@ def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
 @compiled
 def _fill_features(sight, column, time, position, clearance, age, obstacles, features):
     """:func:`sense_features` into ``features`` (B, N, F); ``column`` (B, N) bool, the rest as in an observation."""
-    slot, lane = np.empty(2), np.empty(BINS)
+    slot, lane = np.empty(2), np.empty(LANE_BINS)
     for b in range(position.shape[0]):
         for i in range(position.shape[1]):
             row = features[b, i]
@@ -106,30 +106,30 @@ def _fill_features(sight, column, time, position, clearance, age, obstacles, fea
                     centre = sight.path[0, axis] + time[b] * sight.path[1, axis]
                     slot[axis] = centre + sight.slots[which, i, axis]
                 fill_lane(slot, sight, obstacles[b], lane)
-                for k in range(BINS):
-                    row[which * BINS + k] = lane[k]
+                for k in range(LANE_BINS):
+                    row[which * LANE_BINS + k] = lane[k]
                 row[LANES + which] = way_clearance(position[b, i], slot, sight.length, obstacles[b])
                 error = np.sqrt((position[b, i, 0] - slot[0]) ** 2 + (position[b, i, 1] - slot[1]) ** 2) / sight.length
                 row[WAYS + 2 * which] = np.tanh(error)
-                row[WAYS + 2 * which + 1] = np.tanh(error / FAR)
-            row[COLUMN] = 1.0 if column[b, i] else 0.0
-            row[AGES] = 1.0 - np.exp(-age[b, i] / (FAR * sight.time))
-            row[AGES + 1] = 1.0 - np.exp(-age[b, i] / (OLD * sight.time))
-            row[OWN] = _beyond(clearance[b, i], sight.length)
+                row[WAYS + 2 * which + 1] = np.tanh(error / COARSE)
+            row[COLUMN_ENTRY] = 1.0 if column[b, i] else 0.0
+            row[AGE_ENTRIES] = 1.0 - np.exp(-age[b, i] / (COARSE * sight.time))
+            row[AGE_ENTRIES + 1] = 1.0 - np.exp(-age[b, i] / (COARSEST * sight.time))
+            row[CLEARANCE_ENTRY] = _beyond(clearance[b, i], sight.length)
 
 
 @allocation_free
 def _beyond(clearance, length):
     """A clearance [m] as what it has beyond d_OA = ``length`` [m], clipped, in d_OA."""
-    return min(max(clearance / length - 1.0, NEAREST), FARTHEST)
+    return min(max(clearance / length - 1.0, LEAST_BEYOND), MOST_BEYOND)
 
 
 @allocation_free
 def fill_lane(slot, sight, obstacles, lane):
-    """Profile of the lane of a slot that is at ``slot`` (2,) [m] now, into ``lane`` (BINS,) [d_OA]."""
-    for k in range(BINS):
-        lane[k] = FARTHEST
-    reach = (1.0 + FARTHEST) * sight.length
+    """Profile of the lane of a slot that is at ``slot`` (2,) [m] now, into ``lane`` (LANE_BINS,) [d_OA]."""
+    for k in range(LANE_BINS):
+        lane[k] = MOST_BEYOND
+    reach = (1.0 + MOST_BEYOND) * sight.length
     for o in range(obstacles.shape[0]):
         x, y = slot[0] - obstacles[o, 0], slot[1] - obstacles[o, 1]
         u, w = sight.path[1, 0], sight.path[1, 1]
@@ -140,7 +140,7 @@ def fill_lane(slot, sight, obstacles, lane):
         aside = np.sqrt((x + when * u) ** 2 + (y + when * w) ** 2)
         if aside - obstacles[o, 2] >= reach:
             continue
-        for k in range(BINS):
+        for k in range(LANE_BINS):
             t = min(max(when, sight.edges[k]), sight.edges[k + 1])
             distance = np.sqrt(aside * aside + square * (t - when) ** 2)
             lane[k] = min(lane[k], _beyond(distance - obstacles[o, 2], sight.length))
@@ -171,13 +171,13 @@ def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
     count = np.maximum(known.sum(axis=2), 1)
     counted = heard.copy()
     np.less(heard[..., :WAYS], 0.0, out=counted[..., :WAYS])
-    changing = slice(WAYS, AGES + 2)
+    changing = slice(WAYS, AGE_ENTRIES + 2)
     parts = (
-        np.where(known, heard, np.float32(FARTHEST)).min(axis=2),
+        np.where(known, heard, np.float32(MOST_BEYOND)).min(axis=2),
         np.where(known, counted, np.float32(0.0)).sum(axis=2) / count,
         np.where(known, heard[..., changing], np.float32(0.0)).max(axis=2),
         count / heard.shape[2],
-        1.0 - np.exp(-np.where(known, age[..., None], 0.0).max(axis=2) / FAR),
+        1.0 - np.exp(-np.where(known, age[..., None], 0.0).max(axis=2) / COARSE),
     )
     return np.concatenate(parts, axis=-1, dtype=np.float32)
 

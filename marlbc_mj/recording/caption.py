@@ -69,7 +69,7 @@ class Caption:
         frame = Image.new("RGB", (self.width, self.height), PAPER)
         image = Image.fromarray(np.ascontiguousarray(picture))
         if self.badges:
-            _badge(image, labels, round(13 * self.scale))
+            _badge(image, labels, max(2, round(13 * self.scale)))
         else:
             _number(image, labels, radii)
         commands = tuple(self.log.commands[k] for k in self.log.command[step])

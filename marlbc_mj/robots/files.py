@@ -61,7 +61,7 @@ def check_files(path: Path) -> None:
                 if key.startswith("file") and value:
                     named += 1
                     _locate(path, folder, source, value)
-        _check_copies(path, source.root, 1)
+        _check_copies(path, source.root)
         if named > _MOST_FILES:
             raise ConfigurationError(f"{path} names more than {_MOST_FILES} files")
 
@@ -163,11 +163,13 @@ def _number(text: str) -> float:
         return 0.0
 
 
-def _check_copies(path: Path, element: ElementTree.Element, copies: float) -> None:
+def _check_copies(path: Path, root: ElementTree.Element) -> None:
     """Raise ConfigurationError where nested elements with a count multiply beyond _MOST_COPIES."""
-    if element.tag in ("replicate", "composite", "flexcomp"):
-        copies *= prod(max(_number(part), 1.0) for part in element.get("count", "1").split())
-        if copies > _MOST_COPIES:
-            raise ConfigurationError(f"{path}: {element.tag} makes {copies:g} copies; at most {_MOST_COPIES} are accepted")
-    for child in element:
-        _check_copies(path, child, copies)
+    waiting = [(root, 1.0)]
+    while waiting:
+        element, copies = waiting.pop()
+        if element.tag in ("replicate", "composite", "flexcomp"):
+            copies *= prod(max(1.0, _number(part)) for part in element.get("count", "1").split())
+            if copies > _MOST_COPIES:
+                raise ConfigurationError(f"{path}: {element.tag} makes {copies:g} copies; at most {_MOST_COPIES} are accepted")
+        waiting += [(child, copies) for child in element]

@@ -4,6 +4,7 @@ What plain MuJoCo loads is loaded; what the text means is not changed. Files tha
 keyframes, lights, skins and custom texts are left out, and names get no slash, which dm_control keeps for itself.
 """
 
+import signal
 import subprocess
 import sys
 import warnings
@@ -22,12 +23,14 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import beside
 from marlbc_mj.util.text import one_line
 
-_TRIAL_TIME = 60.0  # that compiling a robot may take [s]
+_TRIAL_TIME = 60.0  # that compiling a robot may take by the clock [s]
+_TRIAL_CPU = 5  # that compiling it and two steps may take of a processor [s]
 _TRIAL_MEMORY = 8 * 2**30  # address space that it may take [bytes]
 _TRIAL = """
 import resource, sys
 resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}))
 resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+resource.setrlimit(resource.RLIMIT_CPU, ({cpu}, {cpu} + 1))
 import mujoco
 mujoco.set_mju_user_warning(lambda text: None)
 try:
@@ -69,7 +72,9 @@ def _standard_text(path: Path, place: Path, state: tuple[tuple[str, int, int], .
         try:
             embed(spec)
             spec.compile()
-            return _tidy(spec.to_xml())
+            text = _tidy(spec.to_xml())
+            mujoco.MjSpec.from_string(text).compile()
+            return text
         except (ValueError, mujoco.FatalError) as error:
             raise ConfigurationError(f"{path} cannot be made one text: {one_line(error)}") from error
 
@@ -86,11 +91,15 @@ def _try_out(path: Path) -> None:
     """
     if not sys.executable:  # Python is embedded in another program
         return
-    command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY), str(path)]
+    command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY, cpu=_TRIAL_CPU), str(path)]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_TIME, cwd=path.resolve().parent)
     except subprocess.TimeoutExpired as error:
         raise ConfigurationError(f"{path} takes more than {_TRIAL_TIME:g} s to compile") from error
+    if done.returncode == -signal.SIGXCPU:
+        raise ConfigurationError(
+            f"{path} takes more than {_TRIAL_CPU} s of a processor to compile and make two steps; simplify it"
+        )
     if done.returncode < 0:
         raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-done.returncode}); simplify the file")
     if done.returncode not in (0, 3):

@@ -97,7 +97,7 @@ class Walls:
         along = np.linspace(first, last, int(np.ceil((last - first) / (2.0 * self.radius))) + 1)[1:]
         places = [(first, middle + sign * y) for sign in (1.0, -1.0) for y in across]
         places += [(x, middle + sign * side) for sign in (1.0, -1.0) for x in along]
-        return np.array([(x, y, self.radius) for x, y in places])
+        return np.array([(x, y, self.radius) for x, y in places]).reshape(-1, 3)  # none, where an opening takes the whole width
 
 
 @dataclass(frozen=True)

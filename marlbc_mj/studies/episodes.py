@@ -15,7 +15,7 @@ from marlbc_mj.episode import Frame, Trajectory, run_episode
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.results.summary import Result, method_key
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors import Decision, Supervisor, make_supervisor
+from marlbc_mj.supervisors import Decision, Supervisor, ask_supervisor, make_supervisor, start_supervisor
 from marlbc_mj.util.errors import MarlbcError, SimulationError
 from marlbc_mj.util.progress import Progress, silent
 
@@ -50,7 +50,7 @@ class Stopwatch:
     def __init__(self, supervisor: Supervisor, scenario: Scenario) -> None:
         self.supervisor = supervisor
         self.solver_ms: list[float] = []
-        self.memory: list[Any] = [supervisor.start(scenario, 1)]
+        self.memory: list[Any] = [start_supervisor(supervisor, scenario, 1)]
 
     def start(self, scenario: Scenario, teams: int) -> Any:
         """The supervisor's memory."""
@@ -58,7 +58,7 @@ class Stopwatch:
 
     def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
         """The supervisor's orders."""
-        orders, memory = self.supervisor.decide(observation, memory)
+        orders, memory = ask_supervisor(self.supervisor, observation, memory)
         spent = getattr(memory, "solver_ms", None)
         if spent is not None:
             self.solver_ms.append(float(spent))

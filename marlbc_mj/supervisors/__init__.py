@@ -6,7 +6,7 @@ from pathlib import Path
 
 from marlbc_mj.policies.general import is_general
 from marlbc_mj.policies.shipped import shipped
-from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, carry_out
+from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, ask_supervisor, carry_out, start_supervisor
 from marlbc_mj.supervisors.cbf_qp import CBFQP
 from marlbc_mj.supervisors.distributed_lookahead import DistributedLookAhead
 from marlbc_mj.supervisors.fixed import FixedPriority
@@ -137,7 +137,9 @@ __all__ = [
     "Scripted",
     "SetBasedRule",
     "Supervisor",
+    "ask_supervisor",
     "batched",
     "carry_out",
     "make_supervisor",
+    "start_supervisor",
 ]

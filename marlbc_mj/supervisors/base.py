@@ -7,7 +7,8 @@ import numpy as np
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.modules import guarded
 
 
 class Blend(NamedTuple):
@@ -51,6 +52,29 @@ class OneTeamSupervisor(Protocol):
     def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
         """Orders (N,) for an :meth:`Observation.team`, alone or with velocities (N, 2); and the memory for the next call."""
         ...
+
+
+def start_supervisor(supervisor: Supervisor, scenario: Scenario, teams: int) -> Any:
+    """Memory of B ``teams`` at the start of an episode.
+
+    Raises:
+        ConfigurationError: the supervisor does not suit the scenario, or its ``start`` fails.
+    """
+    return guarded(lambda: supervisor.start(scenario, teams), f"supervisor {type(supervisor).__name__}: start()")
+
+
+def ask_supervisor(supervisor: Supervisor | OneTeamSupervisor, observation: Observation, memory: Any) -> tuple[Decision, Any]:
+    """A supervisor's decision, which :func:`split_decision` checks, and its memory.
+
+    Raises:
+        ConfigurationError: it does not return these two.
+        SimulationError: it raises an error.
+    """
+    name = type(supervisor).__name__
+    answer: Any = guarded(lambda: supervisor.decide(observation, memory), f"supervisor {name}: decide()", SimulationError)
+    if not isinstance(answer, tuple) or len(answer) != 2 or isinstance(answer, Blend):
+        raise ConfigurationError(f"supervisor {name}: decide() must return (orders, memory), got {type(answer).__name__}")
+    return answer
 
 
 def split_decision(decision: Decision, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:

@@ -8,8 +8,9 @@ import numpy as np
 
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, split_decision
+from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, ask_supervisor, split_decision
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.modules import guarded
 
 
 class Memories(NamedTuple):
@@ -27,7 +28,8 @@ class OneTeam:
 
     def start(self, scenario: Scenario, teams: int) -> Memories:
         """One memory per team."""
-        return Memories(tuple(self.supervisor.start(scenario) for _ in range(teams)))
+        what = f"supervisor {type(self.supervisor).__name__}: start()"
+        return Memories(tuple(guarded(lambda: self.supervisor.start(scenario), what) for _ in range(teams)))
 
     def decide(self, observation: Observation, memory: Memories) -> tuple[Decision, Memories]:
         """The decisions of all teams, stacked.
@@ -35,7 +37,7 @@ class OneTeam:
         Raises:
             ConfigurationError: a decision of wrong shape or type, or velocities for some teams only.
         """
-        answers = [self.supervisor.decide(observation.team(b), own) for b, own in enumerate(memory.teams)]
+        answers = [ask_supervisor(self.supervisor, observation.team(b), own) for b, own in enumerate(memory.teams)]
         decisions, memories = zip(*answers, strict=True)
         return stack_decisions(decisions, observation.position.shape[1]), Memories(memories, _total(memories))
 
@@ -62,7 +64,14 @@ def _total(memories: tuple[object, ...]) -> float | None:
 
 
 def batched(supervisor: Supervisor | OneTeamSupervisor) -> Supervisor:
-    """The supervisor itself, or :class:`OneTeam` around it where its ``start`` takes the scenario alone."""
+    """The supervisor itself, or :class:`OneTeam` around it where its ``start`` takes the scenario alone.
+
+    Raises:
+        ConfigurationError: an object without ``start`` and ``decide``.
+    """
+    lacking = [each for each in ("start", "decide") if not callable(getattr(supervisor, each, None))]
+    if lacking:
+        raise ConfigurationError(f"a supervisor has start and decide; {type(supervisor).__name__} lacks {', '.join(lacking)}")
     if len(inspect.signature(supervisor.start).parameters) > 1:
         return cast(Supervisor, supervisor)
     return OneTeam(cast(OneTeamSupervisor, supervisor))

@@ -10,13 +10,16 @@ from contextlib import suppress
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
+from traceback import extract_tb
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError
 from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
+_PACKAGE = Path(__file__).parents[1]
+_Result = TypeVar("_Result")
 _PREFIX = "marlbc_user_"
 _LONGEST_PLACE = 160  # of a module's name: file names of the cache of compiled code hold it
 _MOST_BESIDE = 500
@@ -57,9 +60,11 @@ def load_module(path: Path) -> ModuleType:
     """
     try:
         path = path.resolve()
+        if path.exists() and not path.is_file():
+            raise ConfigurationError(f"cannot read {path}: it is not a file")
         content = path.read_bytes()
-    except OSError as error:
-        raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
+    except (OSError, RuntimeError) as error:  # a link that leads to itself is a RuntimeError
+        raise ConfigurationError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
     name = _module_name(path)
     stamp = zlib.crc32(content), beside(path, _SUFFIX)
     known = sys.modules.get(name)
@@ -128,20 +133,39 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
                 del sys.modules[name]
 
 
-def guarded(call: Callable[[], Any], what: str) -> Any:
+def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:
     """What a user's code returns.
 
+    Args:
+        call: the user's code.
+        what: its name, for the message.
+        kind: what is raised if it fails.
+
     Raises:
-        ConfigurationError: it raises anything else than an error of this package, or ends the process.
+        MarlbcError: of this ``kind``: it raises anything else than an error of this package, or ends the process.
     """
     try:
         return call()
     except MarlbcError:
         raise
-    except SystemExit as error:
-        raise ConfigurationError(f"{what} fails: it calls sys.exit({error.code!r})") from error
-    except Exception as error:
-        raise ConfigurationError(f"{what} fails: {type(error).__name__}: {one_line(error)}") from error
+    except (Exception, SystemExit) as error:
+        raise kind(f"{what} fails: {blame(error)}") from error
+
+
+def blame(error: BaseException) -> str:
+    """An error of a user's code in one line: its kind, what it says, and the user's line that it comes from."""
+    if isinstance(error, SystemExit):
+        said = f"it calls sys.exit({error.code!r})"
+    else:
+        said = f"{type(error).__name__}: {one_line(error)}".removesuffix(": ")
+    own = [frame for frame in extract_tb(error.__traceback__) if _is_users(frame.filename)]
+    return f"{said} ({Path(own[-1].filename).name}, line {own[-1].lineno})" if own else said
+
+
+def _is_users(file: str) -> bool:
+    """Whether a file is neither Python's, nor of an installed package, nor of this one."""
+    inside = any(Path(file).is_relative_to(folder) for folder in (sys.prefix, sys.base_prefix, _PACKAGE))
+    return not inside and not file.startswith("<")
 
 
 def made(name: str, kind: type) -> Any:

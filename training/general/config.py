@@ -5,7 +5,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.policies.general_inputs import BINS, FEATURES, INPUTS, LANES
+from marlbc_mj.policies.general_inputs import LANE_BINS, FEATURES, INPUTS, LANES
 from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario
 from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.training.config import TrainConfig, make_config
@@ -196,7 +196,7 @@ def input_mask(config: GeneralConfig) -> np.ndarray | None:
         if name == "pooled":
             mask[:, FEATURES:] = 0.0
             continue
-        first, last = {"lanes": (0, LANES), "column-lane": (BINS, LANES), "ways": (LANES, LANES + 2)}[name]
+        first, last = {"lanes": (0, LANES), "column-lane": (LANE_BINS, LANES), "ways": (LANES, LANES + 2)}[name]
         for offset in offsets:
             mask[:, offset + first : offset + last] = 0.0
     return mask
