@@ -1,0 +1,111 @@
+"""Many layouts of many missions: the few numbers that are kept of each layout, and what they say of a supervisor there.
+
+A *cell* is one supervisor on one mission, under one composition, with a shield or without.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.results.outcomes import MissionOutcome, intervened, outcome
+from marlbc_mj.results.scores import SCORES
+from marlbc_mj.results.seeds import SeedRun
+from marlbc_mj.results.statistics import Estimate, bootstrap, rate
+from marlbc_mj.scenarios import Scenario
+
+
+class Cell(NamedTuple):
+    """One supervisor on one mission."""
+
+    mission: str
+    composition: str
+    shield: bool
+    supervisor: str
+
+
+class LayoutMark(NamedTuple):
+    """What is kept of one layout."""
+
+    seed: int
+    outcome: MissionOutcome
+    intervened: bool
+    total: float = np.nan  # return
+    switches: int = 0  # of all agents
+    effort: float = np.nan  # of all agents [N s]
+    failure: str = ""
+
+
+def mark(run: SeedRun, scenario: Scenario) -> LayoutMark:
+    """What is kept of one layout."""
+    ended, metrics = outcome(run.metrics, scenario), run.metrics
+    if metrics is None:
+        return LayoutMark(run.seed, ended, False, failure=str(run.failure))
+    return LayoutMark(
+        run.seed,
+        ended,
+        intervened(metrics),
+        SCORES["return"].read(metrics),
+        sum(agent["switches"] for agent in metrics["agents"]),
+        SCORES["effort_integral_sum"].read(metrics),
+    )
+
+
+class Marks(NamedTuple):
+    """The result of a job."""
+
+    cell: Cell
+    layouts: tuple[LayoutMark, ...]
+    decision_ms: float  # median of the first layout flown alone: what one team takes for a decision [ms]
+
+
+class CellScores(NamedTuple):
+    """What a table says of a cell. Rates count a failure against the supervisor, medians leave it out."""
+
+    cell: Cell
+    layouts: int
+    failed: int
+    success: Estimate
+    reached: Estimate
+    violation: Estimate
+    struck: Estimate
+    collided: Estimate
+    intervention: Estimate
+    total: Estimate  # median return
+    switches: float  # median, of all agents
+    effort: float  # median, of all agents [N s]
+    decision_ms: float
+    reason: str  # of the first failure
+
+    @classmethod
+    def of(cls, cell: Cell, parts: Sequence[Marks]) -> "CellScores":
+        """From the jobs of one cell."""
+        layouts = [layout for part in parts for layout in part.layouts]
+        flown = [layout for layout in layouts if not layout.failure]
+        ended = [layout.outcome for layout in layouts]
+        times = [part.decision_ms for part in parts if np.isfinite(part.decision_ms)]
+        return cls(
+            cell,
+            len(layouts),
+            len(layouts) - len(flown),
+            rate([one.success for one in ended]),
+            rate([one.reached for one in ended]),
+            rate([one.violated for one in ended]),
+            rate([one.struck for one in ended]),
+            rate([one.collided for one in ended]),
+            rate([layout.intervened for layout in layouts]),
+            bootstrap([np.array([layout.total for layout in flown])]),
+            _median([layout.switches for layout in flown]),
+            _median([layout.effort for layout in flown]),
+            _median(times),
+            next((layout.failure for layout in layouts if layout.failure), ""),
+        )
+
+    @property
+    def refused(self) -> bool:
+        """Whether no layout was flown to its end."""
+        return self.failed == self.layouts
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else float("nan")
