@@ -6,12 +6,7 @@ from typing import Annotated
 
 from tyro.conf import subcommand
 
-<<<<<<< HEAD
-from marlbc_mj import __version__
 from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, SafetyCommand
-=======
-from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand
->>>>>>> main
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand

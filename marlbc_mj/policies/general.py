@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general_inputs import INPUTS, INPUT_LAYOUT, Sight, join_inputs
+from marlbc_mj.policies.general_inputs import INPUT_LAYOUT, INPUTS, Sight, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError

@@ -5,7 +5,7 @@ from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.policies.general_inputs import LANE_BINS, FEATURES, INPUTS, LANES
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
 from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario
 from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.training.config import TrainConfig, make_config

@@ -103,7 +103,7 @@ class GeneralTrainer:
             final=np.concatenate([outcome.final.reshape(-1, INPUTS) for outcome in outcomes]),
             action=np.concatenate([squad.last.reshape(-1, 1) for squad in self.squads]),
             reward=np.concatenate([outcome.reward.reshape(-1, 1) for outcome in outcomes]),
-            leniency=np.full((rows, 1), leniency(np.float64(temperature)), dtype=np.float32),
+            leniency=leniency(np.full((rows, 1), temperature)).astype(np.float32),
             lost=np.zeros((rows, 1), dtype=bool),
             code=np.zeros(rows, dtype=np.int64),
             ended=np.concatenate([np.repeat(o.ended, o.reward.shape[1]) for o in outcomes]),
