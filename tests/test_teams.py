@@ -22,6 +22,8 @@ AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
 PAPER = paper()
 FM, FR = (PAPER.orders.index(name) for name in ("FM", "FR"))
 QUICK = tuple(name for name in SUPERVISORS if name not in ("mpcms-mujoco", "oracle"))
+NEEDS = {"marlms-general": {"composition": "set-based"}}
+"""What supervisors ask of a scenario."""
 
 
 def bits(decision) -> list[bytes]:
@@ -54,7 +56,7 @@ def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> 
 @pytest.mark.parametrize("name", [name for name in QUICK if name != "oracle-schedule"])
 def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
     """Five draws of a whole episode of 25 s, past the first point; of 8 s where a decision takes long."""
-    world = World(paper(perturbation=AROUND, duration=8.0 if name == "mpcms" else 25.0), worlds=TEAMS)
+    world = World(paper(perturbation=AROUND, duration=8.0 if name == "mpcms" else 25.0, **NEEDS.get(name, {})), worlds=TEAMS)
     world.reset(4)
     assert_teams_are_alone(make_supervisor(name), world, world.scenario.mission_steps)
 
@@ -62,7 +64,7 @@ def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
 @pytest.mark.parametrize("name", QUICK)
 def test_teams_may_be_at_different_steps_of_the_mission(name):
     """Five places of the case study, under PD; decisions that hold for an interval hold for each team's own."""
-    world = World(paper(perturbation=AROUND), PD(), worlds=TEAMS)
+    world = World(paper(perturbation=AROUND, **NEEDS.get(name, {})), PD(), worlds=TEAMS)
     world.reset(1)
     for b, step in enumerate((0, 353, 862, 1057, 1621)):
         slots = np.array(PAPER.path_origin) + 0.05 * step * np.array(PAPER.path_velocity) + PAPER.formations[b % 2]

@@ -93,7 +93,7 @@ class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
     By default scripted runs with every controller, and every supervisor with sorlc but those that are to be named: mpcms-mujoco,
-    oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca and cbf-qp.
+    oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca, cbf-qp and marlms-general.
     """
 
     scenario: Positional[str] = "paper"

@@ -18,6 +18,7 @@ def selectable() -> dict[str, dict[str, str]]:
     from marlbc_mj.scenarios.formations import FORMATIONS
     from marlbc_mj.supervisors import SUPERVISORS
     from marlbc_mj.training.config import PRESETS
+    from marlbc_mj.training.general.config import GENERAL, GENERAL_SUMMARY
     from marlbc_mj.training.methods import METHODS
 
     return {
@@ -29,7 +30,7 @@ def selectable() -> dict[str, dict[str, str]]:
         "compositions": dict(zip(COMPOSITIONS, _COMPOSITIONS, strict=True)),
         "reference modes": dict(zip(REFERENCE_MODES, _REFERENCES, strict=True)),
         "disturbances": {name: line for name, (_, line) in DISTURBANCES.items()},
-        "training methods": {name: line for name, (_, line) in METHODS.items()},
+        "training methods": {name: line for name, (_, line) in METHODS.items()} | {GENERAL: GENERAL_SUMMARY},
         "training presets": {name: line for name, (_, line) in PRESETS.items()},
         "robots": {name: line for name, (_, line) in ROBOTS.items()},
     }

@@ -13,12 +13,16 @@ class ShipCommand:
     run_folder: Positional[Path]
     """Folder of the training run."""
     name: Positional[str]
-    """Name that the supervisor gets: marlms, rlms."""
+    """Name that the supervisor gets: marlms, rlms, marlms-general."""
     overwrite: bool = False
     """Replace the one that is there."""
 
     def run(self) -> None:
         """Copy, write the card, say where."""
+        from marlbc_mj.policies.general import is_general
+        from marlbc_mj.training.general.shipping import ship_general
         from marlbc_mj.training.ship import ship
 
-        print(ship(self.run_folder, self.name, overwrite=self.overwrite))
+        best = self.run_folder / "checkpoint" / "best.safetensors"
+        put = ship_general if is_general(best) else ship
+        print(put(self.run_folder, self.name, overwrite=self.overwrite))

@@ -160,3 +160,20 @@ def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
             bars.update(task, completed=trainer.steps, total=trainer.config.budget, rate=rate, last=last)
 
         yield update
+
+
+@contextmanager
+def general_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
+    """A line per evaluation of a run of the general policy: success rate and median return of each family."""
+    seen = -1.0
+
+    def update(trainer: Any, row: dict[str, float]) -> None:
+        nonlocal seen
+        if row["mission_steps"] == seen:
+            return
+        seen = row["mission_steps"]
+        families = [name.removeprefix("success_") for name in row if name.startswith("success_")]
+        cells = [f"{name} {100 * row[f'success_{name}']:.0f} % {row[f'return_{name}']:.0f}" for name in families]
+        print(f"{seen / 1e6:6.2f} M steps {row['wall_s']:6.0f} s  " + "  ".join(cells), file=sys.stderr, flush=True)
+
+    yield update

@@ -11,6 +11,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
     from marlbc_mj.training.config import TrainConfig
+    from marlbc_mj.training.general.config import GeneralConfig
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,11 @@ class TrainCommand:
         """Train with a progress display; an interrupted run says how to continue it."""
         from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
+        from marlbc_mj.training.general.config import GENERAL
 
+        if self.method == GENERAL and self.resume is None:
+            self.run_general()
+            return
         with training_display() as progress:
             if self.resume is not None:
                 self.refuse_others()
@@ -62,6 +67,38 @@ class TrainCommand:
         )
         print(f"{folder / 'checkpoint'} holds the best and the last policy")
 
+    def run_general(self) -> None:
+        """Train the policy for every team; an interrupted run leaves the policy that it had."""
+        from marlbc_mj.cli.terminal import general_display
+        from marlbc_mj.training.general.run import judged_rank, train_general
+        from marlbc_mj.training.run import Interrupted
+
+        config = self.general_config()
+        folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
+        with general_display() as progress:
+            ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
+        if isinstance(ended, Interrupted):
+            print(f"marlbc: stopped; {folder / 'checkpoint'} holds the best and the last policy so far", file=sys.stderr)
+            sys.exit(128 + ended.signal)
+        best = max(ended, key=judged_rank)
+        rates = ", ".join(f"{k.removeprefix('success_')} {100 * v:.4g} %" for k, v in best.items() if k.startswith("success_"))
+        print(f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps: success {rates}")
+        print(f"{folder / 'checkpoint'} holds the best and the last policy")
+
+    def general_config(self) -> "GeneralConfig":
+        """The settings of the policy for every team, with the command line's changes.
+
+        Raises:
+            ConfigurationError: an option that this method does not have.
+        """
+        from marlbc_mj.training.general.config import GeneralConfig
+        from marlbc_mj.util.changes import with_settings
+
+        if self.preset != "fast" or self.device is not None:
+            raise ConfigurationError(f"{self.method} has neither presets nor devices; leave out --preset and --device")
+        given = {name: getattr(self, name) for name in ("budget", "threads") if getattr(self, name) is not None}
+        return with_settings(GeneralConfig(seed=self.seed, **given), self.set)
+
     def refuse_others(self) -> None:
         """A resumed run has its own settings.
 
@@ -76,11 +113,12 @@ class TrainCommand:
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""
         from marlbc_mj.training.config import make_config
+        from marlbc_mj.training.general.config import GENERAL
         from marlbc_mj.training.methods import METHODS
         from marlbc_mj.util.changes import with_settings
 
         if self.method not in METHODS:
-            raise unknown("method", self.method, METHODS)
+            raise unknown("method", self.method, (*METHODS, GENERAL))
         given = {name: getattr(self, name) for name in ("budget", "threads", "device") if getattr(self, name) is not None}
         changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **given}
         config = make_config(self.preset, **changes)

@@ -86,7 +86,7 @@ class CommunicationStudy:
         return [DrawsJob(scenario, self.supervisor, self.controller, self.seeds, self.shield) for scenario in flown]
 
     def run(self, job: DrawsJob, watch: Watch) -> list[Metrics | None]:
-        return fly_together(job)
+        return _fly_together(job)
 
     def report(self, results: Sequence[list[Metrics | None]], out: Path | None, progress: Progress = silent) -> Report:
         rows = [case_row(mission, case, metrics) for (mission, case), metrics in zip(self.pairs(), results, strict=True)]
@@ -100,7 +100,7 @@ class CommunicationStudy:
         return Report(to_markdown(case_table(rows)))
 
 
-def fly_together(job: DrawsJob) -> list[Metrics | None]:
+def _fly_together(job: DrawsJob) -> list[Metrics | None]:
     """Metrics of every seed, in one batch; None for a run that failed. One by one where a world diverged, to tell which."""
     law = make_controller(job.controller)
     world = World(job.scenario, law, worlds=len(job.seeds), record=True, shield=job.shield)

@@ -31,7 +31,7 @@ CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
 
 
 @dataclass
-class Cell:
+class ShieldedMission:
     """What happened in the missions of one family and size."""
 
     missions: int = 0
@@ -55,9 +55,9 @@ def hostile_velocities(world: World, targets: np.ndarray) -> np.ndarray:
     return np.asarray(ATTACK_SPEED * way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-9))
 
 
-def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | bool | None = True) -> Cell:
+def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | bool | None = True) -> ShieldedMission:
     """Missions of one scenario, each with its own draw; half of them attack, the others have orders at random."""
-    cell, rng = Cell(breaches=np.zeros(len(ASSUMPTIONS))), np.random.default_rng(seed)
+    cell, rng = ShieldedMission(breaches=np.zeros(len(ASSUMPTIONS))), np.random.default_rng(seed)
     for first in range(0, missions, TOGETHER):
         worlds = min(TOGETHER, missions - first)
         world = World(scenario, PD(), worlds=worlds, record=True, shield=shield)
@@ -66,7 +66,7 @@ def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | 
     return cell
 
 
-def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Cell) -> None:
+def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: ShieldedMission) -> None:
     scenario, shape = world.scenario, (world.worlds, world.scenario.agents)
     things = len(scenario.obstacles) + scenario.agents
     violated, touched = np.zeros((2, world.worlds), dtype=bool)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+from marlbc_mj.policies.general import is_general
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors.base import Blend, Decision, OneTeamSupervisor, Supervisor, ask_supervisor, carry_out, start_supervisor
 from marlbc_mj.supervisors.cbf_qp import CBFQP
@@ -12,6 +13,7 @@ from marlbc_mj.supervisors.fixed import FixedPriority
 from marlbc_mj.supervisors.fms import FMS
 from marlbc_mj.supervisors.frameworks import FuzzyBlend, Layered, MotorSchema
 from marlbc_mj.supervisors.fsams import FSAMS
+from marlbc_mj.supervisors.general import General
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.supervisors.lookahead import LookAhead
 from marlbc_mj.supervisors.mpcms import MPCMS
@@ -50,6 +52,10 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
         lambda: Learned.load(shipped("rlms")),
         "RLMS: the shipped checkpoint of single-agent Q-networks side by side, formation with or without avoidance",
     ),
+    "marlms-general": (
+        lambda: General.load(shipped("marlms-general")),
+        "one shared network for every agent of every team, decided from what it senses and hears; set-based composition",
+    ),
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
     "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
@@ -68,7 +74,7 @@ LEARNED = ("marlms", "rlms")
 """Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
 LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "orca", "cbf-qp")
 """Supervisors for layouts that nobody has seen before, to be compared by ``marlbc evaluate``."""
-ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS)
+ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS, "marlms-general")
 """Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
 oracle itself where nothing is perturbed, the others are no part of the paper's comparison."""
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
@@ -94,7 +100,8 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
             raise ConfigurationError(f"{name} is no supervisor: {type(supervisor).__name__} lacks {', '.join(lacking)}")
         return batched(supervisor)
     if name.endswith(CHECKPOINT_SUFFIX):
-        return batched(Learned.load(Path(name)))
+        path = Path(name)
+        return batched(General.load(path) if is_general(path) else Learned.load(path))
     if name not in SUPERVISORS:
         raise unknown("supervisor", name, (*SUPERVISORS, "FILE.py:NAME", f"a checkpoint that ends in {CHECKPOINT_SUFFIX}"))
     factory = SUPERVISORS[name][0]
@@ -118,6 +125,7 @@ __all__ = [
     "DistributedLookAhead",
     "FixedPriority",
     "FuzzyBlend",
+    "General",
     "Layered",
     "Learned",
     "LookAhead",

@@ -213,7 +213,9 @@ def _tuple_hook(hint: Any, converter: BaseConverter) -> Hook:
 
 
 def _numbers_hook(hint: Any, converter: BaseConverter) -> Hook:
-    """For a text that becomes a tuple of whole numbers."""
+    """For a text that becomes a tuple of whole numbers, or of texts."""
+    if get_args(hint)[0] is str:
+        return lambda text, _: tuple(filter(None, text.split(",")))
 
     def structure(text: str, _: Any) -> tuple[int, ...]:
         try:

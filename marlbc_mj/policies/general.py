@@ -1,0 +1,145 @@
+"""The general policy: one network for every agent of every team, which decides between formation and column, agent by agent.
+
+Its inputs are in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one vector per decision and decides on what it sensed
+and what it has heard, however old, from however many; who has heard nothing decides by itself.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
+from marlbc_mj.policies.general_inputs import INPUT_LAYOUT, INPUTS, Sight, join_inputs
+from marlbc_mj.policies.greedy import Policy, greedy
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import write_json
+
+KIND = "general"
+"""What a checkpoint's header calls a policy of this kind."""
+FORMATION, COLUMN_ACTION = 0, 1
+"""The actions: form the formation, form the column."""
+ACTIONS_OF_AGENT = 2
+INTERVAL = 1.2
+"""Time for which a decision holds, in settling times."""
+
+
+class Sensed(NamedTuple):
+    """What B teams sensed at a decision, and what is in force."""
+
+    features: np.ndarray  # (B, N, F) float32
+    last: np.ndarray  # (B, N) actions in force
+    fresh: np.ndarray  # (B,) bool, no action is in force yet
+
+
+class GeneralPolicy(NamedTuple):
+    """A dueling network that all agents share, with a switching margin."""
+
+    network: Policy  # of one network, INPUTS wide, with two action values
+
+    def messages(self, features: np.ndarray) -> np.ndarray:
+        """(B, N, F) what each agent sends to the others: what it sensed."""
+        return features
+
+    def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """(B, N) actions: the better one if its value leads by more than the margin, else the one in force.
+
+        Args:
+            sensed: by each agent.
+            heard: (B, N, N, F) or (B, 1, N, F), see :func:`join_inputs`; row i is what agent i has heard of each agent.
+            age: (B, N, N) or (B, 1, N) of these [T]; infinite where nothing was heard.
+        """
+        inputs = join_inputs(sensed.features, heard, age)
+        values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], ACTIONS_OF_AGENT)
+        return greedy(values, sensed.last, sensed.fresh, self.network.margin)
+
+    def values(self, inputs: np.ndarray) -> np.ndarray:
+        """(M, 2) action values for inputs (M, S), one row per agent."""
+        return self.network.values(inputs)[:, 0]
+
+
+def decision_steps(scenario: Scenario, sight: Sight) -> int:
+    """Mission steps that a decision holds for."""
+    return max(1, round(INTERVAL * sight.time / scenario.mission_step))
+
+
+def motion_orders(scenario: Scenario) -> np.ndarray:
+    """(2,) index into ``scenario.orders`` of each action.
+
+    Raises:
+        ConfigurationError: an order is missing, or the composition does not avoid obstacles by itself.
+    """
+    if scenario.composition != "set-based":
+        raise ConfigurationError(
+            f"scenario {scenario.name!r} has composition {scenario.composition!r}; the general policy decides between formation "
+            "and column alone and needs the composition that avoids by itself: --composition set-based"
+        )
+    return np.array([scenario.orders.index(name) for name in scenario.formation_names])
+
+
+def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]) -> None:
+    """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
+    network = policy.network
+    arrays = {f"weight{k}": w for k, w in enumerate(network.weights)} | {f"bias{k}": b for k, b in enumerate(network.biases)}
+    said = {**description, "kind": KIND, "layout": INPUT_LAYOUT, "interval": INTERVAL, "margin": network.margin}
+    write_arrays(path, arrays, said)
+    write_json(path.with_suffix(".json"), said)
+
+
+def is_general(path: Path) -> bool:
+    """Whether a checkpoint holds a general policy.
+
+    Raises:
+        ConfigurationError: as :func:`~marlbc_mj.policies.checkpoint.read_arrays`.
+    """
+    return read_arrays(path)[1].get("kind") == KIND
+
+
+def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
+    """A policy and its description.
+
+    Raises:
+        ConfigurationError: as :func:`~marlbc_mj.policies.checkpoint.read_arrays`; a checkpoint of another kind, of other inputs
+            or interval, or whose arrays are no such network.
+    """
+    arrays, description = read_arrays(path)
+    if description.get("kind") != KIND:
+        raise ConfigurationError(f"checkpoint {path} does not hold a general policy, but one of a single team")
+    for name, wanted in (("layout", INPUT_LAYOUT), ("interval", INTERVAL)):
+        if description.get(name) != wanted:
+            raise ConfigurationError(
+                f"checkpoint {path} was trained on other inputs: its {name} is {description.get(name)}, this version's {wanted}"
+            )
+    layers = sum(name.startswith("weight") for name in arrays)
+    try:
+        weights = tuple(arrays[f"weight{k}"] for k in range(layers))
+        biases = tuple(arrays[f"bias{k}"] for k in range(layers))
+        margin = float(description["margin"])
+    except (KeyError, TypeError, ValueError):
+        raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy") from None
+    fault = _network_fault(weights, biases, margin)
+    if fault:
+        raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy: {fault}")
+    return make_general(weights, biases, margin), description
+
+
+def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
+    """The policy of one dueling network, weights (1, in, out) and biases (1, 1, out) of its layers."""
+    return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
+
+
+def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:
+    """The reason why arrays are no network for a general policy; empty if they are one."""
+    width = INPUTS
+    for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+        if weight.dtype != np.float32 or bias.dtype != np.float32 or weight.ndim != 3:
+            return f"layer {k} is not made of float32 matrices"
+        if weight.shape[:2] != (1, width) or bias.shape != (1, 1, weight.shape[2]):
+            return f"layer {k} has weights {weight.shape} and biases {bias.shape} for {width} inputs"
+        if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
+            return f"layer {k} is not finite"
+        width = weight.shape[2]
+    if not weights or width != 1 + ACTIONS_OF_AGENT:
+        return f"its {width} outputs are not a value and {ACTIONS_OF_AGENT} advantages"
+    return "" if np.isfinite(margin) else f"its margin is {margin}"

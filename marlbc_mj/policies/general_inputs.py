@@ -1,0 +1,191 @@
+"""What an agent of any team senses, sends and pools: inputs of the general policy (project).
+
+Everything is relative and free of scale: lengths count in safe distances d_OA, times in settling times
+T = d_OA / v_max + 1 / min(Lambda, alpha), the time in which a reference covers d_OA and settles. So a larger robot, a slower one
+and a team of another size all see the same numbers. An agent needs its own position, its two slots, the path and the obstacles
+around its lanes; no place on the map, no time and no list of obstacles are among the inputs.
+
+A *lane* is the way of a slot along the path. Its profile is the least clearance from obstacles, beyond d_OA, within each of a
+number of time bins around now; slot and obstacle both move in straight lines, so nothing is sampled.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.core.laws import allocation_free, compiled
+from marlbc_mj.engine.inequalities import make_barrier
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.errors import ConfigurationError
+
+EDGES = (-5.0, -2.5, 0.0, 2.0, 4.0, 6.0, 9.0, 12.0, 15.0, 18.0, 21.0, 24.0)
+"""Bounds of a lane's time bins, in settling times from now."""
+LANE_BINS = len(EDGES) - 1
+LEAST_BEYOND, MOST_BEYOND = -1.0, 3.0
+"""Clearances beyond d_OA are clipped to this range [d_OA]."""
+COARSE = 5.0
+"""The coarser of the two scales of slot errors, and of ages [d_OA], [T]."""
+COARSEST = 20.0
+"""The coarsest scale of ages [T]."""
+
+LANES = 2 * LANE_BINS
+"""Entries 0 to LANES - 1: the lanes of the formation's slot and of the column's."""
+WAYS = LANES + 2
+"""Entries up to WAYS - 1 are clearances: the lanes', then those of the straight ways to both slots."""
+ERRORS = WAYS + 4
+"""Entries from WAYS to ERRORS - 1: distances from both slots, each on two scales."""
+COLUMN_ENTRY, AGE_ENTRIES, CLEARANCE_ENTRY = ERRORS, ERRORS + 1, ERRORS + 3
+"""Entries after these: whether the agent is in the column, the age of that on two scales, and its clearance now."""
+FEATURES = CLEARANCE_ENTRY + 1
+"""F, entries that an agent senses; it sends all of them."""
+POOLED = 2 * FEATURES + (AGE_ENTRIES + 2 - WAYS) + 2
+"""Entries that are pooled of what was heard: minima, means, maxima of errors and ages, share heard, age of the oldest."""
+INPUTS = FEATURES + POOLED
+"""S, entries of a network's input."""
+INPUT_LAYOUT: dict[str, float | list[float]] = {
+    **{"version": 1, "features": FEATURES, "pooled": POOLED, "edges": list(EDGES)},
+    **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
+}
+"""What a network's weights depend on; ``version`` is raised when entries change their meaning."""
+
+
+class Sight(NamedTuple):
+    """What it takes to compute the features of one scenario's teams."""
+
+    slots: np.ndarray  # (2, N, 2) of formation and column around the desired centroid [m]
+    path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
+    edges: np.ndarray  # (LANE_BINS + 1,) of the lanes' time bins [s]
+    length: float  # d_OA [m]
+    time: float  # T [s]
+    is_column: np.ndarray  # (C,) bool, commands that end in the column
+
+
+def settling_time(scenario: Scenario) -> float:
+    """T = d_OA / v_max + 1 / min(Lambda, alpha) [s], v_max and alpha those of a set-based composition."""
+    barrier = make_barrier(scenario)
+    gains = [b.gain for b in scenario.behaviors if b.name in scenario.formation_names]  # type: ignore[attr-defined]
+    return float(scenario.safe_distance / barrier.speed + 1.0 / min(*gains, barrier.rate))
+
+
+def make_sight(scenario: Scenario) -> Sight:
+    """The :class:`Sight` of a scenario.
+
+    Raises:
+        ConfigurationError: a path that does not move, or a formation that is its own column.
+    """
+    path = np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64)
+    slots = np.ascontiguousarray(scenario.formations)
+    if not path[1].any():
+        raise ConfigurationError(f"scenario {scenario.name!r} has a path at rest: there are no lanes along it to look at")
+    if np.abs(slots[0] - slots[1]).max() < 1e-9:
+        first, second = scenario.formation_names
+        raise ConfigurationError(f"scenario {scenario.name!r} has no column: the slots of {second} are those of {first}")
+    unit = settling_time(scenario)
+    columns = [name.endswith(scenario.formation_names[1]) for name in scenario.orders.commands]
+    return Sight(slots, path, unit * np.array(EDGES), float(scenario.safe_distance), unit, np.array(columns))
+
+
+def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
+    """(B, N, F) float32: what each agent senses by itself, see the constants of this module for the entries."""
+    features = np.empty((*observation.position.shape[:2], FEATURES), dtype=np.float32)
+    arrays = observation.time, observation.position, observation.clearance, observation.age, observation.obstacles
+    _fill_features(sight, sight.is_column[observation.command], *map(np.ascontiguousarray, arrays), features)
+    return features
+
+
+@compiled
+def _fill_features(sight, column, time, position, clearance, age, obstacles, features):
+    """:func:`sense_features` into ``features`` (B, N, F); ``column`` (B, N) bool, the rest as in an observation."""
+    slot, lane = np.empty(2), np.empty(LANE_BINS)
+    for b in range(position.shape[0]):
+        for i in range(position.shape[1]):
+            row = features[b, i]
+            for which in range(2):
+                for axis in range(2):
+                    centre = sight.path[0, axis] + time[b] * sight.path[1, axis]
+                    slot[axis] = centre + sight.slots[which, i, axis]
+                fill_lane(slot, sight, obstacles[b], lane)
+                for k in range(LANE_BINS):
+                    row[which * LANE_BINS + k] = lane[k]
+                row[LANES + which] = way_clearance(position[b, i], slot, sight.length, obstacles[b])
+                error = np.sqrt((position[b, i, 0] - slot[0]) ** 2 + (position[b, i, 1] - slot[1]) ** 2) / sight.length
+                row[WAYS + 2 * which] = np.tanh(error)
+                row[WAYS + 2 * which + 1] = np.tanh(error / COARSE)
+            row[COLUMN_ENTRY] = 1.0 if column[b, i] else 0.0
+            row[AGE_ENTRIES] = 1.0 - np.exp(-age[b, i] / (COARSE * sight.time))
+            row[AGE_ENTRIES + 1] = 1.0 - np.exp(-age[b, i] / (COARSEST * sight.time))
+            row[CLEARANCE_ENTRY] = _beyond(clearance[b, i], sight.length)
+
+
+@allocation_free
+def _beyond(clearance, length):
+    """A clearance [m] as what it has beyond d_OA = ``length`` [m], clipped, in d_OA."""
+    return min(max(clearance / length - 1.0, LEAST_BEYOND), MOST_BEYOND)
+
+
+@allocation_free
+def fill_lane(slot, sight, obstacles, lane):
+    """Profile of the lane of a slot that is at ``slot`` (2,) [m] now, into ``lane`` (LANE_BINS,) [d_OA]."""
+    for k in range(LANE_BINS):
+        lane[k] = MOST_BEYOND
+    reach = (1.0 + MOST_BEYOND) * sight.length
+    for o in range(obstacles.shape[0]):
+        x, y = slot[0] - obstacles[o, 0], slot[1] - obstacles[o, 1]
+        u, w = sight.path[1, 0], sight.path[1, 1]
+        if obstacles.shape[1] > 3:
+            u, w = u - obstacles[o, 3], w - obstacles[o, 4]
+        square = u * u + w * w
+        when = -(x * u + y * w) / square if square > 0.0 else 0.0
+        aside = np.sqrt((x + when * u) ** 2 + (y + when * w) ** 2)
+        if aside - obstacles[o, 2] >= reach:
+            continue
+        for k in range(LANE_BINS):
+            t = min(max(when, sight.edges[k]), sight.edges[k + 1])
+            distance = np.sqrt(aside * aside + square * (t - when) ** 2)
+            lane[k] = min(lane[k], _beyond(distance - obstacles[o, 2], sight.length))
+
+
+@allocation_free
+def way_clearance(p, slot, length, obstacles):
+    """Least clearance on the straight way from ``p`` (2,) to ``slot`` (2,) [m] beyond d_OA = ``length`` [m], in d_OA."""
+    u, w = slot[0] - p[0], slot[1] - p[1]
+    square, least = u * u + w * w, np.inf
+    for o in range(obstacles.shape[0]):
+        x, y = p[0] - obstacles[o, 0], p[1] - obstacles[o, 1]
+        share = min(max(-(x * u + y * w) / square, 0.0), 1.0) if square > 0.0 else 0.0
+        least = min(least, np.sqrt((x + share * u) ** 2 + (y + share * w) ** 2) - obstacles[o, 2])
+    return _beyond(least, length)
+
+
+def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+    """(B, R, POOLED) float32 of what R receivers of B teams have heard; receivers may be one that stands for all.
+
+    Minima and means are over the senders heard so far; the means of clearances are shares of negative ones: of blocked lanes.
+
+    Args:
+        heard: (B, R, N, F) last feature vectors heard of each sender.
+        age: (B, R, N) how old they are [T]; infinite where nothing was heard.
+    """
+    known = np.isfinite(age)[..., None]
+    count = np.maximum(known.sum(axis=2), 1)
+    counted = heard.copy()
+    np.less(heard[..., :WAYS], 0.0, out=counted[..., :WAYS])
+    changing = slice(WAYS, AGE_ENTRIES + 2)
+    parts = (
+        np.where(known, heard, np.float32(MOST_BEYOND)).min(axis=2),
+        np.where(known, counted, np.float32(0.0)).sum(axis=2) / count,
+        np.where(known, heard[..., changing], np.float32(0.0)).max(axis=2),
+        count / heard.shape[2],
+        1.0 - np.exp(-np.where(known, age[..., None], 0.0).max(axis=2) / COARSE),
+    )
+    return np.concatenate(parts, axis=-1, dtype=np.float32)
+
+
+def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+    """(B, N, S) float32 inputs of the network: an agent's features (B, N, F), and what it heard, pooled.
+
+    ``heard`` (B, N, N, F) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, F) and (B, 1, N) where all hear all.
+    """
+    pooled = pool_heard(heard, age)
+    return np.concatenate([features, np.broadcast_to(pooled, (*features.shape[:2], POOLED))], axis=-1)

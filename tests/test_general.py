@@ -1,0 +1,350 @@
+"""The general policy: inputs without scale, pooling that takes what it gets, one network for all teams, and its training."""
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from marlbc_mj import World, make_scenario, paper
+from marlbc_mj.cli import main
+from marlbc_mj.core.communication import Communication
+from marlbc_mj.policies import general_inputs as inputs
+from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
+from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, read_general, write_general
+from marlbc_mj.policies.shipped import shipped
+from marlbc_mj.supervisors import General, make_supervisor
+from marlbc_mj.training.general.config import GeneralConfig, input_mask, read_team
+from marlbc_mj.training.general.judging import Judge
+from marlbc_mj.training.general.run import train_general
+from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.util.errors import ConfigurationError
+
+SMALL = GeneralConfig(budget=400, families=("field",), teams=("wedge-4",), worlds=2, hidden=(8,), updates=2, batch=16, layouts=1)
+
+
+def random_policy(seed: int = 0, margin: float = 0.0) -> GeneralPolicy:
+    rng = np.random.default_rng(seed)
+    sizes = [(inputs.INPUTS, 16), (16, 3)]
+    weights = tuple(rng.normal(size=(1, *size)).astype(np.float32) for size in sizes)
+    return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin)
+
+
+def field(**changes):
+    return make_scenario("field", composition="set-based", **changes)
+
+
+def sight_of(length: float, time: float, speed=(1.0, 0.3)) -> inputs.Sight:
+    """Slots, path and bins in units of ``length`` and ``time``."""
+    slots = length * np.random.default_rng(1).normal(scale=4.0, size=(2, 3, 2))
+    path = np.array([(0.0, 1.0), np.array(speed) / time]) * length
+    return inputs.Sight(slots, path, time * np.array(inputs.EDGES), length, time, np.array([False, True]))
+
+
+def sensed(sight: inputs.Sight, length: float, time: float, moving: bool) -> np.ndarray:
+    rng = np.random.default_rng(2)
+    obstacles = length * rng.uniform(-12.0, 12.0, size=(2, 6, 5))
+    obstacles[..., 2] = length * rng.uniform(0.0, 1.5, size=(2, 6))
+    obstacles[..., 3:] /= 8.0 * time
+    features = np.empty((2, 3, inputs.FEATURES), dtype=np.float32)
+    position, clearance = length * rng.normal(scale=5.0, size=(2, 3, 2)), length * rng.uniform(0.0, 5.0, size=(2, 3))
+    age = time * rng.uniform(0.0, 30.0, size=(2, 3))
+    shown = np.ascontiguousarray(obstacles if moving else obstacles[..., :3])
+    now = time * np.array([3.0, 7.0])
+    inputs._fill_features(sight, rng.random((2, 3)) < 0.5, now, position, clearance, age, shown, features)
+    return features
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize(("length", "time"), [(2.0, 1.0), (1.0, 3.0), (0.2, 0.5)])
+def test_features_have_no_scale(length: float, time: float, moving: bool) -> None:
+    """A mission of other lengths and times, all in proportion, looks the same."""
+    unit = sensed(sight_of(1.0, 1.0), 1.0, 1.0, moving)
+    np.testing.assert_allclose(sensed(sight_of(length, time), length, time, moving), unit, atol=2e-6)
+    assert np.ptp(unit[..., : inputs.WAYS]) > 1.0
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_a_lane_is_the_least_clearance_in_every_bin(seed: int) -> None:
+    """Against a thousand samples per bin."""
+    rng, sight = np.random.default_rng(seed), sight_of(1.5, 0.7)
+    obstacles = np.concatenate([rng.uniform(-15.0, 15.0, (5, 2)), rng.uniform(0.0, 2.0, (5, 1)), rng.normal(size=(5, 2))], axis=1)
+    slot, lane = rng.normal(scale=3.0, size=2), np.empty(inputs.LANE_BINS)
+    inputs.fill_lane(slot, sight, obstacles, lane)
+    for k in range(inputs.LANE_BINS):
+        t = np.linspace(sight.edges[k], sight.edges[k + 1], 1001)[:, None, None]
+        gap = np.linalg.norm(slot + t * sight.path[1] - obstacles[:, :2] - t * obstacles[:, 3:], axis=-1) - obstacles[:, 2]
+        wanted = np.clip(gap.min() / sight.length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
+        assert wanted - 1e-3 <= lane[k] + 1e-12 <= wanted + 2e-12
+
+
+def test_the_way_to_a_slot_sees_what_is_between() -> None:
+    obstacles = np.array([[5.0, 0.5, 0.25]])
+    at, slot = np.zeros(2), np.array([10.0, 0.0])
+    assert inputs.way_clearance(at, slot, 1.0, obstacles) == pytest.approx(-0.75)
+    assert inputs.way_clearance(at, at, 1.0, obstacles) == inputs.MOST_BEYOND
+    assert inputs.way_clearance(at, slot, 1.0, obstacles[:0]) == inputs.MOST_BEYOND
+
+
+def test_all_hearing_all_is_the_limit_of_hearing_each() -> None:
+    features = np.random.default_rng(0).normal(size=(3, 5, inputs.FEATURES)).astype(np.float32)
+    one = inputs.join_inputs(features, features[:, None], np.zeros((3, 1, 5)))
+    each = inputs.join_inputs(features, np.repeat(features[:, None], 5, axis=1), np.zeros((3, 5, 5)))
+    np.testing.assert_array_equal(one, each)
+
+
+def test_pooling_does_not_ask_who_spoke() -> None:
+    rng = np.random.default_rng(0)
+    heard, age = rng.normal(size=(2, 1, 6, inputs.FEATURES)).astype(np.float32), rng.uniform(0.0, 9.0, (2, 1, 6))
+    order = rng.permutation(6)
+    np.testing.assert_allclose(
+        inputs.pool_heard(heard[:, :, order], age[:, :, order]), inputs.pool_heard(heard, age), rtol=1e-6, atol=1e-6
+    )
+
+
+def test_what_was_never_heard_counts_for_nothing() -> None:
+    """And says so: the share of agents heard is an input."""
+    rng = np.random.default_rng(0)
+    heard, age = rng.normal(size=(1, 1, 4, inputs.FEATURES)).astype(np.float32), np.array([[[0.0, 2.0, np.inf, np.inf]]])
+    other = heard.copy()
+    other[..., 2:, :] = 1e6
+    pooled = inputs.pool_heard(heard, age)
+    np.testing.assert_array_equal(pooled, inputs.pool_heard(other, age))
+    assert pooled[0, 0, -2] == 0.5
+    assert pooled[0, 0, 0] == np.minimum(*heard[0, 0, :2, 0])
+
+
+def test_who_hears_nothing_decides_by_itself() -> None:
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(1, 3, inputs.FEATURES)).astype(np.float32)
+    age = np.where(np.eye(3, dtype=bool), 0.0, np.inf)[None]
+    policy, now = random_policy(), Sensed(features, np.zeros((1, 3), np.int64), np.array([True]))
+    heard = np.repeat(features[:, None], 3, axis=1)
+    alone = policy.decide(now, heard, age)
+    heard[:, 0, 1:], heard[:, 1, ::2], heard[:, 2, :2] = 7.0, -7.0, 3.0
+    np.testing.assert_array_equal(policy.decide(now, heard, age), alone)
+
+
+@pytest.mark.parametrize(("formation", "agents"), [("line", 2), ("grid", 9), ("circle", 32)])
+def test_one_policy_flies_teams_of_any_size(formation: str, agents: int) -> None:
+    scenario = make_scenario("open", composition="set-based", formation=formation, agents=agents, duration=1.0)
+    supervisor, world = General(random_policy()), World(scenario)
+    memory = supervisor.start(scenario, 1)
+    observation = world.reset()
+    for _ in range(scenario.mission_steps):
+        orders, memory = supervisor.decide(observation, memory)
+        assert orders.shape == (1, agents)
+        assert np.isin(orders, memory.orders).all()
+        observation = world.step(orders).observation
+
+
+def test_teams_do_not_depend_on_each_other() -> None:
+    """Values and decisions of a team are the same, bit for bit, whatever other teams are asked about."""
+    scenario = field(split="test")
+    world = World(scenario, worlds=5)
+    seen = world.reset(3)
+    sight, policy = inputs.make_sight(scenario), random_policy()
+    features = inputs.sense_features(seen, sight)
+    whole = inputs.join_inputs(features, features[:, None], np.zeros((5, 1, 4)))
+    for b in range(5):
+        part = features[b : b + 1]
+        alone = inputs.join_inputs(part, part[:, None], np.zeros((1, 1, 4)))
+        np.testing.assert_array_equal(policy.values(alone[0]), policy.values(whole.reshape(-1, inputs.INPUTS))[4 * b : 4 * b + 4])
+
+
+def test_the_column_and_its_age_are_inputs() -> None:
+    scenario = field(duration=2.0)
+    world, column = World(scenario), np.full((1, 4), scenario.orders.index("FR"))
+    for _ in range(20):
+        observation = world.step(column).observation
+    features = inputs.sense_features(observation, inputs.make_sight(scenario))[0]
+    assert (features[:, inputs.COLUMN_ENTRY] == 1.0).all()
+    after = world.step(np.full((1, 4), scenario.orders.index("FM"))).observation
+    features = inputs.sense_features(after, inputs.make_sight(scenario))[0]
+    assert (features[:, inputs.COLUMN_ENTRY] == 0.0).all()
+    assert (features[:, inputs.AGE_ENTRIES] < 0.1).all()
+
+
+@pytest.mark.parametrize(
+    ("scenario", "said"),
+    [
+        (make_scenario("field"), "--composition set-based"),
+        (replace(paper(composition="set-based"), path_velocity=(0.0, 0.0)), "path at rest"),
+    ],
+)
+def test_missions_it_cannot_fly_are_refused(scenario, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        General(random_policy()).start(scenario, 1)
+
+
+def test_a_formation_that_is_its_own_column_is_refused() -> None:
+    scenario = field()
+    formation = next(b for b in scenario.behaviors if b.name == "FM")
+    same = tuple(replace(b, offsets=formation.offsets) if b.name == "FR" else b for b in scenario.behaviors)
+    with pytest.raises(ConfigurationError, match="has no column"):
+        General(random_policy()).start(replace(scenario, behaviors=same), 1)
+
+
+def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
+    policy, path = random_policy(margin=0.25), tmp_path / "general.safetensors"
+    write_general(path, policy, {"note": "x"})
+    read, description = read_general(path)
+    for one, other in zip(policy.network.weights, read.network.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert (read.network.margin, description["note"]) == (0.25, "x")
+    assert isinstance(make_supervisor(str(path)), General)
+    assert path.stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize(
+    ("changes", "arrays", "said"),
+    [
+        ({"layout": {"version": 0}}, {}, "trained on other inputs: its layout"),
+        ({"interval": 3.0}, {}, "trained on other inputs: its interval"),
+        ({"kind": "team"}, {}, "not hold a general policy"),
+        ({"margin": None}, {}, "does not hold the network"),
+        ({}, {"weight0": np.zeros((1, 7, 16), np.float32)}, "7, 16"),
+        ({}, {"weight1": np.full((1, 16, 3), np.nan, np.float32)}, "not finite"),
+        ({}, {"weight0": np.zeros((1, inputs.INPUTS, 16))}, "float32"),
+    ],
+)
+def test_checkpoints_of_another_kind_are_refused(tmp_path: Path, changes, arrays, said: str) -> None:
+    path = tmp_path / "general.safetensors"
+    write_general(path, random_policy(), {})
+    old, description = read_arrays(path)
+    del description["sha256"]
+    write_arrays(path, old | arrays, description | changes)
+    with pytest.raises(ConfigurationError, match=said):
+        read_general(path)
+
+
+def test_a_checkpoint_of_one_team_is_no_general_policy() -> None:
+    with pytest.raises(ConfigurationError, match="of a single team"):
+        read_general(shipped("marlms"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"teams": ("wedge-1",)}, "at least 2 agents"),
+        ({"teams": ("wedge",)}, "FORMATION-AGENTS"),
+        ({"teams": ("star-4",)}, "unknown formation"),
+        ({"teams": ()}, "must name at least one"),
+        ({"families": ("paper",)}, "unknown family"),
+        ({"hide": ("noses",)}, "unknown group of inputs"),
+        ({"gamma": 1.0}, "below 1"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused(changes, said: str) -> None:
+    with pytest.raises(ConfigurationError, match=said):
+        replace(SMALL, **changes)
+
+
+def test_a_team_reads_from_its_text() -> None:
+    assert read_team("grid-16") == ("grid", 16)
+
+
+def test_an_ablation_hides_inputs_from_the_network() -> None:
+    """Hidden inputs have no weight, before learning and after."""
+    config = replace(SMALL, hide=("pooled", "column-lane"))
+    trainer = GeneralTrainer(config)
+    for _ in range(4):
+        trainer.advance()
+    mask = input_mask(config)
+    assert mask is not None
+    weight = trainer.policy().network.weights[0][0]
+    assert (weight[mask[0] == 0.0] == 0.0).all()
+    assert (weight[mask[0] == 1.0] != 0.0).any(axis=1).all()
+
+
+def test_training_is_its_seed(tmp_path: Path) -> None:
+    """Two runs under one seed leave the same network, another seed another one; what they leave flies."""
+    runs = {name: replace(SMALL, seed=seed, evaluate_every=200) for name, seed in (("a", 1), ("b", 1), ("c", 2))}
+    for name, config in runs.items():
+        train_general(config, tmp_path / name)
+    networks = [read_general(tmp_path / name / "checkpoint" / "last.safetensors")[0].network for name in runs]
+    assert all((x == y).all() for x, y in zip(networks[0].weights, networks[1].weights, strict=True))
+    assert any((x != y).any() for x, y in zip(networks[0].weights, networks[2].weights, strict=True))
+    with (tmp_path / "a" / "eval.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {"success_field_wedge-4", "return_corridor_wedge-4", "mission_steps", "wall_s"} <= set(rows[0])
+    with pytest.raises(ConfigurationError, match="not empty"):
+        train_general(SMALL, tmp_path / "a")
+
+
+def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
+    """The first policy is the old one; other layers, or another kind of checkpoint, are refused."""
+    policy, path = random_policy(), tmp_path / "general.safetensors"
+    write_general(path, policy, {})
+    trainer = GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path), first_temperature=0.2))
+    assert trainer.temperature == pytest.approx(0.2)
+    for one, other in zip(policy.network.weights, trainer.policy().network.weights, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
+        with pytest.raises(ConfigurationError, match=said):
+            GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
+
+
+def test_lost_messages_age() -> None:
+    """An agent always hears itself; where all is lost, others' entries stay as they were."""
+    trainer = GeneralTrainer(SMALL)
+    squad = trainer.squads[0]
+    squad.loss[:] = 1.0
+    squad.end[:] = 10**6
+    before = squad.age.copy()
+    own = np.eye(4, dtype=bool)
+    squad.step(np.zeros((2, 4), dtype=np.int64), 0.0)
+    assert (squad.age[:, own] == 0.0).all()
+    assert (squad.age[:, ~own] == before[:, ~own] + 1.0).all()
+    torch.set_num_threads(1)
+
+
+def test_the_command_refuses_what_it_cannot_train(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for options, said in (
+        (["--preset", "paper"], "neither presets nor devices"),
+        (["--set", "teams=wedge-1"], "at least 2 agents"),
+        (["--set", "nonsense=1"], "unknown setting"),
+    ):
+        with pytest.raises(SystemExit):
+            main(["train", "marlms-general", "--out", str(tmp_path / "run"), *options])
+        assert said in capsys.readouterr().err
+
+
+def test_the_shipped_policy_flies_what_it_never_saw() -> None:
+    """A held-out layout of a family with walls, in whose middle only the column fits."""
+    scenario = make_scenario("gates", composition="set-based", split="test")
+    verdict = Judge(scenario, "sorlc", 2)(make_supervisor("marlms-general"), seed=59_000)
+    assert verdict.success.all()
+    assert shipped("marlms-general").stat().st_size < 1_000_000
+
+
+def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
+    """(steps, B, N) orders of the first mission steps of held-out layouts."""
+    supervisor, world = General(random_policy()), World(scenario, worlds=worlds)
+    observation, memory = world.reset(3), supervisor.start(scenario, worlds)
+    taken = []
+    for _ in range(steps):
+        orders, memory = supervisor.decide(observation, memory)
+        taken.append(orders.copy())
+        observation = world.step(orders).observation
+    return np.stack(taken)
+
+
+def test_ideal_communication_is_the_limit_of_a_long_range() -> None:
+    """One decision is the same whether nothing is exchanged because all hear all, or a layer carries it without limits."""
+    ideal, carried = (field(communication=c) for c in (Communication(), Communication(range=1e6)))
+    np.testing.assert_array_equal(decisions(carried), decisions(ideal))
+
+
+@pytest.mark.parametrize("changes", [{"delay": 0.1, "loss": 0.5}, {"silent": (0,)}, {"protocol": "consensus", "range": 9.0}])
+def test_it_flies_over_any_network(changes) -> None:
+    """Every team decides on its own network: alone it takes the same orders as beside another."""
+    scenario = field(communication=Communication(**changes))
+    taken = decisions(scenario)
+    assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
+    np.testing.assert_array_equal(decisions(scenario, worlds=1)[:, 0], taken[:, 0])

@@ -1,0 +1,202 @@
+"""What a training run of the general policy is: one frozen dataclass, and what learner and exploration take of it."""
+
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
+from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario
+from marlbc_mj.scenarios.formations import FORMATIONS
+from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
+
+GENERAL = "marlms-general"
+"""Name of the method, of the supervisor and of the shipped checkpoint."""
+GENERAL_SUMMARY = "one network for every agent of every team, over families of drawn layouts"
+"""One line of description."""
+JUDGED_WITH = "sorlc"
+"""Controller of the evaluations."""
+DRAWN = ("field", "forest", "gates", "corridor", "traffic")
+"""Families of missions that draw layouts."""
+HIDEABLE = ("pooled", "lanes", "column-lane", "ways")
+"""Groups of inputs that an ablation can hide from the network."""
+_NAMED = Rule("must name at least one", bool)
+_LAYERS = Rule("layers must have at least one unit", lambda widths: bool(widths) and min(widths) >= 1)
+_DISCOUNT = Rule("must be at least 0 and below 1", lambda gamma: 0 <= gamma < 1)
+
+
+class TeamName(NamedTuple):
+    """A team by formation and size."""
+
+    formation: str
+    agents: int
+
+
+@dataclass(frozen=True)
+class GeneralConfig:
+    """A training run of the general policy.
+
+    Raises:
+        ConfigurationError: a value that cannot be run.
+    """
+
+    seed: Annotated[int, NOT_NEGATIVE] = 0
+    """Random seed of network, exploration, layouts and the draws from the replay buffer."""
+    budget: Annotated[int, AT_LEAST_ONE] = 1_200_000
+    """Mission steps, over all worlds."""
+    start: str = ""
+    """Checkpoint of a general policy whose network learning begins with; a random one by default."""
+    first_temperature: Annotated[float, POSITIVE] = 1.0
+    """Temperature at the start, below 1 for a network that has learned before."""
+    families: Annotated[tuple[str, ...], _NAMED] = DRAWN
+    """Families that are trained on; one that is named twice counts twice."""
+    teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "wedge-8", "circle-8", "line-6", "grid-9")
+    """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
+    worlds: Annotated[int, AT_LEAST_ONE] = 4
+    """Worlds of every family and team, all stepped together."""
+    controller: str = "pd"
+    """Controller that tracks the references while learning; evaluations have sorlc."""
+    substep: Annotated[float, POSITIVE] = 0.01
+    """Physics and control step while learning [s]; evaluations have the scenario's own."""
+    most_drag: Annotated[float, NOT_NEGATIVE] = 2.0
+    """Every episode multiplies the disturbance by a draw from 0 to this."""
+    start_spread: Annotated[float, NOT_NEGATIVE] = 0.5
+    """Each coordinate of a start moves by at most this [m]."""
+    lossy: Annotated[float, SHARE] = 0.3
+    """Share of episodes in which agents miss messages of others."""
+    most_loss: Annotated[float, SHARE] = 0.6
+    """In those, the share of messages that are missed is a draw from 0 to this."""
+
+    hidden: Annotated[tuple[int, ...], _LAYERS] = (64, 64)
+    """Widths of the hidden layers."""
+    copies: Annotated[int, AT_LEAST_ONE] = 3
+    """Past networks that a target is averaged over."""
+    push_every: Annotated[int, AT_LEAST_ONE] = 100
+    """Updates after which the present network joins the past ones."""
+    gamma: Annotated[float, _DISCOUNT] = 0.97
+    """Discount factor per decision."""
+    n_step: Annotated[int, AT_LEAST_ONE] = 1
+    """Decisions whose rewards are summed before the bootstrap."""
+    learning_rate: Annotated[float, POSITIVE] = 1e-3
+    """Step size of Adam at the start of the budget."""
+    final_learning_rate: Annotated[float, POSITIVE] = 3e-5
+    """Step size of Adam at the end of the budget; linear in between."""
+    batch: Annotated[int, AT_LEAST_ONE] = 512
+    """Transitions of single agents per update."""
+    updates: Annotated[int, AT_LEAST_ONE] = 8
+    """Updates after each decision of all worlds."""
+    capacity: Annotated[int, AT_LEAST_ONE] = 400_000
+    """Transitions of single agents in the replay buffer."""
+    smoothing: Annotated[float, SHARE] = 0.998
+    """Memory of the running mean of the weights, which the policy is made of."""
+    learner: Literal["lenient", "hysteretic", "plain"] = "hysteretic"
+    """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
+    cool_by: Annotated[float, POSITIVE] = 0.5
+    """Share of the budget after which the temperature is 0.05."""
+    hold: Annotated[int, AT_LEAST_ONE] = 6
+    """An exploring agent keeps its random order for 1 to this many decisions."""
+    together: Annotated[float, SHARE] = 0.7
+    """Share of explorations in which the whole team takes one random order."""
+    least_exploration: Annotated[float, SHARE] = 0.02
+    """Lower bound of the exploration."""
+    switch_cost: Annotated[float, NOT_NEGATIVE] = 0.3
+    """Cost of an agent's own switch; a decision in formation costs nothing, in column 0.5, in neither 1."""
+    switching_margin: float = 0.05
+    """The policy leaves an order only for one whose value is higher by more than this."""
+    hide: tuple[str, ...] = ()
+    """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
+
+    evaluate_every: Annotated[int, AT_LEAST_ONE] = 400_000
+    """Mission steps between evaluations on held-out layouts."""
+    layouts: Annotated[int, AT_LEAST_ONE] = 10
+    """Held-out layouts of each family per evaluation."""
+    threads: Annotated[int, AT_LEAST_ONE] = 1
+    """Threads of the simulation."""
+
+    def __post_init__(self) -> None:
+        check(self)
+        for name in self.families:
+            if name not in DRAWN:
+                raise unknown("family of drawn layouts", name, DRAWN)
+        for name in self.hide:
+            if name not in HIDEABLE:
+                raise unknown("group of inputs", name, HIDEABLE)
+        for name in self.teams:
+            read_team(name)
+
+
+def read_team(name: str) -> TeamName:
+    """A team from its text, ``wedge-4``.
+
+    Raises:
+        ConfigurationError: another form, an unknown formation, or a team of one.
+    """
+    formation, dash, agents = name.partition("-")
+    if not (dash and agents.isdigit()):
+        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {name!r}")
+    if formation not in FORMATIONS:
+        raise unknown("formation", formation, FORMATIONS)
+    if int(agents) < 2:
+        raise ConfigurationError(f"a team needs at least 2 agents, got {name!r}")
+    return TeamName(formation, int(agents))
+
+
+def training_scenarios(config: GeneralConfig) -> list[Scenario]:
+    """Every family with every team, under the set-based composition, with spread starts and drag."""
+    spread = Perturbation(start_spread=config.start_spread, drag_scale=(0.0, config.most_drag))
+    teams = [read_team(name) for name in config.teams]
+    return [
+        make_scenario(family, **team._asdict(), substep=config.substep, composition="set-based", perturbation=spread)
+        for family in config.families
+        for team in teams
+    ]
+
+
+def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
+    """Held-out layouts of every family, whether it is trained on or not, for the first and the last team; by family and team."""
+    names = dict.fromkeys((config.teams[0], config.teams[-1]))
+    return {
+        f"{family}_{team}": make_scenario(family, **read_team(team)._asdict(), composition="set-based", split="test")
+        for team in names
+        for family in DRAWN
+    }
+
+
+def learner_config(config: GeneralConfig) -> TrainConfig:
+    """What learner and exploration take of a configuration, under the names that they know."""
+    return make_config(
+        "fast",
+        **{"method": "marlms" if config.learner == "lenient" else {"hysteretic": "hysteretic", "plain": "iql"}[config.learner]},
+        learner=config.learner,
+        seed=config.seed,
+        worlds=config.worlds,
+        hidden=config.hidden,
+        copies=config.copies,
+        push_every=config.push_every,
+        learning_rate=config.learning_rate,
+        final_learning_rate=config.final_learning_rate,
+        smoothing=config.smoothing,
+        risk_gamma=0.0,
+        hold=config.hold,
+        together=config.together,
+        agreement=0.0,
+        least_exploration=config.least_exploration,
+    )
+
+
+def input_mask(config: GeneralConfig) -> np.ndarray | None:
+    """(1, S) of 0 and 1, the inputs that the network sees; None: all of them."""
+    if not config.hide:
+        return None
+    mask = np.ones((1, INPUTS), dtype=np.float32)
+    offsets = (0, FEATURES, 2 * FEATURES)  # own, minima, means
+    for name in config.hide:
+        if name == "pooled":
+            mask[:, FEATURES:] = 0.0
+            continue
+        first, last = {"lanes": (0, LANES), "column-lane": (LANE_BINS, LANES), "ways": (LANES, LANES + 2)}[name]
+        for offset in offsets:
+            mask[:, offset + first : offset + last] = 0.0
+    return mask

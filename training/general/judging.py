@@ -1,0 +1,74 @@
+"""How a policy does on held-out layouts while it is learned: success rate and median return of each family."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.core.safety import violates
+from marlbc_mj.engine.world import World
+from marlbc_mj.policies.general import GeneralPolicy
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.base import Supervisor
+from marlbc_mj.supervisors.general import General
+
+VALIDATION_SEED = 50_000
+"""Seed of the held-out layouts that checkpoints are chosen by; results are reported on others, from 60000 on."""
+
+
+class Verdict(NamedTuple):
+    """What became of B missions, measured at mission steps."""
+
+    total: np.ndarray  # (B,) return
+    reached: np.ndarray  # (B,) bool, everybody ended within the tolerance of its slot
+    violated: np.ndarray  # (B,) bool, an agent came within the safe distance of an obstacle
+    switches: np.ndarray  # (B,) of all agents
+
+    @property
+    def success(self) -> np.ndarray:
+        """(B,) bool: reached and not violated."""
+        return np.asarray(self.reached & ~self.violated)
+
+
+class Judge:
+    """Whole missions on the same held-out layouts of one scenario, again and again.
+
+    Args:
+        scenario: that layouts are drawn of.
+        controller: name of the law that tracks the references.
+        layouts: how many.
+        threads: of the simulation.
+    """
+
+    def __init__(self, scenario: Scenario, controller: str, layouts: int, threads: int = 1) -> None:
+        self.scenario = scenario
+        self.world = World(scenario, make_controller(controller), worlds=layouts, threads=threads)
+
+    def __call__(self, supervisor: Supervisor, seed: int = VALIDATION_SEED) -> Verdict:
+        """All missions from their beginning to their end."""
+        world, scenario = self.world, self.scenario
+        observation, memory = world.reset(seed), supervisor.start(scenario, world.worlds)
+        total, switches = np.zeros(world.worlds), np.zeros(world.worlds)
+        violated = np.zeros(world.worlds, dtype=bool)
+        for step in range(scenario.mission_steps):
+            orders, memory = supervisor.decide(observation, memory)
+            if world.advance(np.ascontiguousarray(orders)):
+                world.raise_if_diverged()
+            previous, observation = observation, world.observe()
+            total += world.state.reward
+            violated |= violates(observation.clearance, scenario.safe_distance).any(axis=1)
+            switches += (observation.command != previous.command).sum(axis=1) * (step > 0)
+        centre = np.array(scenario.path_origin) + scenario.duration * np.array(scenario.path_velocity)
+        away = np.linalg.norm(observation.position - centre - scenario.formations[0], axis=-1)
+        return Verdict(total, (away <= scenario.formation_tolerance).all(axis=1), violated, switches)
+
+
+def judge_policy(policy: GeneralPolicy, judges: dict[str, Judge]) -> dict[str, float]:
+    """Success rate, median return and median switches per agent of each family, by ``success_field`` and so on."""
+    row: dict[str, float] = {}
+    for name, judge in judges.items():
+        verdict = judge(General(policy))
+        row[f"success_{name}"] = float(verdict.success.mean())
+        row[f"return_{name}"] = float(np.median(verdict.total))
+        row[f"switches_{name}"] = float(np.median(verdict.switches)) / judge.scenario.agents
+    return row

@@ -1,0 +1,105 @@
+"""A training run of the general policy on disk: evaluations on held-out layouts, learning curve, best and last checkpoints."""
+
+from collections.abc import Callable
+from pathlib import Path
+from time import monotonic, process_time
+from typing import Any
+
+from marlbc_mj.policies.general import write_general
+from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
+from marlbc_mj.training.general.judging import Judge, judge_policy
+from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, remove_run, stopper, write_table
+from marlbc_mj.training.saved import CONFIG_FILE
+from marlbc_mj.util.files import check_folder, write_json, writing
+from marlbc_mj.util.provenance import provenance
+
+CURVE = "eval.csv"
+GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
+"""What a run calls after every decision, with its last evaluation."""
+
+
+def train_general(
+    config: GeneralConfig, out: Path, *, overwrite: bool = False, progress: GeneralProgress | None = None
+) -> Interrupted | list[TrainingScores]:
+    """Train from scratch; returns the evaluations, or what interrupted the run, which then leaves its last policy.
+
+    Args:
+        config: configuration of the run.
+        out: folder of the run.
+        overwrite: whether ``out`` may hold something.
+        progress: called after every decision.
+
+    Raises:
+        ConfigurationError: a setting that cannot be run, or ``out`` is not empty.
+        SimulationError: a world diverged.
+    """
+    check_folder(out, overwrite=overwrite)
+    run = GeneralRun(config, out)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        remove_run(out)
+    write_json(out / CONFIG_FILE, {**run.origin, "train": config})
+    return run.go(progress)
+
+
+class GeneralRun:
+    """A trainer with its folder.
+
+    Args:
+        config: configuration of the run.
+        out: folder of the run.
+    """
+
+    def __init__(self, config: GeneralConfig, out: Path) -> None:
+        self.config, self.out = config, out
+        self.trainer = GeneralTrainer(config)
+        scenarios = judging_scenarios(config)
+        self.judges = {k: Judge(each, JUDGED_WITH, config.layouts, config.threads) for k, each in scenarios.items()}
+        self.origin = provenance()
+        self.evaluations: list[TrainingScores] = []
+        self.wall = 0.0  # time of training so far, without evaluations [s]
+        self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]
+
+    def go(self, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
+        """Train to the end of the budget, or until a signal arrives."""
+        trainer = self.trainer
+        with stopper() as stop:
+            while not trainer.finished:
+                began, used = monotonic(), process_time()
+                trainer.advance()
+                self.wall, self.cpu = self.wall + monotonic() - began, self.cpu + process_time() - used
+                if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished or stop.signal:
+                    self.evaluate()
+                if progress and self.evaluations:
+                    progress(trainer, self.evaluations[-1])
+                if stop.signal:
+                    return Interrupted(stop.signal)
+        return self.evaluations
+
+    def evaluate(self) -> None:
+        """Fly the held-out layouts; write the learning curve, the last checkpoint and perhaps the best."""
+        policy = self.trainer.policy()
+        row = {
+            "wall_s": self.wall,
+            "cpu_s": self.cpu,
+            "mission_steps": float(self.trainer.steps),
+            "updates": float(self.trainer.learner.updates),
+        }
+        row |= {"td_error": self.trainer.error, **judge_policy(policy, self.judges)}
+        best = max((judged_rank(each) for each in self.evaluations), default=None)
+        self.evaluations.append(row)
+        write_table(self.out / CURVE, self.evaluations)
+        description: dict[str, Any] = {**self.origin, "train": self.config, "evaluation": row}
+        write_general(self.out / CHECKPOINT / "last.safetensors", policy, description)
+        if best is None or judged_rank(row) >= best:
+            write_general(self.out / CHECKPOINT / "best.safetensors", policy, description)
+
+
+def judged_rank(row: TrainingScores) -> tuple[float, float]:
+    """Sort key of evaluations, best last: by the mean success rate first, then by the mean return."""
+    means = []
+    for prefix in ("success_", "return_"):
+        values = [value for name, value in row.items() if name.startswith(prefix)]
+        means.append(sum(values) / len(values))
+    return means[0], means[1]

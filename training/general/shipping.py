@@ -1,0 +1,91 @@
+"""Making a run of the general policy the checkpoint that comes with the package, with its model card."""
+
+import csv
+import shutil
+from pathlib import Path
+from typing import Any
+
+from marlbc_mj.policies.general import read_general
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS
+from marlbc_mj.policies.shipped import FOLDER
+from marlbc_mj.report.table import pipe_table
+from marlbc_mj.training.config import flat_settings
+from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import check_target, staged_file, write_json
+from marlbc_mj.util.provenance import plain_data
+
+
+def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
+    """Copy the best checkpoint of a run and write its model card, ``<name>.md``; returns the checkpoint's path.
+
+    Args:
+        run: folder of the training run.
+        name: name of the shipped checkpoint.
+        folder: folder of the shipped checkpoints.
+        overwrite: whether a checkpoint of that name may be replaced.
+
+    Raises:
+        ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
+    """
+    source = run / "checkpoint" / "best.safetensors"
+    _, description = read_general(source)
+    try:
+        with (run / "eval.csv").open() as file:
+            text = general_card(name, description, list(csv.DictReader(file)))
+    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ConfigurationError(f"{run} is not a finished training run: {error!r}") from error
+    target = folder / source.with_stem(name).name
+    check_target(target, overwrite=overwrite)
+    with staged_file(target, overwrite=True) as staging:
+        shutil.copyfile(source, staging)
+    write_json(target.with_suffix(".json"), description)
+    with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
+        staging.write_text(text)
+    return target
+
+
+def general_card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
+    """The model card in Markdown: what the checkpoint is, how it was made, its learning curve on held-out layouts.
+
+    Args:
+        name: name of the shipped checkpoint.
+        description: description in the checkpoint's header.
+        rows: lines of the run's eval.csv.
+    """
+    train, evaluation, versions = description["train"], description["evaluation"], description["versions"]
+    families = [key.removeprefix("success_") for key in rows[0] if key.startswith("success_")]
+    lines = [
+        f"# {name}",
+        "",
+        "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself "
+        f"between formation and column, from {FEATURES} numbers that it senses and {INPUTS - FEATURES} that it pools of what it "
+        "heard. It needs the set-based composition, a formation with a column and a path that moves.",
+        "",
+        f"- Trained on {', '.join(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
+        f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
+        "twice.",
+        f"- Command: `marlbc train {GENERAL} --seed {train['seed']}{''.join(map(' {}'.format, _changed(train)))}`",
+        f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
+        f"{evaluation['cpu_s']:.0f} s of processor time on {train['threads']} thread(s) of {description['cpu']}.",
+        f"- Evaluations: {train['layouts']} held-out layouts of each family and team, controller {JUDGED_WITH}; success at "
+        "mission steps, median return.",
+        f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
+        "",
+        pipe_table(("mission steps", *families), [_curve_cells(row, families) for row in rows]),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
+    """One evaluation as a row of the card's table."""
+    cells = [f"{100 * float(row[f'success_{name}']):.0f} % / {float(row[f'return_{name}']):.0f}" for name in families]
+    return (f"{float(row['mission_steps']):.0f}", *cells)
+
+
+def _changed(train: dict[str, Any]) -> list[str]:
+    """``--set`` and the settings that differ from the defaults; empty if none does."""
+    preset = flat_settings(plain_data(GeneralConfig()))
+    changed = {k: v for k, v in flat_settings(train).items() if k != "seed" and preset.get(k) != v}
+    texts = [f"{k}={','.join(map(str, v)) if isinstance(v, list) else v}" for k, v in changed.items()]
+    return ["--set", *texts] if texts else []

@@ -1,0 +1,99 @@
+"""Squads: worlds of one family and team that learn together with others, each with what its agents have heard of each other."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.loop import FORMATION_REWARD
+from marlbc_mj.engine.world import World
+from marlbc_mj.policies.general import FORMATION, decision_steps, motion_orders
+from marlbc_mj.policies.general_inputs import join_inputs, make_sight, sense_features
+from marlbc_mj.scenarios import Scenario
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.exploration import Exploration
+from marlbc_mj.training.general.config import GeneralConfig
+from marlbc_mj.util.seeding import stream
+
+
+class SquadOutcome(NamedTuple):
+    """What a decision of W teams led to."""
+
+    reward: np.ndarray  # (W, N) float32
+    final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
+    ended: np.ndarray  # (W,) bool, a new episode has begun
+    steps: int  # mission steps made, over all worlds
+
+
+class Squad:
+    """W worlds of one scenario. Missions end without a terminal state: agents do not know the time.
+
+    Args:
+        scenario: that layouts are drawn of.
+        config: configuration of the run.
+        learning: the same for the exploration.
+        number: of the squad, for its own random stream.
+    """
+
+    def __init__(self, scenario: Scenario, config: GeneralConfig, learning: TrainConfig, number: int) -> None:
+        self.scenario, self.config = scenario, config
+        self.sight = make_sight(scenario)
+        self.orders = motion_orders(scenario)
+        self.interval = decision_steps(scenario, self.sight)
+        self.world = World(scenario, make_controller(config.controller), worlds=config.worlds, threads=config.threads)
+        self.explore = Exploration(learning, scenario.agents, len(self.orders))
+        self.rng = stream(config.seed, number)
+        self.last = np.full((config.worlds, scenario.agents), FORMATION, dtype=np.int64)
+        self.heard = np.zeros((config.worlds, scenario.agents, *self._sense().shape[1:]), dtype=np.float32)
+        self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
+        self.loss = np.zeros(config.worlds)  # share of messages missed
+        self.end = np.full(config.worlds, scenario.mission_steps)  # mission step from which no decision is left
+        self._restart(np.ones(config.worlds, dtype=bool))
+        self.end = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that phases differ
+        self.inputs = self._exchange()  # (W, N, S) of the next decision
+
+    @property
+    def rows(self) -> int:
+        """Agents in all worlds."""
+        return int(self.last.size)
+
+    def _sense(self) -> np.ndarray:
+        return sense_features(self.world.observe(), self.sight)
+
+    def _exchange(self, only: np.ndarray | None = None) -> np.ndarray:
+        """(W, N, S) inputs after everybody sent once; of the teams ``only`` (W,) alone others' memories stay as they are."""
+        features = self._sense()
+        arrives = self.rng.random(self.age.shape) >= self.loss[:, None, None]
+        arrives |= np.eye(features.shape[1], dtype=bool)
+        if only is not None:
+            arrives &= only[:, None, None]
+        np.copyto(self.heard, features[:, None], where=arrives[..., None])
+        self.age = np.where(arrives, 0.0, self.age + (1.0 if only is None else only[:, None, None]))
+        return join_inputs(features, self.heard, self.age * self.interval * self.scenario.mission_step / self.sight.time)
+
+    def step(self, greedy: np.ndarray, temperature: float) -> SquadOutcome:
+        """One decision: ``greedy`` (W, N) actions, or what is explored instead; see :class:`Exploration` for the temperature."""
+        actions = self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
+        switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
+        self.last = actions
+        returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
+        team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
+        reward = team[:, None] - self.config.switch_cost * switched
+        final = self._exchange()
+        ended = self.world.state.steps >= self.end
+        self.inputs = final
+        if ended.any():
+            self._restart(ended)
+            self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
+        return SquadOutcome(reward.astype(np.float32), final, ended, self.interval * len(actions))
+
+    def _restart(self, ended: np.ndarray) -> None:
+        """New episodes on new layouts where ``ended`` (W,) is true."""
+        config, count = self.config, int(ended.sum())
+        self.world.reset(int(self.rng.integers(2**31)), ended)
+        self.explore.forget(ended)
+        self.last[ended] = FORMATION
+        self.end[ended] = self.scenario.mission_steps - self.interval + 1
+        self.age[ended] = np.inf
+        lossy = self.rng.random(count) < config.lossy
+        self.loss[ended] = np.where(lossy, self.rng.uniform(0.0, config.most_loss, count), 0.0)

@@ -1,0 +1,128 @@
+"""Learning of the general policy: one dueling network on the transitions of all agents of all squads."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
+from marlbc_mj.policies.general_inputs import INPUTS
+from marlbc_mj.training.base import single_thread
+from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
+from marlbc_mj.training.general.squads import Squad
+from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.leniency import leniency
+from marlbc_mj.training.replay import Replay
+from marlbc_mj.util.errors import ConfigurationError
+
+COLD = 0.05
+"""Temperature after the share ``cool_by`` of the budget."""
+
+
+class GeneralTrainer:
+    """One run. :meth:`advance` makes a decision in every world and learns from all agents' transitions alike.
+
+    Args:
+        config: configuration of the run.
+
+    Raises:
+        ConfigurationError: a scenario or controller that cannot be used.
+    """
+
+    def __init__(self, config: GeneralConfig) -> None:
+        self.config = config
+        learning = learner_config(config)
+        self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
+        generator = torch.Generator().manual_seed(config.seed)
+        scale = np.ones(INPUTS, dtype=np.float32)
+        self.learner = Learner(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        if config.start:
+            self._begin_with(read_general(Path(config.start))[0])
+        self.rng = np.random.default_rng(config.seed)
+        rows = sum(squad.rows for squad in self.squads)
+        self.replay = Replay(max(config.capacity // rows, 2 * config.n_step), rows, 1, INPUTS)
+        self.steps = 0  # mission steps made, over all worlds
+        self.error = 0.0  # mean absolute TD error of the last update
+        single_thread()
+
+    @property
+    def finished(self) -> bool:
+        """Whether the budget is spent."""
+        return self.steps >= self.config.budget
+
+    @property
+    def share(self) -> float:
+        """Share of the budget that is spent."""
+        return min(1.0, self.steps / self.config.budget)
+
+    @property
+    def temperature(self) -> float:
+        """Wanted randomness of the actions; it falls from 1."""
+        first = math.log(self.config.first_temperature)
+        return math.exp(first + (math.log(COLD) - first) * self.share / self.config.cool_by)
+
+    def _begin_with(self, policy: GeneralPolicy) -> None:
+        """Take over the network of a policy, also for targets and for the running mean.
+
+        Raises:
+            ConfigurationError: its layers have other sizes than the configuration's.
+        """
+        found = tuple(bias.shape[2] for bias in policy.network.biases[:-1])
+        if found != self.config.hidden:
+            raise ConfigurationError(f"checkpoint {self.config.start} has hidden layers {found}, the run {self.config.hidden}")
+        learner = self.learner
+        arrays = (*policy.network.weights, *policy.network.biases)
+        for network in (learner.network, learner.smooth):
+            for parameter, array in zip((*network.weights, *network.biases), arrays, strict=True):
+                parameter.data.copy_(torch.from_numpy(array.copy()))
+        for _ in range(self.config.copies):
+            learner.push()
+
+    def advance(self) -> None:
+        """One decision in every world, stored, and the updates after it.
+
+        Raises:
+            ConfigurationError: the network diverged.
+        """
+        self._act()
+        if self.replay.count > self.config.n_step:
+            self._learn()
+
+    def _act(self) -> None:
+        inputs = np.concatenate([squad.inputs.reshape(-1, INPUTS) for squad in self.squads])
+        greedy = self.learner.values(inputs)[:, 0].argmax(axis=-1)
+        bounds = np.cumsum([squad.rows for squad in self.squads])[:-1]
+        temperature, outcomes = self.temperature, []
+        for squad, best in zip(self.squads, np.split(greedy, bounds), strict=True):
+            outcomes.append(squad.step(best.reshape(squad.last.shape), temperature))
+        single_thread()
+        rows = len(inputs)
+        self.replay.store(
+            state=inputs,
+            final=np.concatenate([outcome.final.reshape(-1, INPUTS) for outcome in outcomes]),
+            action=np.concatenate([squad.last.reshape(-1, 1) for squad in self.squads]),
+            reward=np.concatenate([outcome.reward.reshape(-1, 1) for outcome in outcomes]),
+            leniency=leniency(np.full((rows, 1), temperature)).astype(np.float32),
+            lost=np.zeros((rows, 1), dtype=bool),
+            code=np.zeros(rows, dtype=np.int64),
+            ended=np.concatenate([np.repeat(o.ended, o.reward.shape[1]) for o in outcomes]),
+            terminal=np.zeros((rows, 1), dtype=bool),
+        )
+        self.steps += sum(outcome.steps for outcome in outcomes)
+
+    def _learn(self) -> None:
+        config = self.config
+        rate = config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * (1.0 - self.share)
+        for _ in range(config.updates):
+            batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
+            self.error = self.learner.update(batch, rate)
+        if not np.isfinite(self.error):
+            raise ConfigurationError(f"the network diverged after {self.steps} mission steps; try a lower learning_rate")
+
+    def policy(self) -> GeneralPolicy:
+        """The greedy policy of the running mean of the weights."""
+        network = self.learner.smooth
+        weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
+        biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
+        return make_general(weights, biases, self.config.switching_margin)
