@@ -102,7 +102,7 @@ class Troubled:
         if self.trouble == "NaN":
             velocity[troubled] = np.nan
         if self.trouble == "diverges":
-            velocity[troubled] = 1e30
+            velocity[troubled] = 9e8  # allowed, and more than a force without limit can follow
         return Blend(memory, velocity), memory
 
 

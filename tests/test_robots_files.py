@@ -270,7 +270,7 @@ def test_no_section_of_a_file_makes_mujoco_warn(write, capfd, recwarn, monkeypat
     head = (
         '<size nuser_geom="3" memory="9M"/><statistic extent="9" meansize="0.5"/><visual><map znear="0.3"/>'
         '<global offwidth="99"/></visual><option timestep="0.1" magnetic="1 2 3" o_margin="0.1" impratio="9" cone="elliptic"'
-        ' solver="CG" tolerance="1e-3" sdf_iterations="7"><flag contact="disable" energy="enable" sensornoise="enable"/></option>'
+        ' solver="CG" tolerance="1e-3" sdf_iterations="7"><flag contact="disable" energy="enable"/></option>'
     )
     name = write(cart(head=head))
     World(robot_gate(name), PD(64.0, 16.0))

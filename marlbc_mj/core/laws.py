@@ -80,7 +80,7 @@ def for_team(law: Law, signature: Any) -> Law:
         except MarlbcError:
             raise
         except Exception as error:
-            if isinstance(error, AttributeError):
+            if isinstance(error, AttributeError) or (is_compiled(law) and isinstance(error, KeyError)):
                 refuse_undeclared(law, error)
             raise SimulationError(f"law {name_of(law)!r} fails: {blame(error)}") from error
 

@@ -1,8 +1,7 @@
 """Two driven wheels and a caster: a point ahead of the axle follows second-order laws as if it were a point mass.
 
-The point p = c + l (cos t, sin t) has p'' = R(t) (u' - l w^2, l w' + u w) for the axle's speed u and turn rate w, so any wanted
-p'' gives u' and w', and these the torques of the wheels (feedback linearization; d'Andrea-Novel, Campion, Bastin 1995). With the
-centre of mass d ahead of the axle, m u' = F + m d w^2 and I w' = M - m d u w.
+The point p = c + l (cos t, sin t) has p'' = R(t) (u' - l w^2, l w' + u w) for the axle's speed u and turn rate w: p'' gives u',
+w' and the wheels' torques (d'Andrea-Novel, Campion, Bastin 1995). Mass d ahead: m u' = F + m d w^2, I w' = M - m d u w.
 """
 
 import mujoco

@@ -15,7 +15,7 @@ SYSTEM = (
 ROOT = Path(__file__).resolve().parents[2]
 INSTALLED = (
     *(sys.prefix, sys.base_prefix),
-    *(str(ROOT / name) for name in ("marlbc_mj", "models", "tasks", "training", "tests")),
+    *(str(ROOT / name) for name in ("marlbc_mj", "marlbc_mj.egg-info", "models", "tasks", "training", "tests")),
     *(entry for entry in sys.path if entry and Path(entry).resolve() != ROOT),
 )
 

@@ -5,7 +5,7 @@ import signal
 import threading
 import time
 from collections.abc import Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, InvalidStateError, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import connection, get_context, parent_process
@@ -66,7 +66,10 @@ class Processes:
 def _pooled(work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, workers: int) -> Generator[tuple[int, ResultT]]:
     context = get_context("spawn")
     stopping, told = context.Event(), context.SimpleQueue()
-    with ProcessPoolExecutor(min(workers, len(tasks)), context, _begin_worker, (told, stopping, ears.stop is not None)) as pool:
+    with (
+        _quiet_when_broken(),
+        ProcessPoolExecutor(min(workers, len(tasks)), context, _begin_worker, (told, stopping, ears.stop is not None)) as pool,
+    ):
         with _ctrl_c_later():
             places = {pool.submit(_work, work, task): task.place for task in tasks}
         waiting, failure = set(places), None
@@ -89,6 +92,17 @@ def _pooled(work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, worker
             _drain(waiting, told, ears.progress)
     if failure is not None:
         raise failure
+
+
+@contextmanager
+def _quiet_when_broken() -> Iterator[None]:
+    """Say nothing of a job that was cancelled while its pool broke: Python's executor shows that as a traceback of its thread."""
+    say = threading.excepthook
+    threading.excepthook = lambda event: None if event.exc_type is InvalidStateError else say(event)
+    try:
+        yield
+    finally:
+        threading.excepthook = say
 
 
 @contextmanager
