@@ -64,15 +64,23 @@ def test_a_command_that_is_interrupted_while_it_is_read(monkeypatch, capsys):
     assert stopped.value.code == 130 and capsys.readouterr().err == "marlbc: interrupted\n"
 
 
+LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times the second after which the signal comes
+
+
+@pytest.fixture(scope="module")
+def compiled_before(tmp_path_factory):
+    """The command has run once, so that a signal meets episodes and not the compiler."""
+    before = [*COMMAND, "bench", *QUICK, *LONG, "--out", str(tmp_path_factory.mktemp("before") / "out")]
+    subprocess.run(before, env=ENVIRONMENT, capture_output=True, check=True)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
+@pytest.mark.usefixtures("compiled_before")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("workers", [[], ["--seeds", "4000", "--workers", "2"]])
-def test_a_signal_leaves_nothing_half_written(tmp_path, tmp_path_factory, number, status, workers):
+def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers):
     """In this process or in workers: nothing beside the output folder, no process, one line."""
-    long = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times the second after which the signal comes
-    before = [*COMMAND, "bench", *QUICK, *long, "--out", str(tmp_path_factory.mktemp("before") / "out")]
-    subprocess.run(before, env=ENVIRONMENT, capture_output=True, check=True)  # compiles, so that the signal meets episodes
-    command = [*COMMAND, "bench", *QUICK[:-2], *long, *workers, "--out", str(tmp_path / "out")]
+    command = [*COMMAND, "bench", *QUICK[:-2], *LONG, *workers, "--out", str(tmp_path / "out")]
     with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         until = time.monotonic() + 120
         while not any(tmp_path.iterdir()) and time.monotonic() < until:
