@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test kills slurm-test fuzz lint wheel docs gallery clean
+.PHONY: help venv benchmark test test-all kills slurm-test fuzz lint wheel docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -25,6 +25,7 @@ help:
 	@echo 'make kills       kill every command at random moments and compare what is left, into out/kills (an hour or two)'
 	@echo 'make slurm-test  run a study on a SLURM that is set up for it on this machine (Debian, root)'
 	@echo 'make fuzz        thousands of wrong inputs; half an hour or more'
+	@echo 'make test-all    run the slow tests, too'
 	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
 	@echo 'make lint        ruff and mypy'
 	@echo 'make wheel       sdist and wheel, into dist'
@@ -49,6 +50,10 @@ slurm-test: venv
 fuzz: venv
 	@$(BIN)/python tests/warm_cache.py
 	@$(BIN)/python tests/fuzz --out out/fuzz
+
+test-all: venv
+	@$(BIN)/python tests/warm_cache.py
+	@$(BIN)/python -m pytest -n auto --dist worksteal --slow
 
 lint: venv
 	@status=0; \

@@ -26,6 +26,21 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
     return min(MOST_WORKERS, len(os.sched_getaffinity(0)))
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--slow``: also the tests that take over about five seconds each, as ``make test-all`` does."""
+    parser.addoption("--slow", action="store_true", help="also run tests marked slow")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out slow tests, unless they are asked for."""
+    if not config.getoption("--slow"):
+        kept, left = [], []
+        for item in items:
+            (left if item.get_closest_marker("slow") else kept).append(item)
+        items[:] = kept
+        config.hook.pytest_deselected(items=left)
+
+
 Episode = Callable[..., Trajectory]
 
 

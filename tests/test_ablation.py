@@ -69,6 +69,7 @@ def test_whole_case_study_cannot_be_flown_at_drag_20() -> None:
     assert table.notes[-1] == f"{len(rows)} of {len(rows)} rows have no figures."
 
 
+@pytest.mark.slow
 def test_default_gains_are_the_best_of_the_sweep() -> None:
     """`SORLC.scaled` has the gains of the sweep's smallest RMS velocity error, and the table's note says so."""
     rows = rows_of(QUESTIONS["sweep"])

@@ -43,6 +43,7 @@ def export(policy, folder, actions="commands"):
     return runtime.InferenceSession(str(out), options, providers=["CPUExecutionProvider"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(  # any two of the three in all four ways
     ("dueling", "risk", "joint"), [(False, 0.0, False), (False, 0.3, True), (True, 0.0, True), (True, 0.3, False)]
 )

@@ -262,6 +262,7 @@ def test_an_ablation_hides_inputs_from_the_network() -> None:
     assert (weight[mask[0] == 1.0] != 0.0).any(axis=1).all()
 
 
+@pytest.mark.slow
 def test_training_is_its_seed(tmp_path: Path) -> None:
     """Two runs under one seed leave the same network, another seed another one; what they leave flies."""
     runs = {name: replace(SMALL, seed=seed, evaluate_every=200) for name, seed in (("a", 1), ("b", 1), ("c", 2))}

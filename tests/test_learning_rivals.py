@@ -408,6 +408,7 @@ def test_every_rival_goes_on_bit_for_bit(method):
     assert equal(*(trainer.snapshot()[0] for trainer in (one, other)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("method", "state"), [("rlms", "printed"), ("central", "extended"), ("mappo", "extended")])
 def test_a_checkpoint_of_a_rival_gives_the_evaluated_episode(method, state, tmp_path):
     """From train to the supervisor; a run that was interrupted while it learnt ends with the same networks, to the bit."""

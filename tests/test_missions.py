@@ -119,6 +119,7 @@ def test_a_run_of_a_file_leaves_a_log(tmp_path: Path):
     assert config["scenario"]["name"] == "mine" and config["scenario"]["disturbance"]["type"] == "WindGusts"
 
 
+@pytest.mark.slow
 def test_a_small_scale_run_has_every_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Table, picture and numbers; the figures themselves are the machine's."""
     for name, value in {"SIZES": (4, 16), "AGENT_STEPS": 64, "MEMORY_AGENTS": 64, "LEAST_WORLDS": 8}.items():

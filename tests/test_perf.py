@@ -30,6 +30,7 @@ def small(threads: int) -> TrainConfig:
     )
 
 
+@pytest.mark.slow
 def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All keys of the file's schema, positive and finite, and lines that show them."""
     for name, value in {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1}.items():

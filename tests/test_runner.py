@@ -144,6 +144,7 @@ def test_every_study_can_be_sent_elsewhere(name: str) -> None:
     assert len({repr(job) for job in jobs}) == len(jobs)
 
 
+@pytest.mark.slow
 def test_workers_change_no_number_of_an_ablation() -> None:
     """The command runs it in one process; its cases are jobs like any others."""
     question = select_questions(("avoidance",))

@@ -57,6 +57,7 @@ def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, b
     assert signal.getsignal(signal.SIGTERM) == handler and (tmp_path / "once").read_text() == "again"
 
 
+@pytest.mark.slow
 def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
     """Its processes on this machine stand for an array of two tasks; one is killed, and what it has left is submitted again."""
     monkeypatch.setattr("marlbc_mj.studies.engines.slurm_arrays.ALIVE_EVERY", 0.2)

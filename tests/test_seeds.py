@@ -96,6 +96,7 @@ def test_results_depend_on_neither_order_nor_company_nor_a_reused_world(results:
     assert alone["agents"] == results.methods[3].runs[2].metrics["agents"]  # type: ignore[index]
 
 
+@pytest.mark.slow
 def test_workers_change_nothing(results: SeedResults) -> None:
     """Neither results nor what progress is told, only the order in which methods take turns."""
     told = []

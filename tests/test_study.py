@@ -194,6 +194,7 @@ def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     write_comparison(tmp_path, only, [])  # nothing but a failure can still be drawn
 
 
+@pytest.mark.slow
 def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
     """The study passes it on to its worker processes, which save their runs; what there is can be compared."""
 

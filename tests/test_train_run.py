@@ -109,6 +109,7 @@ def test_torch_has_one_thread_wherever_it_computes(method, monkeypatch):
     assert trainer.updates and set(threads) == {1}
 
 
+@pytest.mark.slow
 def test_seeds_differ_and_repeat():
     def rewards(seed):
         trainer = Trainer(small(seed=seed))

@@ -294,6 +294,7 @@ def test_clipping_keeps_each_direction_and_bounds_each_norm(seed, size):
     assert torch.allclose(gradients(net), before * (5.0 / norms).clamp(max=1.0)[:, None], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
     """A corridor of three states with two orders: from the last, the first order is lost; from there on all is lost."""
     config = replace(TrainConfig(), hidden=(32,), copies=2, push_every=10, capacity=4000, learner="plain", risk_gamma=0.5)

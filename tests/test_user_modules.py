@@ -103,6 +103,7 @@ def in_a_process(name: str, cwd: Path) -> list[float]:
     return json.loads(done.stdout)
 
 
+@pytest.mark.slow
 def test_a_users_robot_is_the_same_in_every_process(skate, tmp_path):
     """The second one included, from another folder, by another spelling; after an edit of a helper it is the edited one."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]
@@ -138,6 +139,7 @@ def test_a_robot_is_made_anew_after_an_edit_or_in_another_folder(skate, tmp_path
     assert made() == (1.5, 0.25, 3.0)
 
 
+@pytest.mark.slow
 def test_torn_files_of_the_cache_are_compiled_anew(skate, tmp_path):
     """Whatever another program left there."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]
