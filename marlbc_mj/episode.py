@@ -1,6 +1,6 @@
 """One episode: supervisor and world in turn, and the trajectory they leave behind."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import NamedTuple
@@ -99,90 +99,51 @@ def run_episode(
     """
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
-    frames, last = _play(world, batched(supervisor), world.reset(seed), on_frame)
-    return _trajectory(world, 0, frames[0], last, (seed, *names))
-
-
-def run_episodes(
-    world: World,
-    supervisor: Supervisor | OneTeamSupervisor,
-    seeds: Sequence[int],
-    *,
-    names: tuple[str, str] = ("supervisor", "controller"),
-) -> list[Trajectory]:
-    """Run the episodes of many seeds together, a world each: bit for bit those of :func:`run_episode`, in less time.
-
-    A decision counts as what it took for all, divided by their number.
-
-    Args:
-        world: made with ``worlds=len(seeds), record=True``.
-        supervisor: decides for B teams, or for one.
-        seeds: which draws of the scenario.
-        names: supervisor's and controller's.
-
-    Raises:
-        ConfigurationError: another number of worlds, or a decision of wrong shape or type.
-        SimulationError: one of the worlds diverged.
-    """
-    if world.worlds != len(seeds):
-        raise ConfigurationError(f"run_episodes needs a World of {len(seeds)} worlds, got {world.worlds}")
-    one = World(world.scenario, world.plan.controller, native=world.native, shield=world.shield)
-    for b, seed in enumerate(seeds):
-        one.reset(seed)
-        world.copy_world(one, 0, b)
-    frames, last = _play(world, batched(supervisor), world.observe())
-    return [_trajectory(world, b, frames[b], last, (seed, *names)) for b, seed in enumerate(seeds)]
-
-
-def _play(
-    world: World, supervisor: Supervisor, observation: Observation, on_frame: Callable[[Frame], None] | None = None
-) -> tuple[list[list[Frame]], Observation]:
-    """All worlds to the end of their episodes: the frames of each, and what is seen at the end."""
-    memory, done = start_supervisor(supervisor, world.scenario, world.worlds), False
-    frames: list[list[Frame]] = [[] for _ in range(world.worlds)]
+    supervisor, observation = batched(supervisor), world.reset(seed)
+    memory, done = start_supervisor(supervisor, world.scenario, 1), False
+    frames: list[Frame] = []
     while not done:
         began = perf_counter()
         decision, memory = ask_supervisor(supervisor, observation, memory)
-        decision_ms = 1e3 * (perf_counter() - began) / world.worlds
+        decision_ms = 1e3 * (perf_counter() - began)
         heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
-        before = [(world.state.controller[b].copy(), body_poses(world, b)) for b in range(world.worlds)]
+        before = world.state.controller[0].copy(), decision_ms, body_poses(world)
         step = carry_out(world, decision)
-        for b, (controller_state, pose) in enumerate(before):
-            frames[b].append(_frame(b, observation, step, (controller_state, decision_ms, pose), heard))
-            if on_frame is not None:
-                on_frame(frames[b][-1])
-        observation, done = step.observation, bool(step.done.all())
-    return frames, observation
+        frames.append(_frame(observation, step, before, heard))
+        if on_frame is not None:
+            on_frame(frames[-1])
+        observation, done = step.observation, bool(step.done[0])
+    return _trajectory(world, frames, observation, (seed, *names))
 
 
-def _frame(b: int, seen: Observation, step: Step, others: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
-    """Of world ``b``; ``others`` are controller state, decision time and pose."""
+def _frame(seen: Observation, step: Step, before: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
+    """One mission step; ``before`` are controller state, decision time and pose."""
     if step.record is None:
         raise ConfigurationError("an episode needs a World that keeps every substep: World(..., record=True)")
-    record = Record(*(rows[b] for rows in step.record))
-    shield = None if step.shield is None else ShieldCounts(*(rows[b] for rows in step.shield))
-    links = None if heard is None else heard.team(b)
-    return Frame(seen.team(b), record, step.observation.command[b], float(step.reward[b]), *others, shield, links)
+    record = Record(*(rows[0] for rows in step.record))
+    shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
+    links = None if heard is None else heard.team(0)
+    return Frame(seen.team(0), record, step.observation.command[0], float(step.reward[0]), *before, shield, links)
 
 
-def _trajectory(world: World, b: int, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
-    """The frames of a whole episode in world ``b``, and the ``last`` observation of its end, as one record.
+def _trajectory(world: World, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
+    """The frames of a whole episode, and the ``last`` observation of its end, as one record.
 
     ``names`` are seed, supervisor and controller.
     """
     scenario, state = world.scenario, world.state
     position, velocity, *others = (np.concatenate(rows) for rows in zip(*(f.record for f in frames), strict=True))
     reference, reference_velocity, force = others
-    formation = [*(f.observation.formation for f in frames[1:]), last.formation[b]]
+    formation = [*(f.observation.formation for f in frames[1:]), last.formation[0]]
     return Trajectory(
         scenario=scenario,
         supervisor=names[1],
         controller=names[2],
         seed=names[0],
-        obstacles=(state.anchors if scenario.moving else state.obstacles)[b].copy(),
+        obstacles=(state.anchors if scenario.moving else state.obstacles)[0].copy(),
         time=np.arange(len(position)) * scenario.substep,
-        position=np.concatenate([position, last.position[b, None]]),
-        velocity=np.concatenate([velocity, last.velocity[b, None]]),
+        position=np.concatenate([position, last.position]),
+        velocity=np.concatenate([velocity, last.velocity]),
         reference=reference,
         reference_velocity=reference_velocity,
         force=force,
@@ -191,7 +152,7 @@ def _trajectory(world: World, b: int, frames: list[Frame], last: Observation, na
         reward=np.array([f.reward for f in frames]),
         controller_state=np.array([f.controller_state for f in frames]),
         decision_ms=np.array([f.decision_ms for f in frames]),
-        motions=state.motions[b].copy(),
+        motions=state.motions[0].copy(),
         pose=np.array([f.pose for f in frames]),
         shield=_shield(frames),
         hearing=_hearing(frames),

@@ -99,6 +99,8 @@ class Troubled:
         troubled = (observation.obstacles[:, 0, 0] == self.place) & (observation.time >= 1.0)
         if self.trouble == "raises" and troubled.any():
             raise SimulationError("no plan for this draw")
+        if self.trouble == "slips" and troubled.any():
+            raise KeyError("nothing")
         if self.trouble == "NaN":
             velocity[troubled] = np.nan
         if self.trouble == "diverges":
@@ -106,7 +108,10 @@ class Troubled:
         return Blend(memory, velocity), memory
 
 
-@pytest.mark.parametrize(("trouble", "reason"), [("diverges", "t = 1.0"), ("raises", "no plan for"), ("NaN", "must be finite")])
+@pytest.mark.parametrize(
+    ("trouble", "reason"),
+    [("diverges", "t = 1.0"), ("raises", "no plan for"), ("slips", "KeyError: 'nothing'"), ("NaN", "must be finite")],
+)
 def test_a_draw_that_fails_leaves_the_others_as_they_are(trouble: str, reason: str) -> None:
     """Whether a world diverges, or a supervisor does not say which team it failed for; the reason is that of the draw alone."""
     scenario, controller = held_out(make_scenario("field", duration=2.0)), "finite-time"

@@ -13,7 +13,7 @@ from marlbc_mj.cli import main
 from marlbc_mj.controllers import PD
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.engine.world import World
-from marlbc_mj.episode import Trajectory, run_episode, run_episodes
+from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.recording.links import CLEAREST, FAINTEST, HALF_LIFE, MOST_LINKS, drawn_links
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.reader import read_log
@@ -21,6 +21,7 @@ from marlbc_mj.recording.schemas import COMMUNICATION, decode_hearing, encode_he
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, make_scenario
+from marlbc_mj.studies.batches import Entry, JointFlight
 from marlbc_mj.studies.communication import CASES, CommunicationStudy, NetworkCase, neighbor_distance, time_to_agree
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.supervisors import DistributedLookAhead, LookAhead, make_supervisor
@@ -181,17 +182,17 @@ def test_links_are_in_a_recording_of_rerun(flown, tmp_path):
 
 @pytest.mark.parametrize("supervisor", [DistributedLookAhead(), make_supervisor("fsams-hysteresis")])
 def test_episodes_flown_together_are_those_flown_alone(supervisor):
-    """Every array, bit for bit, whatever is drawn with the seed; only the clock differs."""
+    """Every array that is kept of them, bit for bit, whatever is drawn with the seed; only the clock differs."""
     scenario = gates(duration=1.0, communication=POOR)
-    together = run_episodes(World(scenario, PD(), worlds=2, record=True), supervisor, (4, 9))
-    for one, seed in zip(together, (4, 9), strict=True):
-        alone = run_episode(World(scenario, PD(), record=True), supervisor, seed=seed)
+    flight = JointFlight(Entry(scenario, supervisor, PD(), ("supervisor", "controller"), False), (4, 9))
+    flight.fly(supervisor)
+    assert not flight.failures
+    for b, seed in enumerate((4, 9)):
+        one, alone = flight.trajectory(b), run_episode(World(scenario, PD(), record=True), supervisor, seed=seed)
         for entry in fields(Trajectory):
             a, b = (getattr(each, entry.name) for each in (one, alone))
-            if entry.name != "decision_ms":
+            if entry.name not in ("decision_ms", "controller_state", "pose", "hearing"):
                 np.testing.assert_equal(a, b, err_msg=entry.name)
-    with pytest.raises(ConfigurationError, match="needs a World of 3 worlds, got 2"):
-        run_episodes(World(scenario, PD(), worlds=2, record=True), supervisor, (1, 2, 3))
 
 
 # Command line and study ---------------------------------------------------------------------------------------------------------

@@ -6,11 +6,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from hostile import attack
 from mcap.reader import make_reader
 
 from marlbc_mj.controllers import PD, SORLC
 from marlbc_mj.core import laws
-from marlbc_mj.core.cells import spacing
 from marlbc_mj.core.disturbances import DISTURBANCES, ConstantWind, LinearDrag, PaperDrag, QuadraticDrag, WindGusts
 from marlbc_mj.core.imperfections import Imperfections
 from marlbc_mj.core.shield import ASSUMPTIONS, FORCE_BROKEN, Shield
@@ -136,26 +136,8 @@ class Hostile:
 
 
 def harass(world, steps=300, seed=0, speed=15.0):
-    """Send every agent against an obstacle or another agent of its own, changed now and then.
-
-    Returns the least clearance [m] and the least distance between agents [m] at any substep.
-    """
-    rng, agents = np.random.default_rng(seed), world.scenario.agents
-    clearance, distance = np.inf, np.inf
-    obstacles = world.state.obstacles[0]
-    for step in range(steps):
-        p = world.state.position[0]
-        if step % 25 == 0:
-            targets = rng.integers(0, len(obstacles) + agents, agents)
-        ends = np.concatenate([obstacles[:, :2], p[rng.permutation(agents)]])
-        way = ends[targets] - p
-        world.state.reference[0] = p  # no memory of where it could not go
-        velocity = speed * way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-        record = world.step(np.zeros((1, agents), dtype=np.int64), velocity[None]).record
-        at = np.concatenate([record.position[0], world.state.position])
-        gaps = np.linalg.norm(at[:, :, None] - obstacles[:, :2], axis=-1) - obstacles[:, 2]
-        clearance, distance = min(clearance, gaps.min()), min(distance, spacing(at).min())
-    return clearance, distance
+    """Least clearance [m], and least distance between agents [m], at any substep under attack."""
+    return attack(world, steps, seed, speed=speed, change=25, forget=True)[:2]
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -2,12 +2,11 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
+from hostile import attack
 from test_shield import corridor
 
 from marlbc_mj.controllers import LQR, PD, SORLC
-from marlbc_mj.core.cells import spacing
 from marlbc_mj.core.disturbances import PaperDrag
 from marlbc_mj.core.shield import FORCE_BROKEN, STATE_BROKEN, TUBE_BROKEN, Shield
 from marlbc_mj.engine.shielding import resolve, tracking_tube
@@ -20,26 +19,6 @@ from marlbc_mj.util.errors import ConfigurationError
 def limited(**changes):
     """Point masses among obstacles, with references of limited speed and acceleration."""
     return corridor(speed_limit=3.0, acceleration_limit=4.0, disturbance=PaperDrag(1.0), **changes)
-
-
-def attack(world, steps, seed=0):
-    """References at full speed against obstacles and agents; (least clearance, least spacing, farthest from reference) [m]."""
-    rng, agents = np.random.default_rng(seed), world.scenario.agents
-    clearance, distance, off = np.inf, np.inf, 0.0
-    obstacles = world.state.obstacles[0]
-    for step in range(steps):
-        p = world.state.position[0]
-        if step % 30 == 0:
-            targets = rng.integers(0, len(obstacles) + agents, agents)
-        ends = np.concatenate([obstacles[:, :2], p[rng.permutation(agents)]])
-        way = ends[targets] - p
-        velocity = world.scenario.speed_limit * way / np.maximum(np.linalg.norm(way, axis=1, keepdims=True), 1e-9)
-        record = world.step(np.zeros((1, agents), dtype=np.int64), velocity[None]).record
-        at = np.concatenate([record.position[0], world.state.position])
-        gaps = np.linalg.norm(at[:, :, None] - obstacles[:, :2], axis=-1) - obstacles[:, 2]
-        clearance, distance = min(clearance, gaps.min()), min(distance, spacing(at).min())
-        off = max(off, float(np.linalg.norm(record.position - record.reference, axis=-1).max()))
-    return clearance, distance, off
 
 
 def crowded(robot):
@@ -56,7 +35,7 @@ def test_robots_keep_clear_under_a_supervisor_that_means_harm(robot):
     """In MuJoCo, at every substep, by their own numbers: no assumption is broken. Without a shield they hit something."""
     scenario = crowded(robot)
     world = World(scenario, PD(*make_robot(robot).gains), record=True, shield=True)
-    clearance, distance, off = attack(world, 240)
+    clearance, distance, off = attack(world, 240, speed=world.scenario.speed_limit, change=30)
     assert clearance > scenario.safe_distance
     assert distance > 2.0 * world.plan.robot.radius
     assert world.state.breaches.sum() == 0
@@ -69,7 +48,7 @@ def test_robots_keep_clear_under_a_supervisor_that_means_harm(robot):
 def test_references_of_point_masses_have_a_computed_tube():
     """Nobody leaves it, and it is not three times too wide."""
     world = World(limited(), PD(), record=True, shield=Shield(level="reference"))
-    clearance, distance, off = attack(world, 240)
+    clearance, distance, off = attack(world, 240, speed=world.scenario.speed_limit, change=30)
     tube = world.plan.plant.shield[0].tube
     assert tube == tracking_tube(world.scenario, PD(), PaperDrag(1.0).force_bound())
     assert tube / 3.0 < off <= tube
@@ -82,7 +61,7 @@ def test_references_of_point_masses_have_a_computed_tube():
 def test_a_tube_that_is_too_narrow_is_counted():
     """Whoever is farther from its reference than is assumed."""
     world = World(limited(), PD(), record=True, shield=Shield(tube=1e-3))
-    attack(world, 20)
+    attack(world, 20, speed=world.scenario.speed_limit, change=30)
     assert world.state.breaches[..., TUBE_BROKEN].sum() > 0
     assert world.state.breaches[..., (FORCE_BROKEN, STATE_BROKEN)].sum() == 0
 

@@ -3,7 +3,7 @@
 import csv
 import shutil
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,11 +95,16 @@ def train(
     """
     check_folder(out, overwrite=overwrite)
     run = TrainingRun(make_trainer(config), out)
+    begin_folder(out, run.origin, config)
+    return run.go(progress)
+
+
+def begin_folder(out: Path, origin: Mapping[str, Any], config: Any) -> None:
+    """The folder of a new run: without what another one left there, and with the configuration of this one."""
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         remove_run(out)
-    write_json(out / CONFIG_FILE, {**run.origin, "train": config})
-    return run.go(progress)
+    write_json(out / CONFIG_FILE, {**origin, "train": config})
 
 
 def remove_run(out: Path) -> None:

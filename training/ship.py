@@ -2,6 +2,7 @@
 
 import csv
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -32,12 +33,24 @@ def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False
     Raises:
         ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
     """
+    return put_in_package(run, name, folder, overwrite=overwrite, read=read_policy, write_card=card)
+
+
+def put_in_package(
+    run: Path,
+    name: str,
+    folder: Path,
+    *,
+    overwrite: bool,
+    read: Callable[[Path], tuple[Any, dict[str, Any]]],
+    write_card: Callable[[str, dict[str, Any], list[dict[str, str]]], str],
+) -> Path:
+    """:func:`ship` for any kind of policy: ``read`` gives a checkpoint's description, ``write_card`` the text of the card."""
     source = run / "checkpoint" / "best.safetensors"
-    _, description = read_policy(source)
+    _, description = read(source)
     try:
         with (run / "eval.csv").open() as file:
-            rows = list(csv.DictReader(file))
-        text = card(name, description, rows)
+            text = write_card(name, description, list(csv.DictReader(file)))
     except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise ConfigurationError(f"{run} is not a finished training run: {error!r}") from error
     target = folder / source.with_stem(name).name

@@ -1,7 +1,6 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
 import sys
-from importlib.metadata import version
 from typing import Annotated
 
 from tyro.conf import subcommand
@@ -60,6 +59,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run, see :func:`~marlbc_mj.cli.ending.in_one_line`."""
     with in_one_line("marlbc"):
         if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
+            from importlib.metadata import version
+
             print(f"marlbc {version('marlbc-mj')}")
             return
         command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)

@@ -23,7 +23,7 @@ from marlbc_mj.results.seeds import Instance, SeedRun
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.studies.episodes import check_free
-from marlbc_mj.supervisors import Supervisor, make_supervisor
+from marlbc_mj.supervisors import Supervisor, ask_supervisor, make_supervisor, start_supervisor
 from marlbc_mj.supervisors.base import split_decision
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.progress import Progress, silent
@@ -151,11 +151,11 @@ class JointFlight:
 
         Raises:
             ConfigurationError: a decision of wrong shape or type.
-            SimulationError: the supervisor's.
+            SimulationError: the supervisor's, or it raised an error.
         """
         world, count = self.world, self.world.worlds
         try:
-            memory = supervisor.start(world.scenario, count)
+            memory = start_supervisor(supervisor, world.scenario, count)
         except (ConfigurationError, SimulationError) as error:
             self.failures = {b: self.failures.get(b, str(error)) for b in range(count)}
             return
@@ -164,7 +164,7 @@ class JointFlight:
             if len(self.failures) == count:
                 return
             began = perf_counter()
-            decision, memory = supervisor.decide(observation, memory)
+            decision, memory = ask_supervisor(supervisor, observation, memory)
             self.decision_ms[m] = 1e3 * (perf_counter() - began) / count
             step = world.try_step(*split_decision(decision, shape))
             self._keep(m, step)
@@ -196,14 +196,14 @@ class JointFlight:
         seed, instance = self.seeds[b], self.instances[b]
         if b in self.failures:
             return SeedRun(seed, instance, failure=self.failures[b])
-        trajectory = self._trajectory(b)
+        trajectory = self.trajectory(b)
         try:
             check_free(trajectory, self.entry.law)
         except SimulationError as error:
             return SeedRun(seed, instance, failure=str(error))
         return SeedRun(seed, instance, metrics=measure(trajectory))
 
-    def _trajectory(self, b: int) -> Trajectory:
+    def trajectory(self, b: int) -> Trajectory:
         """What is measured of world ``b``; controllers' states and poses, which no metric reads, are not kept."""
         scenario, state = self.entry.scenario, self.world.state
         position, velocity, reference, reference_velocity, force = (tape[b] for tape in self.record)

@@ -9,21 +9,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.communication import Communication
-from marlbc_mj.engine.world import World
-from marlbc_mj.episode import run_episodes
 from marlbc_mj.report.table import Column, Table, to_markdown
-from marlbc_mj.results.metrics import Metrics, measure
+from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.outcomes import outcome_rates
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.formations import column, grid
 from marlbc_mj.studies.draws import DrawsJob, fly_draws
-from marlbc_mj.studies.episodes import check_free
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.supervisors.communication import Consensus, Flooding, Layer, Radio
-from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
@@ -86,7 +81,7 @@ class CommunicationStudy:
         return [DrawsJob(scenario, self.supervisor, self.controller, self.seeds, self.shield) for scenario in flown]
 
     def run(self, job: DrawsJob, watch: Watch) -> list[Metrics | None]:
-        return _fly_together(job)
+        return [run.metrics for run in fly_draws(job, watch.progress).runs]
 
     def report(self, results: Sequence[list[Metrics | None]], out: Path | None, progress: Progress = silent) -> Report:
         rows = [case_row(mission, case, metrics) for (mission, case), metrics in zip(self.pairs(), results, strict=True)]
@@ -98,19 +93,6 @@ class CommunicationStudy:
             facts = {"supervisor": self.supervisor, "controller": self.controller, "seeds": self.seeds, "shield": self.shield}
             write_json(out / "config.json", {**facts, "missions": self.missions, **provenance()})
         return Report(to_markdown(case_table(rows)))
-
-
-def _fly_together(job: DrawsJob) -> list[Metrics | None]:
-    """Metrics of every seed, in one batch; None for a run that failed. One by one where a world diverged, to tell which."""
-    law = make_controller(job.controller)
-    world = World(job.scenario, law, worlds=len(job.seeds), record=True, shield=job.shield)
-    try:
-        flown = run_episodes(world, make_supervisor(job.supervisor, job.controller), job.seeds)
-        for trajectory in flown:
-            check_free(trajectory, law)
-    except SimulationError:
-        return [run.metrics for run in fly_draws(job).runs]
-    return [measure(trajectory) for trajectory in flown]
 
 
 def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | None]) -> dict[str, Any]:

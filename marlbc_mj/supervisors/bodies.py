@@ -12,6 +12,7 @@ from marlbc_mj.core.laws import allocation_free
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.supervisors.base import Blend
 from marlbc_mj.supervisors.frameworks import Repertoire, behavior_velocities, evaluated_at, repertoire
 from marlbc_mj.supervisors.neighbors import give_way
 from marlbc_mj.util.errors import ConfigurationError, unknown
@@ -66,6 +67,29 @@ def make_cruise(scenario: Scenario, motion: str, margin: float, speed: float, si
         step=float(scenario.mission_step),
     )
     return Cruise(repertoire(scenario, (motion,)), bodies, None)
+
+
+class Cruising:
+    """A supervisor that gives velocities, with these fields."""
+
+    motion: str
+    margin: float
+    speed: float
+    sight: float
+
+    def start(self, scenario: Scenario, teams: int) -> Cruise:
+        """Nobody has moved yet.
+
+        Raises:
+            ConfigurationError: an unknown behavior, or a number that cannot be.
+        """
+        return make_cruise(scenario, self.motion, self.margin, self.speed, self.sight)
+
+
+def give(velocity: np.ndarray, memory: Cruise) -> tuple[Blend, Cruise]:
+    """Velocities (B, N, 2) [m/s] as a decision under the one label that never changes, and remembered."""
+    orders = np.full(velocity.shape[:2], memory.motion.orders[0])
+    return Blend(orders, velocity), memory._replace(velocity=velocity)
 
 
 def wish_of(observation: Observation, memory: Cruise) -> Wish:

@@ -25,14 +25,13 @@ import numpy as np
 from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.laws import allocation_free, compiled
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend
-from marlbc_mj.supervisors.bodies import Cruise, make_cruise, relative, wish_of
+from marlbc_mj.supervisors.bodies import Cruise, Cruising, give, relative, wish_of
 from marlbc_mj.util.errors import ConfigurationError
 
 
 @dataclass(frozen=True)
-class CBFQP:
+class CBFQP(Cruising):
     """Second-order barrier functions on the reference's acceleration; see the module.
 
     Raises:
@@ -53,22 +52,13 @@ class CBFQP:
             if not (np.isfinite(value) and value > 0):
                 raise ConfigurationError(f"CBFQP {name} must be positive and finite, got {value}")
 
-    def start(self, scenario: Scenario, teams: int) -> Cruise:
-        """Nobody has moved yet.
-
-        Raises:
-            ConfigurationError: an unknown behavior, or a number that cannot be.
-        """
-        return make_cruise(scenario, self.motion, self.margin, self.speed, self.sight)
-
     def decide(self, observation: Observation, memory: Cruise) -> tuple[Blend, Cruise]:
         """One velocity per agent, the last one and what the acceleration adds to it."""
         wish = wish_of(observation, memory)
         acceleration = np.empty_like(wish.wanted)
         _accelerate(wish, memory.bodies, self.pole, self.rate, self.acceleration, acceleration)
         velocity = wish.velocity + memory.bodies.step * acceleration
-        orders = np.full(velocity.shape[:2], memory.motion.orders[0])
-        return Blend(orders, velocity), memory._replace(velocity=velocity)
+        return give(velocity, memory)
 
 
 @allocation_free

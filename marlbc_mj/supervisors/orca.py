@@ -19,14 +19,13 @@ import numpy as np
 from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.laws import allocation_free, compiled
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend
-from marlbc_mj.supervisors.bodies import Cruise, make_cruise, relative, wish_of
+from marlbc_mj.supervisors.bodies import Cruise, Cruising, give, relative, wish_of
 from marlbc_mj.util.errors import ConfigurationError
 
 
 @dataclass(frozen=True)
-class ORCA:
+class ORCA(Cruising):
     """Reciprocal velocity obstacles on the velocity of ``motion``; see the module.
 
     Raises:
@@ -43,21 +42,12 @@ class ORCA:
         if not (np.isfinite(self.horizon) and self.horizon > 0):
             raise ConfigurationError(f"ORCA horizon must be positive and finite, got {self.horizon}")
 
-    def start(self, scenario: Scenario, teams: int) -> Cruise:
-        """Nobody has moved yet.
-
-        Raises:
-            ConfigurationError: an unknown behavior, or a number that cannot be.
-        """
-        return make_cruise(scenario, self.motion, self.margin, self.speed, self.sight)
-
     def decide(self, observation: Observation, memory: Cruise) -> tuple[Blend, Cruise]:
         """One velocity per agent."""
         wish = wish_of(observation, memory)
         velocity = np.empty_like(wish.wanted)
         _avoid(wish, memory.bodies, self.horizon, velocity)
-        orders = np.full(velocity.shape[:2], memory.motion.orders[0])
-        return Blend(orders, velocity), memory._replace(velocity=velocity)
+        return give(velocity, memory)
 
 
 @allocation_free

@@ -9,9 +9,8 @@ from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, remove_run, stopper, write_table
-from marlbc_mj.training.saved import CONFIG_FILE
-from marlbc_mj.util.files import check_folder, write_json, writing
+from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, begin_folder, stopper, write_table
+from marlbc_mj.util.files import check_folder
 from marlbc_mj.util.provenance import provenance
 
 CURVE = "eval.csv"
@@ -36,10 +35,7 @@ def train_general(
     """
     check_folder(out, overwrite=overwrite)
     run = GeneralRun(config, out)
-    with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
-        remove_run(out)
-    write_json(out / CONFIG_FILE, {**run.origin, "train": config})
+    begin_folder(out, run.origin, config)
     return run.go(progress)
 
 

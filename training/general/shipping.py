@@ -1,7 +1,5 @@
 """Making a run of the general policy the checkpoint that comes with the package, with its model card."""
 
-import csv
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +9,7 @@ from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.training.config import flat_settings
 from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig
-from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import check_target, staged_file, write_json
+from marlbc_mj.training.ship import put_in_package
 from marlbc_mj.util.provenance import plain_data
 
 
@@ -28,21 +25,7 @@ def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool
     Raises:
         ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
     """
-    source = run / "checkpoint" / "best.safetensors"
-    _, description = read_general(source)
-    try:
-        with (run / "eval.csv").open() as file:
-            text = general_card(name, description, list(csv.DictReader(file)))
-    except (OSError, KeyError, TypeError, ValueError, AttributeError) as error:
-        raise ConfigurationError(f"{run} is not a finished training run: {error!r}") from error
-    target = folder / source.with_stem(name).name
-    check_target(target, overwrite=overwrite)
-    with staged_file(target, overwrite=True) as staging:
-        shutil.copyfile(source, staging)
-    write_json(target.with_suffix(".json"), description)
-    with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
-        staging.write_text(text)
-    return target
+    return put_in_package(run, name, folder, overwrite=overwrite, read=read_general, write_card=general_card)
 
 
 def general_card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
