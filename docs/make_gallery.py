@@ -40,6 +40,7 @@ def shots(names: list[str]) -> Iterator[Shot]:
             controller = make_controller("sorlc")
             world, names_shown = World(paper(), controller, record=True), ("scripted", "sorlc")
             trajectory = run_episode(world, make_supervisor("scripted"), names=names_shown)
+            draw_mission(from_trajectory(trajectory, controller))
             yield Shot(name, from_trajectory(trajectory, controller), "track", 57.0, (41.0, 67.0), 4.0)
         else:
             _, trajectory = fly_gate(name, "scripted")
@@ -47,6 +48,13 @@ def shots(names: list[str]) -> Iterator[Shot]:
             log = from_trajectory(trajectory, GATE_CONTROLLERS["pd"](make_robot(name)))
             clip = 0.35 * duration, 0.60 * duration
             yield Shot(name, log, "close", 0.56 * duration, clip, max(1.0, round((clip[1] - clip[0]) / 6.0)))
+
+
+def draw_mission(log: EpisodeLog) -> None:
+    """The picture of the README: agent 1 avoids the first obstacle."""
+    picture = render_still(log, 20.0, width=1280, height=720, camera="track")
+    colors = Image.fromarray(picture).quantize(256, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)  # keeps small marks
+    colors.save(GALLERY.parent / "mission.png", optimize=True)
 
 
 def draw(shot: Shot) -> None:
