@@ -3,8 +3,8 @@
 The compiled loop runs it for every world; the Python path runs the same source as plain Python, with laws and ``mj_step`` as
 objects; the dm_control task calls its parts from composer's hooks. Its order:
 
-1. :func:`begin`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
-   (``actual``), limited, and held; a shield of references may change it, :func:`shield_references`;
+1. :func:`start`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
+   (``actual``), limited, and held, :func:`begin`; a shield of references may change it, :func:`shield_references`;
 2. for every substep h, :func:`apply`: force from the current errors and weights, weights by explicit Euler, drag at the current
    (p, v), the robot's controls; MuJoCo's step; :func:`settle`: what was reached is measured, p_r += h v_r;
 3. :func:`finish`: obstacles that move are put where they are then; clearances, formation identifier and reward follow from the
@@ -18,7 +18,7 @@ import numpy as np
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.imperfections import sense, weaken
-from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_stopping, restrain_references, shield_team
@@ -27,6 +27,7 @@ from marlbc_mj.core.stopping import TINY, ShieldView
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
+from marlbc_mj.engine.references import call
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
 FORMATION_REWARD = 5.0  # (14), times G
@@ -68,6 +69,9 @@ class Plant(NamedTuple):
 class Native(NamedTuple):
     """What is reached by address: addresses for compiled code, the objects themselves for the Python path."""
 
+    mission_step: Any  # entry of mission_step
+    shield_references: Any  # entry of shield_references
+    shield_forces: Any  # entry of shield_forces
     step: Any  # mj_step
     model: Any  # MjModel
     controller: Any  # law of the whole team
@@ -211,7 +215,7 @@ def begin(b, orders, given, mission, behaviors, team):
     limit(behaviors, mission.mission_step, previous, v_r)
 
 
-@inlined
+@on_both_paths
 def set_forces(b, t, h, native, plant, team):
     """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
 
@@ -242,10 +246,8 @@ def set_forces(b, t, h, native, plant, team):
 
 @allocation_free
 def shield_references(b, mission, behaviors, plant, team):
-    """After :func:`begin`: change v_r of world ``b``, as little as braking in time needs, if its shield is one of references."""
+    """After :func:`begin`: change v_r of world ``b`` as little as braking in time needs. Returns 0."""
     numbers, v_r = plant.shield[0], team.reference_velocity[b]
-    if team.interventions.shape[1] == 0 or not numbers.tube > 0.0:
-        return
     wish, at, duration = team.force[b], team.reference[b], mission.mission_step
     for i in range(v_r.shape[0]):
         for axis in range(2):
@@ -264,6 +266,7 @@ def shield_references(b, mission, behaviors, plant, team):
             if x * x + y * y < kept * kept:
                 team.breaches[b, i, STATE_BROKEN] += mission.substeps
                 break
+    return 0
 
 
 @allocation_free
@@ -275,33 +278,34 @@ def exchange_messages(b, count, view, numbers, team):
     exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, said))
 
 
-@inlined
+@allocation_free
 def shield_forces(b, t, h, plant, team):
-    """Replace the forces of world ``b`` by the nearest that keep the team able to stop, if its shield is one of forces.
-
-    Where it is one of references, whether agents are within the tube around theirs is watched.
-    """
-    if team.last_substep.shape[1] > 0:
-        known = team.sensed.shape[1] > 0
-        p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
-        obstacles = team.obstacles[b]
-        if team.tracks.shape[1] > 0:
-            obstacles = team.tracks[b]
-            move(t, team.anchors[b], team.motions[b], obstacles)
-        view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b])
-        if team.stamps.shape[1] > 0:
-            exchange_messages(b, round(t / h), view, plant.shield[0], team)
-        counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
-        shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
-    elif team.interventions.shape[1] > 0:
-        tube = plant.shield[0].tube
-        for i in range(team.position.shape[1]):
-            x, y = team.position[b, i, 0] - team.reference[b, i, 0], team.position[b, i, 1] - team.reference[b, i, 1]
-            if x * x + y * y > tube * tube:
-                team.breaches[b, i, TUBE_BROKEN] += 1.0
+    """Replace the forces of world ``b`` by the nearest that keep the team able to stop. Returns 0."""
+    known = team.sensed.shape[1] > 0
+    p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
+    obstacles = team.obstacles[b]
+    if team.tracks.shape[1] > 0:
+        obstacles = team.tracks[b]
+        move(t, team.anchors[b], team.motions[b], obstacles)
+    view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b])
+    if team.stamps.shape[1] > 0:
+        exchange_messages(b, round(t / h), view, plant.shield[0], team)
+    counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
+    shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
+    return 0
 
 
-@inlined
+@on_both_paths
+def watch_tube(b, plant, team):
+    """Count the agents of world ``b`` that are farther from their references than a shield of references assumes."""
+    tube = plant.shield[0].tube
+    for i in range(team.position.shape[1]):
+        x, y = team.position[b, i, 0] - team.reference[b, i, 0], team.position[b, i, 1] - team.reference[b, i, 1]
+        if x * x + y * y > tube * tube:
+            team.breaches[b, i, TUBE_BROKEN] += 1.0
+
+
+@on_both_paths
 def apply(b, k, mission, native, plant, team):
     """Substep ``k`` of world ``b`` before MuJoCo's step: force law, shield, drag and robot of every agent, into ctrl and
     qfrc_applied.
@@ -313,7 +317,10 @@ def apply(b, k, mission, native, plant, team):
     failed = set_forces(b, t, h, native, plant, team)
     if not failed:
         force = team.force[b]
-        shield_forces(b, t, h, plant, team)
+        if team.last_substep.shape[1] > 0:
+            call(native.shield_forces, b, t, h, plant, team)
+        elif team.interventions.shape[1] > 0:
+            watch_tube(b, plant, team)
         if plant.loss > 0.0:
             weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
@@ -327,7 +334,7 @@ def apply(b, k, mission, native, plant, team):
     return 0
 
 
-@inlined
+@on_both_paths
 def settle(b, k, mission, native, plant, team, record):
     """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read_robot what was reached, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
@@ -370,11 +377,18 @@ def finish(b, mission, team):
     team.reward[b] += judge(b, mission, team)
 
 
+@on_both_paths
+def start(b, orders, given, mission, behaviors, native, plant, team):
+    """:func:`begin`, and what a shield of references, if the team has one, makes of it."""
+    begin(b, orders, given, mission, behaviors, team)
+    if team.interventions.shape[1] > 0 and plant.shield[0].tube > 0.0:
+        call(native.shield_references, b, mission, behaviors, plant, team)
+
+
 @allocation_free
 def mission_step(b, orders, given, mission, behaviors, native, plant, team, record):
     """One mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
-    begin(b, orders, given, mission, behaviors, team)
-    shield_references(b, mission, behaviors, plant, team)
+    start(b, orders, given, mission, behaviors, native, plant, team)
     team.status[b] = 0
     for k in range(mission.substeps):
         failed = apply(b, k, mission, native, plant, team)
@@ -387,6 +401,7 @@ def mission_step(b, orders, given, mission, behaviors, native, plant, team, reco
     return 1 if team.status[b] else 0
 
 
+start_compiled = allocation_free(start)
 apply_compiled = allocation_free(apply)
 settle_compiled = allocation_free(settle)
 """The parts that need MuJoCo between them, compiled for callers that step it themselves."""

@@ -122,7 +122,7 @@ def place(
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
     team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED
-    judge(b, plan.mission, team)
+    laws.plain(judge)(b, plan.mission, team)
 
 
 def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:
