@@ -12,8 +12,8 @@ from marlbc_mj.core.barriers import Barrier, bound_neighbors, bound_obstacles
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE
 from marlbc_mj.core.braking import restrain
 from marlbc_mj.core.cells import fill, nearest, room
-from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.compiling import allocation_free, on_both_paths
+from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.native import as_behavior
 from marlbc_mj.engine.references import call

@@ -1,25 +1,13 @@
 """How the loop is called: what a World hands over is referred to once, and worlds are stepped in series or by threads."""
 
-from typing import Any, NamedTuple
-
 import numba
 import numpy as np
 
 from marlbc_mj.core.laws import compiled, threaded
-from marlbc_mj.engine.loop import Native, Record, Team, mission_step, shield_forces, shield_references
+from marlbc_mj.engine.loop import mission_step, shield_forces, shield_references
 from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.records import Arguments, Native, Record, Team
 from marlbc_mj.engine.references import call, entry, refer
-
-
-class Arguments(NamedTuple):
-    """What a World hands to the loop at every mission step, besides orders: the records of :mod:`marlbc_mj.engine.loop`."""
-
-    mission: Any
-    behaviors: Any
-    native: Any
-    plant: Any
-    team: Any
-    record: Any
 
 
 def hand_over(plan: Plan, native: Native, team: Team, record: Record, compiled_loop: bool) -> Arguments:

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numba
@@ -18,8 +18,9 @@ from marlbc_mj.core.stopping import NO_SHIELD, ShieldNumbers, as_records
 from marlbc_mj.engine.assembly import agent_prefix, assemble, unfit
 from marlbc_mj.engine.composition import Behaviors, null_space_team, set_based_team
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
-from marlbc_mj.engine.loop import MissionRules, Native, Plant, shield_forces, shield_references
+from marlbc_mj.engine.loop import shield_forces, shield_references
 from marlbc_mj.engine.native import step_address
+from marlbc_mj.engine.records import MissionRules, Native, Plant
 from marlbc_mj.engine.references import entry, refer
 from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, make_robot
@@ -102,7 +103,7 @@ class Plan:
 
 
 def _arrays(data: Any) -> tuple[np.ndarray, ...]:
-    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.loop.Native`."""
+    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.records.Native`."""
     return data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force
 
 
@@ -190,7 +191,7 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
     )
     rows, team = np.zeros((1, 2)), set_based_team if set_based else null_space_team
     compose = entry(team, 0.0, np.zeros(1, dtype=np.int64), refer(behaviors), rows, rows, np.zeros(1), rows, rows)
-    return refer(behaviors._replace(compose=compose))
+    return cast(Behaviors, refer(behaviors._replace(compose=compose)))
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:

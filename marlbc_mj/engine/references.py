@@ -46,13 +46,13 @@ class ReferenceType(types.Type):
 
 
 @register_model(ReferenceType)
-class _ReferenceModel(models.PrimitiveModel):  # type: ignore[misc]
+class _ReferenceModel(models.PrimitiveModel):
     def __init__(self, manager: Any, kind: ReferenceType) -> None:
         super().__init__(manager, kind, manager.lookup(kind.target).get_value_type().as_pointer())
 
 
 @infer_getattr
-class _Fields(AttributeTemplate):  # type: ignore[misc]
+class _Fields(AttributeTemplate):
     key = ReferenceType
 
     def generic_resolve(self, kind: ReferenceType, name: str) -> Any:

@@ -13,9 +13,9 @@ from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.records import Arguments, Record
 from marlbc_mj.engine.references import refer
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -42,7 +42,7 @@ class World:
 
     Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled
     controller the whole mission step runs inside one compiled call. A plain Python one takes the Python path: slower, with the
-    same results. ``state`` is the :class:`~marlbc_mj.engine.loop.Team` of all worlds, ``data`` has one MjData per world.
+    same results. ``state`` is the :class:`~marlbc_mj.engine.records.Team` of all worlds, ``data`` has one MjData per world.
 
     Args:
         scenario: the problem instance.
@@ -101,7 +101,7 @@ class World:
         World.__init__(self, **state["settings"])
         self.restore(state["snapshot"])
 
-    def _make_arguments(self) -> drivers.Arguments:
+    def _make_arguments(self) -> Arguments:
         """What the loop takes besides orders and velocities."""
         plan = self.plan
         self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
