@@ -8,7 +8,10 @@ from tyro.conf import Positional
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a checkpoint's policy as an ONNX file for a robot's computer; needs the onnx extra."""
+    """Write a checkpoint's policy as an ONNX file for a robot's computer; needs the onnx extra.
+
+    The general policy becomes the graph of one agent: what it sensed and heard goes in, its action comes out.
+    """
 
     checkpoint: Positional[Path]
     """Checkpoint, checkpoint/best.safetensors of a run for example."""
