@@ -265,14 +265,14 @@ def test_a_full_disk_during_a_study_is_one_line_and_status_3(tmp_path):
 
 def test_one_process_writes_into_a_folder(tmp_path):
     """A second is refused while the first is at it, and afterwards unless it may overwrite; a folder without a file goes."""
-    out = tmp_path / "run"
+    out = tmp_path / "runs" / "run"
     for content in ("", "a.json"):
         with alone_in(out, overwrite=False):
             with pytest.raises(ConfigurationError, match="is being written by another process"), alone_in(out, overwrite=True):
                 pass
             if content:
                 (out / content).touch()
-        assert out.exists() == bool(content)
+        assert out.parent.exists() == bool(content)
     with pytest.raises(ConfigurationError, match="is not empty"), alone_in(out, overwrite=False):
         pass
     with alone_in(out, overwrite=True):

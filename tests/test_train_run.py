@@ -259,6 +259,7 @@ def test_runs_have_folders_of_their_own(arguments, folder, monkeypatch, capsys):
         (["train", "--budget", "0"], ["budget", "0"]),
         (["train", "--resume", "nowhere"], ["nowhere", RESUME]),
         (["train", "--device", "cuda"], ["cuda"]),
+        (["train", "--set", "copies=2147483648"], ["copies", "more memory than there is"]),
         (
             ["train", "--resume", "x", "--budget", "9", "--threads", "1", "--device", "cpu", "--set", "gamma=0.9", "--out", "y"],
             ["--resume", "--budget, --threads, --device, --set", "--out"],

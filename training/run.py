@@ -25,7 +25,7 @@ from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
 from marlbc_mj.training.saved import CONFIG_FILE, check_origin, check_snapshot, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, enough_memory
 from marlbc_mj.util.files import alone_in, remove_leftovers, staged_file, write_json, writing
 from marlbc_mj.util.provenance import provenance
 
@@ -34,6 +34,8 @@ TABLES = ("eval.csv", "progress.csv")
 COUNTED = ("wall_s", "mission_steps")
 """First columns of both tables."""
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
+SIZES = "these settings (worlds, hidden, copies, capacity, batch)"
+"""What a run's memory depends on, for messages."""
 TrainingScores = dict[str, float]
 """A line of eval.csv or progress.csv."""
 TrainingProgress = Callable[[BaseTrainer, TrainingScores], None]
@@ -93,7 +95,7 @@ def train(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite):
+    with alone_in(out, overwrite=overwrite), enough_memory(SIZES):
         run = TrainingRun(make_trainer(config), out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
@@ -131,7 +133,7 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
     path = out / RESUME
     if not path.is_file():
         raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
-    with alone_in(out, overwrite=True):
+    with alone_in(out, overwrite=True), enough_memory(SIZES):
         return _restored(path).go(progress)
 
 

@@ -66,13 +66,15 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def alone_in(out: Path, *, overwrite: bool) -> Iterator[None]:
-    """Write into ``out``, which is made, as the only process of this program that does; left without a file, it is removed.
+    """Write into ``out``, which is made, as the only process of this program that does.
+
+    What was made is removed, with its parents, if no file is left there.
 
     Raises:
         ConfigurationError: another process is at it; ``out`` holds something (and ``overwrite`` is off), or cannot be written.
     """
     check_folder(out, overwrite=overwrite)
-    made = not out.exists()
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     with held_alone(out, busy(out)):
@@ -80,9 +82,9 @@ def alone_in(out: Path, *, overwrite: bool) -> Iterator[None]:
         try:
             yield
         finally:
-            if made:
-                with suppress(OSError):
-                    out.rmdir()
+            for folder in made:
+                with suppress(OSError):  # there is something in it
+                    folder.rmdir()
 
 
 def busy(out: Path) -> str:
