@@ -28,11 +28,12 @@ from marlbc_mj.studies.packs import entries, packs
 
 MOST_SECONDS = 400.0  # of one command
 ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
-TIMES = ("decision", "wall", "solver", "command", "seconds", "steps_per_s", "git_revision")
+TIMES = ("decision", "wall", "cpu_s", "solver", "command", "seconds", "steps_per_s", "git_revision")
 """What may differ between two runs: keys and columns with any of these in their names."""
 TEMPORARY = (".partial", ".old-", ".begun-", ".new-")
 """Parts of names that nothing has that is left in the end."""
 TINY = ["worlds=8", "hidden=8", "batch=16", "updates=1", "capacity=400", "start_length=1.0", "evaluate_every=800"]
+SMALL = ["families=field", "teams=wedge-4", "worlds=2", "hidden=8", "batch=16", "updates=2", "layouts=1", "evaluate_every=600"]
 SHORT = ["--duration", "4", "--overwrite"]
 RAY_PARTS = ("ray::", "raylet", "gcs_server")
 
@@ -90,6 +91,7 @@ TARGETS = {
         ("train", "--budget", "6400", "--threads", "1", "--overwrite", "--out", "OUT", "--set", *TINY),
         again=_resumed,
     ),
+    "general": Target(("train", "marlms-general", "--budget", "2000", "--overwrite", "--out", "OUT", "--set", *SMALL)),
     "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
     "video": Target(("video", "LOG", "--width", "160", "--height", "90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
 }

@@ -250,6 +250,7 @@ def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, f
     ("call", "message"),
     [
         (lambda: seed_range(0), "seeds must be at least 1, got 0"),
+        (lambda: seed_range(2**63), "seeds must be at most 10000000 in one run, got 9223372036854775808"),
         (lambda: seed_range(3, first=-1), "seed must not be negative, got -1"),
         (lambda: run_seeds(paper(), (), ("pd",), (0,)), "at least one supervisor"),
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), ()), "at least one seed"),

@@ -57,12 +57,14 @@ class Scatter:
 
     def _first_free(self, places: np.ndarray, radius: float, discs: np.ndarray) -> int:
         """Index of the first of ``places`` (P, 2) with room for a disc among ``discs`` (k, 3); -1 if there is none."""
-        for first in range(0, len(places), 20):  # a few at a time: most discs find room soon
-            some = places[first : first + 20]
+        first = 0
+        while first < len(places):  # one place, then more and more at a time: most discs find room soon, also among thousands
+            some = places[first : 2 * first + 1]
             room = np.linalg.norm(some[:, None] - discs[None, :, :2], axis=-1) - discs[:, 2] - radius
             free = np.flatnonzero((room >= self.gap).all(axis=1))
             if len(free):
                 return first + int(free[0])
+            first += len(some)
         return -1
 
     def _reason(self, what: str) -> str:

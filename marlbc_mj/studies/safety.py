@@ -14,7 +14,7 @@ import numpy as np
 from marlbc_mj.report.safety_tables import safety_tables, write_cells
 from marlbc_mj.report.table import to_markdown
 from marlbc_mj.results.layouts import CellScores, Marks, MissionCell, mark
-from marlbc_mj.results.seeds import SeedRun
+from marlbc_mj.results.seeds import SeedRun, seed_range
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
 from marlbc_mj.studies.batches import evaluate_batch
@@ -120,7 +120,7 @@ class SafetyStudy:
         first = self.seed
         if cell.mission in DRAG_DRAWS:
             count, first = min(count, DRAWS_EACH), DRAG_DRAWS[cell.mission][1]
-        return tuple(range(first, first + count))
+        return seed_range(count, first)
 
     def run(self, job: SafetyJob, watch: Watch) -> Marks:
         scenario, cell = ground(job.cell.mission), job.cell

@@ -22,7 +22,7 @@ from typing import Any
 from marlbc_mj.studies import codec
 from marlbc_mj.studies.packs import PackWriter, entries, next_pack, packs
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import JOBS_FOLDER, check_folder, duplicate, remove_orphans, write_json, writing
+from marlbc_mj.util.files import JOBS_FOLDER, busy, check_folder, duplicate, remove_orphans, write_json, writing
 from marlbc_mj.util.locks import held_alone
 
 STORE_SCHEMA = 1
@@ -140,7 +140,7 @@ def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
     folder, made = out / JOBS_FOLDER, not out.exists()
     with writing(out):
         folder.mkdir(parents=True, exist_ok=True)
-    with held_alone(folder / _LOCK, f"{out} is being written by another process; wait for it or choose another folder"):
+    with held_alone(folder / _LOCK, busy(out)):
         store = RunStore(folder)
         try:
             yield store

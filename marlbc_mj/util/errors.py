@@ -1,6 +1,7 @@
 """The two ways in which this package refuses to go on; every message names the value and the valid ones."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 
 class MarlbcError(Exception):
@@ -28,3 +29,18 @@ class NoSpaceError(ConfigurationError):
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
     """The error for a name that is not in a list: says which one and shows the list."""
     return ConfigurationError(f"unknown {kind} {name!r}; choose from: {', '.join(valid)}")
+
+
+@contextmanager
+def enough_memory(what: str) -> Iterator[None]:
+    """Turn a lack of memory inside the block, Python's, NumPy's or torch's, into one line about ``what``.
+
+    Raises:
+        ConfigurationError: memory was asked for that is not there.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MarlbcError) or not (isinstance(error, MemoryError) or "allocate memory" in str(error)):
+            raise
+        raise ConfigurationError(f"{what} need more memory than there is") from error

@@ -9,8 +9,9 @@ from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, begin_folder, stopper, write_table
-from marlbc_mj.util.files import check_folder
+from marlbc_mj.training.run import CHECKPOINT, SIZES, Interrupted, TrainingScores, begin_folder, stopper, write_table
+from marlbc_mj.util.errors import enough_memory
+from marlbc_mj.util.files import alone_in
 from marlbc_mj.util.provenance import provenance
 
 CURVE = "eval.csv"
@@ -30,13 +31,13 @@ def train_general(
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: a setting that cannot be run, or ``out`` is not empty.
+        ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    check_folder(out, overwrite=overwrite)
-    run = GeneralRun(config, out)
-    begin_folder(out, run.origin, config)
-    return run.go(progress)
+    with alone_in(out, overwrite=overwrite), enough_memory(SIZES):
+        run = GeneralRun(config, out)
+        begin_folder(out, run.origin, config)
+        return run.go(progress)
 
 
 class GeneralRun:
