@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from marlbc_mj.training.methods import METHODS, PPO, WITHOUT_RISKS
 from marlbc_mj.training.shaping import Shaping
@@ -221,17 +221,23 @@ def make_config(preset: str, **changes: Any) -> TrainConfig:
 
 
 _JSON = json_data()
+Configuration = TypeVar("Configuration")
 
 
 def from_json(data: Mapping[str, Any]) -> TrainConfig:
-    """The configuration whose JSON data :func:`marlbc_mj.util.provenance.plain_data` gives; settings that are missing have their
-    defaults.
+    """:func:`config_from_json` of a run for one team."""
+    return config_from_json(data, TrainConfig)
+
+
+def config_from_json(data: Mapping[str, Any], kind: type[Configuration]) -> Configuration:
+    """The configuration, of a ``kind``, whose JSON data :func:`marlbc_mj.util.provenance.plain_data` gives; settings that are
+    missing have their defaults.
 
     Raises:
         ConfigurationError: an unknown setting or a value that cannot be run.
     """
     try:
-        config: TrainConfig = convert(_JSON, _without_types(data), TrainConfig)
+        config: Configuration = convert(_JSON, _without_types(data), kind)
     except ConfigurationError as error:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error
     return config

@@ -110,6 +110,8 @@ class GeneralConfig:
 
     evaluate_every: Annotated[int, AT_LEAST_ONE] = 400_000
     """Mission steps between evaluations on held-out layouts."""
+    save_every: Annotated[float, NOT_NEGATIVE] = 120.0
+    """Time between saves for --resume [s]; a save of the default buffer takes 0.4 GB."""
     layouts: Annotated[int, AT_LEAST_ONE] = 10
     """Held-out layouts of each family per evaluation."""
     threads: Annotated[int, AT_LEAST_ONE] = 1
