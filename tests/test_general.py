@@ -300,7 +300,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(
     """A signal saves the run; resumed by the command, it ends with the networks of a run that nobody stopped."""
     short = {"field_wedge-4": make_scenario("field", composition="set-based", split="test", duration=2.0)}
     monkeypatch.setattr("marlbc_mj.training.general.run.judging_scenarios", lambda _: short)
-    config = replace(SMALL, budget=800, evaluate_every=10_000, lossy=1.0, start_spread=0.1)
+    config = replace(SMALL, budget=800, evaluate_every=10_000, lossy=1.0, start_spread=0.1, capacity=2_000)
     train_general(config, tmp_path / "whole")
     calls, advance = itertools.count(1), GeneralTrainer.advance
 
