@@ -91,7 +91,7 @@ TARGETS = {
         again=_resumed,
     ),
     "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
-    "video": Target(("video", "LOG", "--width", "160", "--height", "90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
+    "video": Target(("video", "LOG", "--size", "160x90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
 }
 """By name."""
 

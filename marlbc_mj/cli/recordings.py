@@ -12,26 +12,24 @@ from marlbc_mj.cli.terminal import progress_bars
 
 @dataclass(frozen=True)
 class VideoCommand:
-    """Render a video from a log, off-screen."""
+    """Render a video from a log, off-screen: .mp4, .webp or .gif."""
 
     log: Positional[Path]
     """MCAP log."""
     out: Path | None = None
-    """Video file; the log's name with .mp4 by default."""
+    """Video file, whose ending chooses the format; the log's name with .mp4 by default."""
     speed: float = 4.0
     """Mission seconds per video second."""
     fps: int = 30
     """Frames per second."""
     camera: str = "track"
-    """Camera: track or top."""
+    """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one of the model."""
     start: float | None = None
     """First mission time shown [s]."""
     end: float | None = None
     """Last mission time shown [s]."""
-    width: int = 1280
-    """Picture width [pixel]."""
-    height: int = 720
-    """Picture height [pixel]."""
+    size: str = "1280x720"
+    """Width and height [pixel]."""
     samples: int = 0
     """Multisampling of edges: 0 is fast, 4 is smoother and takes about twice as long."""
     overwrite: bool = False
@@ -41,9 +39,11 @@ class VideoCommand:
         """Render, with progress; the backend is named once there is a first frame."""
         from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
-        from marlbc_mj.recording.video import VideoStyle, render_video
+        from marlbc_mj.recording.video import VideoStyle, parse_size, render_video
 
         out = self.out or self.log.with_suffix(".mp4")
+        given = {field.name: getattr(self, field.name) for field in fields(VideoStyle)}
+        style = VideoStyle(**{**given, "size": parse_size(self.size)})
         with progress_bars() as progress:
 
             def show(done: int, total: int) -> None:
@@ -51,7 +51,6 @@ class VideoCommand:
                     print(f"marlbc: off-screen rendering with {choose_gl()}", file=sys.stderr)
                 progress("video", done, total)
 
-            style = VideoStyle(**{field.name: getattr(self, field.name) for field in fields(VideoStyle)})
             render_video(read_log(self.log), out, style, overwrite=self.overwrite, progress=show)
         print(out)
 

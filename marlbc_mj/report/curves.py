@@ -12,15 +12,15 @@ from marlbc_mj.controllers.sorlc import STATE, Weights, weights
 from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.method_names import source_of
-from marlbc_mj.util.palette import AGENT_COLORS, command_color
+from marlbc_mj.util.method_names import source_of
+from marlbc_mj.util.palette import METHOD_COLORS, command_color
 from marlbc_mj.util.stretches import stretches
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
 _ZOOM = 2.0  # width of the window that shows single force pulses [s]
 _PULSE = 1.0  # the same for one pulse [s]
-_AXIS_COLORS = (AGENT_COLORS[0], AGENT_COLORS[1])  # of the x and the y axis, where one agent is shown alone
+_AXIS_COLORS = METHOD_COLORS[:2]  # of the x and the y axis, where one agent is shown alone
 _FLAT = 1e-9  # relative change below which a weight counts as constant
 _SMALLEST_NORM = 1e-6  # share of the largest below which a norm is not drawn on a logarithmic axis
 

@@ -9,15 +9,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.method_names import source_of
 from marlbc_mj.report.paper_tables import LIMITED, one_per_controller, one_per_supervisor
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.method_names import source_of
+from marlbc_mj.util.palette import METHOD_COLORS
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
-_COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
 
 _INK, _PAPER = "#1A1A1A", "#FFFFFF"
 _COST_UNIT = "[s, SI squared]"  # the paper adds m^2, (m/s)^2 and N^2
@@ -166,7 +165,7 @@ def _law(result: Result) -> str:
 
 
 def _style(supervisor: int, law: int, hollow: bool) -> dict[str, Any]:
-    color = _COLORS[supervisor % len(_COLORS)]
+    color = METHOD_COLORS[supervisor % len(METHOD_COLORS)]
     return {
         "marker": _MARKERS[law % len(_MARKERS)],
         "markerfacecolor": "white" if hollow else color,

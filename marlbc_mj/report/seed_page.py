@@ -20,7 +20,7 @@ from marlbc_mj.results.seed_statistics import MethodStatistics, analyse
 from marlbc_mj.results.seeds import SeedResults
 from marlbc_mj.results.summary import AGENT_KEYS
 from marlbc_mj.util.files import write_json
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.palette import METHOD_COLORS
 from marlbc_mj.util.progress import Progress
 
 FIGURE = "intervals"
@@ -34,7 +34,7 @@ def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     supervisors = list(dict.fromkeys(s.runs.supervisor for s in methods))
     for axes, name in zip(panels[0], names, strict=True):
         for k, s in enumerate(methods):
-            color = AGENT_COLORS[supervisors.index(s.runs.supervisor) % len(AGENT_COLORS)]
+            color = METHOD_COLORS[supervisors.index(s.runs.supervisor) % len(METHOD_COLORS)]
             estimate = s.medians[name]
             axes.plot([estimate.low, estimate.high], [k, k], color=color, linewidth=2.0, alpha=0.45)
             axes.plot(estimate.value, k, "o", color=color, markersize=3.5)

@@ -245,8 +245,7 @@ def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str
         folder / f"{name}.mp4",
         VideoStyle(
             speed=float(max(1, round((end - start) / 10.0))),
-            width=960,
-            height=540,
+            size=(960, 540),
             camera="close",
             start=start,
             end=end,

@@ -42,7 +42,7 @@ SHORT: tuple[tuple[str, ...], ...] = (
     ("study", "lenient", "--seeds", "0"),
     ("ship", "run", "mine"),
     ("export", "p.safetensors", "p.onnx"),
-    ("video", "torn.mcap", "--width", "64", "--height", "64"),
+    ("video", "torn.mcap", "--size", "64x64"),
     ("view", "torn.mcap"),
     ("log", "info", "a.mcap"),
     ("log", "recover", "torn.mcap", "b.mcap"),

@@ -1,4 +1,4 @@
-"""Names and sources of supervisors and controllers as a leaderboard shows them; the literature is listed in REFERENCES.md."""
+"""Names and sources of supervisors and controllers as people read them; the literature is listed in REFERENCES.md."""
 
 from typing import NamedTuple
 
