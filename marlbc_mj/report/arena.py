@@ -14,7 +14,7 @@ from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.core.safety import violates
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.method_names import source_of
+from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import command_color
 from marlbc_mj.util.stretches import stretches
 

@@ -12,7 +12,7 @@ from marlbc_mj.controllers.sorlc import STATE, Weights, weights
 from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.method_names import source_of
+from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import AGENT_COLORS, command_color
 from marlbc_mj.util.stretches import stretches
 

@@ -21,10 +21,10 @@ from marlbc_mj.report.curves import (
     weight_norms,
 )
 from marlbc_mj.report.formats import listed
-from marlbc_mj.report.method_names import source_of
 from marlbc_mj.report.paper_tables import one_per_controller, one_per_supervisor
 from marlbc_mj.report.pareto import coincident, pareto
 from marlbc_mj.results.summary import Result
+from marlbc_mj.util.method_names import source_of
 
 FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
 """Controllers of the frameworks in Figures 8 and 9."""

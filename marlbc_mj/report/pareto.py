@@ -9,11 +9,11 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from marlbc_mj.report import plotting as pl
-from marlbc_mj.report.method_names import source_of
 from marlbc_mj.report.paper_tables import LIMITED, one_per_controller, one_per_supervisor
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result
+from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import AGENT_COLORS
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
