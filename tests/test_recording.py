@@ -28,8 +28,9 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.recording import schemas
+from marlbc_mj.recording.exports import export_log
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
-from marlbc_mj.recording.reader import export_log, log_info, read_log, recover_log
+from marlbc_mj.recording.reader import log_info, read_log, recover_log
 from marlbc_mj.recording.writer import LogWriter, partial_name
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor

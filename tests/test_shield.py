@@ -19,8 +19,9 @@ from marlbc_mj.engine.shielding import LEAST_CREEP, resolve
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.recording import schemas
+from marlbc_mj.recording.exports import export_log
 from marlbc_mj.recording.log import from_trajectory
-from marlbc_mj.recording.reader import export_log, read_log
+from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.results.metrics import measure

@@ -5,9 +5,10 @@ arrays of arrays, PlotJuggler refuses a channel without a schema. Hence every to
 ``agents`` of flat objects, and a number that is not finite is left out: JSON has neither NaN nor Infinity.
 """
 
+import base64
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -134,12 +135,22 @@ COMMUNICATION = Topic(
         "oldest": MessageField("number", "greatest of the ages [s]"),
     },
 )
-TOPICS = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
+SUBSTEPS = Topic(
+    "/substeps",
+    "marlbc.Substeps",
+    "position, velocity, reference, reference velocity and force of every substep of a mission step, for metrics",
+    {},
+    {
+        "substeps": MessageField("integer", "how many there are"),
+        "data": MessageField("string", "packed numbers, see encode_substeps"),
+    },
+)
+TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEPS, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and those whose communication is not ideal
-``COMMUNICATION``.
+All logs written since 0.1.0 have ``SUBSTEPS``. Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and
+those whose communication is not ideal ``COMMUNICATION``.
 """
 
 
@@ -208,6 +219,41 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
             raise ValueError(f"an agent knows {len(ages)} ages, of {agents} agents")
         age[i] = ages
     return Hearing(link, age)
+
+
+def encode_substeps(rows: Sequence[np.ndarray], after: np.ndarray) -> bytes:
+    """A message on ``SUBSTEPS``.
+
+    Its data are little-endian doubles: positions, with those at the end of the mission step behind them, velocities, references,
+    reference velocities and forces; of each, agent by agent and axis by axis, all substeps. They are sorted by their bytes, first
+    bytes first, since neighbors have most of them in common, and written in base64.
+
+    Args:
+        rows: the five, (substeps, N, 2) each.
+        after: position at the end of the mission step (N, 2) [m].
+    """
+    position, *others = rows
+    tracks = [np.concatenate([position, after[None]]), *others]
+    numbers = np.concatenate([track.transpose(1, 2, 0).ravel() for track in tracks]).astype("<f8")
+    packed = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 8).T)
+    scalars = [f'"substeps":{len(position)}', f'"data":"{base64.b64encode(packed.data).decode()}"']
+    return message(scalars, "")
+
+
+def decode_substeps(row: Mapping[str, Any], agents: int) -> list[np.ndarray]:
+    """What :func:`encode_substeps` packed of ``agents``: positions (substeps + 1, N, 2), then the others (substeps, N, 2).
+
+    Raises:
+        ValueError: data that it does not write.
+    """
+    packed = np.frombuffer(base64.b64decode(row["data"], validate=True), np.uint8).reshape(8, -1)
+    numbers = np.ascontiguousarray(packed.T).view("<f8").ravel()
+    steps = int(row["substeps"])
+    ends = np.cumsum([2 * agents * (steps + 1), *[2 * agents * steps] * 4])
+    if len(numbers) != ends[-1] or not np.isfinite(numbers).all():
+        raise ValueError(f"{len(numbers)} numbers of {steps} substeps of {agents} agents, or not finite ones")
+    tracks = np.split(numbers, ends[:-1])
+    return [np.ascontiguousarray(track.reshape(agents, 2, -1).transpose(2, 0, 1)) for track in tracks]
 
 
 def message(scalars: list[str], rows: str) -> bytes:

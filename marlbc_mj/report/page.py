@@ -51,7 +51,7 @@ class EmbeddedVideo(NamedTuple):
 class MethodSection(NamedTuple):
     """A folding section of one method."""
 
-    key: str
+    name: str
     facts: str
     failed: bool = False
     narrow: Sequence[Picture] = ()
@@ -68,6 +68,7 @@ def write_benchmark_page(
     paragraph: str = "",
     video: Path | None = None,
     links: Sequence[Path] = (),
+    awaited: int = 0,
 ) -> Path:
     """Write the page of a benchmark.
 
@@ -75,14 +76,15 @@ def write_benchmark_page(
         path: the file to write.
         results: in the order in which methods are shown.
         config: of the run: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``.
-        tables: as :func:`marlbc_mj.report.tables.make_tables` gives them, the one of all metrics first.
+        tables: as :func:`marlbc_mj.report.tables.make_tables` gives them, those of all metrics first.
         figures: folder that :func:`marlbc_mj.report.figures.write_figures` wrote to; figures that are not there are left out.
         paragraph: plain text, shown above the tables.
         video: an mp4 to embed, or to link to beyond 20 MB.
         links: files to list, linked relative to the page.
+        awaited: how many methods there will be, for a page that is written before all have ended; 0: these are all.
     """
     scenario, drawn = config["scenario"], plots(results)
-    failed = [(result.key, str(result.failure)) for result in results if result.metrics is None]
+    failed = [(result.display, str(result.failure)) for result in results if result.metrics is None]
     facts = [
         *scenario_facts(scenario),
         ("Limits", f"force {scenario.force_limit:g} N per axis, safe distance {scenario.safe_distance:g} m"),
@@ -104,6 +106,7 @@ def write_benchmark_page(
         paragraph=paragraph,
         pictures=_pictures(figures, [p for p in drawn if p.method is None]),
         video=_video(video, path.parent) if video else None,
+        awaited=awaited,
         methods=[_method(result, [p for p in drawn if p.method == result.key], figures) for result in results],
     )
 
@@ -175,13 +178,13 @@ def _lead(results: Sequence[Result], scenario: Scenario) -> str:
 def _method(result: Result, own: Sequence[Plot], figures: Path) -> MethodSection:
     metrics = result.metrics
     if metrics is None:
-        return MethodSection(result.key, "failed", failed=True)
+        return MethodSection(result.display, "failed", failed=True)
     facts = (
         f"return {score_cell('return', metrics)}, switches {switches_text(metrics)}, "
         f"least clearance {score_cell('clearance_min_worst', metrics)} m"
     )
     narrow, wide = (_pictures(figures, [plot for plot in own if plot.narrow is which]) for which in (True, False))
-    return MethodSection(result.key, facts, narrow=narrow, wide=wide)
+    return MethodSection(result.display, facts, narrow=narrow, wide=wide)
 
 
 def _video(video: Path, folder: Path) -> EmbeddedVideo:

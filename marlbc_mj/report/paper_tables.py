@@ -11,6 +11,7 @@ from marlbc_mj.report.paper_values import Published, order_mark
 from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.metrics import AgentMetrics
 from marlbc_mj.results.summary import Result
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.text import one_line
 
 SAME_ORDER = "same order"
@@ -70,7 +71,7 @@ def switches(chosen: Mapping[str, Result], published: bool) -> Table:
         "Number of behavior priority switches of each mission supervisor (Table 3 of the paper)",
         "supervisor",
         _Comparison(chosen, (SWITCHES,), paper_values.PAPER_SUPERVISORS if published else {}),
-        ("Orders that command the same motion count as equal.", "Controller: sorlc, or the one in brackets."),
+        ("Orders that command the same motion count as equal.", "Controller: SORLC, or the one in brackets."),
     )
 
 
@@ -78,7 +79,7 @@ def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool)
     """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
     return _table(
         "control-cost",
-        f"Maximum and total control cost of each controller under the {supervisor} supervisor (Table 5 of the paper)",
+        f"Maximum and total control cost of each controller under {display_name(supervisor)} (Table 5 of the paper)",
         "controller",
         _Comparison(chosen, (COST_MAX, COST_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -92,7 +93,7 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
     """Table 6: maximum and total control input; blocks as in Table 5."""
     return _table(
         "control-input",
-        f"Maximum and total control input of each controller under the {supervisor} supervisor (Table 6 of the paper)",
+        f"Maximum and total control input of each controller under {display_name(supervisor)} (Table 6 of the paper)",
         "controller",
         _Comparison(chosen, (INPUT_MAX, INPUT_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -134,7 +135,7 @@ class _Comparison:
         """One per quantity and agent, and the one relative to SORLC."""
         groups = [q.label if self.of_controllers else "" for q in self.quantities]
         columns = [Column(group, f"agent {i + 1}") for group in groups for i in range(self.agents)]
-        return columns + ([Column("total", "over sorlc's")] if self.relative else [])
+        return columns + ([Column("total", "over SORLC's")] if self.relative else [])
 
     def block(self, keys: Sequence[str]) -> list[tuple[str, ...]]:
         """Rows of these methods, each with the published numbers below it where there are some."""
@@ -159,13 +160,18 @@ class _Comparison:
     def notes(self) -> list[str]:
         """What the columns are, what is published but did not run here, and what failed."""
         told = [n for n in TOLD if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
-        notes = [f"Told the true drag, which the others have to identify or ignore: {', '.join(told)}."] if told else []
-        notes += ["Last column: sum of the totals over agents, relative to sorlc."] if self.relative else []
+        notes = (
+            [f"Told the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
+            if told
+            else []
+        )
+        notes += ["Last column: sum of the totals over agents, relative to SORLC."] if self.relative else []
         return [*notes, *_missing(self.chosen, self.quantities, self.names), *map(failure_note, failures(self.chosen.values()))]
 
     def _row(self, key: str) -> tuple[str, ...]:
         result, metrics = self.chosen[key], self.chosen[key].metrics
-        title = key if self.of_controllers or result.controller == "sorlc" else f"{key} ({result.controller})"
+        usual = self.of_controllers or result.controller == "sorlc"
+        title = display_name(key) + ("" if usual else f" ({display_name(result.controller)})")
         if metrics is None:
             cells = [FAILED, *[DASH] * (self.agents * len(self.quantities) - 1)]
         else:
@@ -213,22 +219,18 @@ def decision_time(chosen: Mapping[str, Result], published: bool) -> Table:
     shares = any(r.solver_share is not None for r in chosen.values())
     columns = _decision_columns(shares, bool(sums))
     rows = [
-        (name, *_measured(r, shares), *(_beside(source.get(name), medians.get(name)) if sums else []))
+        (display_name(name), *_measured(r, shares), *(_beside(source.get(name), medians.get(name)) if sums else []))
         for name, r in chosen.items()
     ]
-    mark, rules = order_mark(medians, sums), []
     notes = ["Here: one call that decides for all agents, every method in the same process. Published: on another machine."]
-    if mark != DASH:
-        rules.append(len(rows))
-        rows.append((SAME_ORDER, mark, *[""] * (len(columns) - 2)))
-        notes.append(_ORDER_NOTE)
+    notes += ["Orders are not compared: they would depend on the machine and on the hour."] if sums else []
     if shares:
         notes.append("Network or solver: its share of the decision time, where the supervisor measures it.")
     quantity = Quantity(4, "", paper_values.PUBLISHED_DECISION_MS, lambda agent: 0.0, 1)
     notes += _missing(chosen, (quantity,), paper_values.PAPER_SUPERVISORS if published else {})
     notes += map(failure_note, failures(chosen.values()))
     caption = "Time for one decision of each mission supervisor (Table 4 of the paper)"
-    return Table("decision-time", caption, tuple(columns), tuple(rows), tuple(notes), tuple(rules))
+    return Table("decision-time", caption, tuple(columns), tuple(rows), tuple(notes))
 
 
 def _decision_columns(shares: bool, published: bool) -> list[Column]:
@@ -272,4 +274,4 @@ def failures(results: Iterable[Result]) -> list[Result]:
 
 def failure_note(result: Result) -> str:
     """Which method failed and why, in one line."""
-    return f"{result.key} failed: {one_line(result.failure).rstrip('.')}."
+    return f"{result.display} failed: {one_line(result.failure).rstrip('.')}."

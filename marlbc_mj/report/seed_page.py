@@ -29,7 +29,9 @@ FIGURE = "intervals"
 def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     """Median and 95 % interval of return, violation time and effort: one line per method, with a word where all runs failed."""
     names = ("return", "violation_time_worst", "effort_integral_sum")
-    margins = pl.Margins(left=0.2 + 0.054 * max(len(s.runs.key) for s in methods), top=0.12, across=0.22)  # room for the names
+    margins = pl.Margins(
+        left=0.2 + 0.054 * max(len(s.runs.display) for s in methods), top=0.12, across=0.22
+    )  # room for the names
     figure, panels = pl.panels(pl.DOUBLE, 0.65 + 0.16 * len(methods), 1, len(names), margins, sharey=True)
     supervisors = list(dict.fromkeys(s.runs.supervisor for s in methods))
     for axes, name in zip(panels[0], names, strict=True):
@@ -51,7 +53,7 @@ def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     ours = [s.medians[names[-1]].value for s in methods if s.medians[names[-1]].value > 0]
     if ours and max(ours) > 30 * min(ours):
         panels[0, -1].set_xscale("log")
-    panels[0, 0].set_yticks(range(len(methods)), [s.runs.key for s in methods])
+    panels[0, 0].set_yticks(range(len(methods)), [s.runs.display for s in methods])
     panels[0, 0].set_ylim(len(methods) - 0.4, -0.6)
     return figure
 
@@ -120,7 +122,7 @@ def _write_page(
 class _MethodTable(NamedTuple):
     """A folding section with every metric of every agent."""
 
-    key: str
+    name: str
     facts: str
     table: Table
 
@@ -133,4 +135,6 @@ def _method_section(statistics: MethodStatistics) -> _MethodTable:
         facts = f"return {score_interval('return', statistics.medians['return'])}"
     columns = (Column("", "median"), *(Column("", f"agent {i + 1}") for i in range(len(statistics.agents))))
     rows = tuple((name, *(loose_interval(agent[name]) for agent in statistics.agents)) for name in AGENT_KEYS)
-    return _MethodTable(key, facts, Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows))
+    return _MethodTable(
+        statistics.runs.display, facts, Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows)
+    )

@@ -5,7 +5,7 @@ import unicodedata
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from marlbc_mj.util.text import one_line
 
@@ -80,6 +80,13 @@ class Table:
         """The header's first line: every group and how many columns it spans; columns without one stand alone."""
         keys = [(column.group, -1 if column.group else at) for at, column in enumerate(self.columns)]
         return [(name, len(list(same))) for (name, _), same in groupby(keys)]
+
+
+def table_document(table: Table) -> dict[str, Any]:
+    """A table as data: cells are the text that people read, by the heads of their columns."""
+    heads = [column.text for column in table.columns]
+    rows = [dict(zip(heads, row, strict=True)) for row in table.rows]
+    return {"name": table.name, "caption": table.caption, "rows": rows, "notes": list(table.notes)}
 
 
 def to_markdown(table: Table) -> str:

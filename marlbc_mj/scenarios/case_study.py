@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors, with_changes
 
 STARTS = ((-2.0, 8.0), (-2.0, -8.0), (-7.0, 14.0), (-7.0, -14.0))
 SLOTS = ((2.5, 6.0), (2.5, -6.0), (-2.5, 12.0), (-2.5, -12.0))
@@ -40,7 +40,7 @@ def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
         "schedule": SCHEDULE,
         "description": "four agents, two points and a gate on a 100 m path: the paper's case study",
     }
-    return Scenario(**{**fields, **changes})
+    return with_changes(fields, changes)
 
 
 def cruise(**changes: Any) -> Scenario:

@@ -12,7 +12,7 @@ import numpy as np
 
 from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.robots import make_robot
-from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors
+from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors, with_changes
 from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS
 
 LENGTH, ORIGIN = 108.0, -2.5  # of the path, where it starts, in length units
@@ -52,7 +52,7 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
         "acceleration_limit": brake,
         **body.scale(),
     }
-    return Scenario(**{**fields, **changes})
+    return with_changes(fields, changes)
 
 
 def _schedule(unit_time: float) -> tuple[Window, ...]:

@@ -83,7 +83,7 @@ class CalibrationStudy:
 
     def report(self, results: Sequence[Calibration], out: Path | None, progress: Progress = silent) -> Report:
         """The table; this study leaves no file."""
-        return Report("\n".join(calibration_lines(results)))
+        return Report("\n".join(calibration_lines(results)), list(results))
 
 
 def calibrate(

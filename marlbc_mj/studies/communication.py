@@ -92,7 +92,7 @@ class CommunicationStudy:
                 table.writerows(rows)
             facts = {"supervisor": self.supervisor, "controller": self.controller, "seeds": self.seeds, "shield": self.shield}
             write_json(out / "config.json", {**facts, "missions": self.missions, **provenance()})
-        return Report(to_markdown(case_table(rows)))
+        return Report(to_markdown(case_table(rows)), rows)
 
 
 def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | None]) -> dict[str, Any]:

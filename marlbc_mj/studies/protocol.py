@@ -8,7 +8,7 @@ and checkpoints, go into a folder beside it. :mod:`marlbc_mj.studies.runner` run
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from marlbc_mj.util.progress import Progress, silent
 
@@ -44,6 +44,8 @@ class Report(NamedTuple):
 
     text: str = ""
     """For the terminal."""
+    document: Any = None
+    """The same as data, of the kinds that results are made of."""
     problems: tuple[str, ...] = ()
     """What could not be written, a video without GL for example; one line each."""
 

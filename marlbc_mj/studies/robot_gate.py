@@ -26,6 +26,7 @@ from marlbc_mj.studies.runner import Conclusion, counting, run_study
 from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
 from marlbc_mj.util.errors import SimulationError, unknown
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 
 GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
@@ -107,7 +108,7 @@ class GateStudy:
             (out / "gate.md").write_text(text + "\n")
             rows = [row._asdict() for row in results]
             write_json(out / "gate.json", {"schema": 1, "controller": self.controller, "rows": rows})
-        return Report(text)
+        return Report(text, list(results))
 
 
 def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateRow, Trajectory]:
@@ -195,11 +196,11 @@ def gate_table(rows: Sequence[GateRow]) -> str:
 
 def _gate_cells(r: GateRow) -> tuple[str, ...]:
     if r.failure is not None:
-        return (r.robot, r.supervisor, f"failed: {r.failure}", *("–",) * 7)
+        return (r.robot, display_name(r.supervisor), f"failed: {r.failure}", *("–",) * 7)
     flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
     return (
         r.robot,
-        r.supervisor,
+        display_name(r.supervisor),
         f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
         f"{r.violation:.2f} s",
         str(r.collisions),

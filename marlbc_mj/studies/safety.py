@@ -149,7 +149,7 @@ class SafetyStudy:
             write_json(out / "config.json", {**provenance(), "study": self})
             write_cells(rows, out / "safety.csv")
             (out / "safety.md").write_text(text, encoding="utf-8")
-        return Report(text)
+        return Report(text, rows)
 
 
 def ground(name: str) -> Scenario:

@@ -110,7 +110,7 @@ class ScaleStudy:
         figures = self.gather(results)
         if out is not None:
             write_scale(figures, out)
-        return Report(to_markdown(scale_table(figures)))
+        return Report(to_markdown(scale_table(figures)), figures)
 
 
 def run_scale(

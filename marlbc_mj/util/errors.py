@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 
+from marlbc_mj.util.text import nearest
+
 
 class MarlbcError(Exception):
     """Root of all errors raised on purpose by marlbc_mj; the command line turns them into one line."""
@@ -26,5 +28,8 @@ class NoSpaceError(ConfigurationError):
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
-    """The error for a name that is not in a list: says which one and shows the list."""
-    return ConfigurationError(f"unknown {kind} {name!r}; choose from: {', '.join(valid)}")
+    """The error for a name that is not in a list: says which one and which is spelled like it, and shows the list."""
+    names = list(valid)
+    like = nearest(name, names) if isinstance(name, str) else None
+    perhaps = "" if like is None else f" perhaps {like!r};"
+    return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")

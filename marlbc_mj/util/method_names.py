@@ -1,5 +1,6 @@
 """Names and sources of supervisors and controllers as people read them; the literature is listed in REFERENCES.md."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 _PAPER = "Zhang et al. 2024"
@@ -49,11 +50,35 @@ NAMES = {
 LIMITED_SUFFIX = "-limited"
 
 
+def short_name(name: str) -> str:
+    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
+    file, _, attribute = name.rpartition(":")
+    if file:
+        return f"{Path(file).stem}.{attribute}"
+    return Path(name).stem if "/" in name or name.endswith(".safetensors") else name
+
+
 def source_of(name: str) -> Source:
-    """Of a supervisor or controller; a name that is not listed stands for itself."""
+    """Of a supervisor or controller; one that is not listed has its short name."""
     if name in NAMES:
         return NAMES[name]
     if name.endswith(LIMITED_SUFFIX) and name.removesuffix(LIMITED_SUFFIX) in NAMES:
         law = NAMES[name.removesuffix(LIMITED_SUFFIX)]
         return Source(f"{law.display}, limited", law.citation)
-    return Source(name)
+    return Source(short_name(name))
+
+
+def display_name(name: str) -> str:
+    """Of a supervisor or controller, for people."""
+    return source_of(name).display
+
+
+def display_key(key: str) -> str:
+    """Of a method by its key, ``mpcms+sorlc``, for people; any other text as it is."""
+    supervisor, plus, controller = key.partition("+")
+    return display_method(supervisor, controller) if plus else key
+
+
+def display_method(supervisor: str, controller: str) -> str:
+    """Of a supervisor together with a controller, for people: ``MPCMS + SORLC``."""
+    return f"{display_name(supervisor)} + {display_name(controller)}"

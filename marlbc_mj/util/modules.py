@@ -27,7 +27,13 @@ _MOST_BESIDE = 500
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one."""
+    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one.
+
+    Raises:
+        ConfigurationError: something else than a text.
+    """
+    if not isinstance(name, str):
+        raise ConfigurationError(f"a name must be a text, got {type(name).__name__}")
     file, colon, attribute = name.rpartition(":")
     return (file, attribute) if colon and file.endswith(_SUFFIX) else (name, "")
 

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 from marlbc_mj.controllers import CONTROLLERS, make_controller
 from marlbc_mj.results.layout_runs import Method
-from marlbc_mj.results.summary import short_name
 from marlbc_mj.scenarios.base import COMPOSITIONS
 from marlbc_mj.studies.suite.definition import TRACKS
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.method_names import short_name
 
 SUITE_SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
 """Supervisors that try out futures at every decision. A quick run leaves them out unless they are named."""
