@@ -107,7 +107,9 @@ def same_actuator(results: Sequence[Result]) -> str:
         return ""
     ours = costs["sorlc"]
     first = f"Under {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
-    return first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours) + _conclusion(costs, limited, ours)
+    found = first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours)
+    of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in chosen.values())
+    return found + _conclusion(costs, limited, ours) if of_paper else found.rstrip()
 
 
 def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
@@ -209,7 +211,7 @@ def convergence(results: Sequence[Result]) -> Table | None:
         "Time after which the norm of the velocity error stays below 2 % of its largest value in the first 15 s; "
         f"supervisor: {display_name(supervisor)}.",
     )
-    caption = "Convergence of the velocity error at the start [s] (Figures 6c and 7c of the paper)"
+    caption = f"Convergence of the velocity error at the start [s]{' (Figures 6c and 7c of the paper)' if of_paper else ''}"
     return Table("convergence", caption, tuple(columns), rows, notes)
 
 

@@ -95,6 +95,12 @@ def legend_above(figure: Figure, handles: Sequence[Artist], **options: Any) -> N
     figure.legend(handles=list(handles), loc="upper center", **options)
 
 
+def legend_in(axes: Axes, handles: Sequence[Artist]) -> None:
+    """A legend in a panel that shows nothing else, one entry per line."""
+    axes.set_axis_off()
+    axes.legend(handles=list(handles), loc="center left", borderaxespad=0.0, labelspacing=0.6)
+
+
 def agent_line(agent: int) -> dict[str, Any]:
     """Color, line style and label of an agent's curve."""
     return {

@@ -104,7 +104,7 @@ def pipe_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A ``table*`` for a document that loads booktabs."""
+    """A ``table*`` for a document that loads booktabs and graphicx; one that is wider than the text is made as narrow."""
     count = len(table.columns)
     body = [_latex_row(row) for row in table.rows]
     for at in sorted(table.rules, reverse=True):
@@ -118,13 +118,14 @@ def to_latex(table: Table) -> str:
             rf"\label{{tab:{table.name}}}",
             r"\footnotesize" if count <= 9 else r"\scriptsize",
             r"\setlength{\tabcolsep}{" + ("6pt" if count <= 9 else "3pt" if count <= 11 else "1pt") + "}",
+            r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
             r"\toprule",
             *_latex_header(table),
             r"\midrule",
             *body,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}}",
             *([rf"\par\smallskip\begin{{minipage}}{{\linewidth}}\scriptsize {notes}\end{{minipage}}"] if notes else []),
             r"\end{table*}",
         ]
