@@ -351,7 +351,7 @@ def test_no_mark_covers_another(results: list[Result]) -> None:
     figure = pareto([sorlc, other, twin])
     figure.draw_without_rendering()
     for axes in figure.axes:
-        marks = [line for line in axes.lines if line.get_marker() in tuple("osv")]
+        marks = [line for line in axes.lines if line.get_marker() in tuple("os^")]
         places = [72.0 / figure.dpi * line.get_transform().transform(line.get_xydata())[0] for line in marks]
         true = [72.0 / figure.dpi * axes.transData.transform(line.get_xydata())[0] for line in marks]
         assert len(places) == 3 and min(np.hypot(*(a - b)) for a, b in combinations(places, 2)) > 6.0

@@ -170,4 +170,5 @@ def _latex_header(table: Table) -> list[str]:
 
 
 def _latex_row(cells: Iterable[str]) -> str:
-    return " & ".join(map(latex, cells)) + r" \\"
+    text = " & ".join(map(latex, cells))
+    return ("{}" if text.startswith("[") else "") + text + r" \\"  # a bracket behind a line break would be its length
