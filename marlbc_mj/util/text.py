@@ -12,7 +12,7 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
-def nearest(word: str, words: Iterable[str]) -> str | None:
+def nearest_word(word: str, words: Iterable[str]) -> str | None:
     """The word that is spelled most like ``word``, whatever their case; None where none is like it."""
     if len(word) > _LONGEST:
         return None
