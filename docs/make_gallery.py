@@ -36,7 +36,7 @@ def shots(names: list[str]) -> Iterator[Shot]:
             yield Shot(name, log, VideoStyle(speed=10.0, fps=10, size=(840, 378), camera="wide", end=92.0, samples=4))
         elif name in FAMILY_SEEDS:
             log = fly(name, "lookahead", seed=FAMILY_SEEDS[name], composition="set-based")
-            yield Shot(f"gallery/{name}", log, style(log, 0.0, float(log.time[-1]), "wide", 10))
+            yield Shot(f"gallery/{name}", log, style(log, 0.0, float(log.time[-1]), "wide", 8))
         else:
             yield robot_shot(name)
 

@@ -16,8 +16,11 @@ from marlbc_mj.cli.choices import (
     ScenarioSettings,
     SomeComposition,
     SomeControllers,
+    SomeCount,
     SomeDisturbance,
     SomeFormation,
+    SomeNumber,
+    SomeRange,
     SomeReference,
     SomeRobot,
     SomeSplit,
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
 class ScenarioOptions:
     """Changes to the scenario."""
 
-    substep: float | None = None
+    substep: SomeNumber = None
     """Physics and control step [s]; must divide the mission step of 0.05 s."""
     reference: SomeReference = None
     """Where behaviors are evaluated: at the reference (virtual) or at the measured position (actual)."""
@@ -50,15 +53,15 @@ class ScenarioOptions:
     """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
     disturbance: SomeDisturbance = None
     """Unknown dynamics."""
-    drag_scale: float | None = None
+    drag_scale: SomeNumber = None
     """Multiplies the disturbance."""
-    force_limit: float | None = None
+    force_limit: SomeNumber = None
     """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
-    duration: float | None = None
+    duration: SomeNumber = None
     """Mission time [s]."""
     robot: SomeRobot = None
     """Robot of every agent; the scenario takes its mass, force and limits."""
-    agents: int | None = None
+    agents: SomeCount = None
     """Size of the team, 2 to 256, for scenarios that are made for any."""
     formation: SomeFormation = None
     """Formation of the team, for the same scenarios."""
@@ -116,9 +119,9 @@ class BenchCommand:
     """Folder of the results."""
     seed: int = 0
     """Draw of the scenario; every seed is the same where nothing is perturbed."""
-    seeds: int | None = None
+    seeds: SomeCount = None
     """Number of draws around the scenario, from --seed on: tables with intervals instead of logs and videos."""
-    drag_range: tuple[float, float] | None = None
+    drag_range: SomeRange = None
     """With --seeds, a draw from this range multiplies the disturbance: 0 2 by default, 5 5 for five times throughout."""
     workers: int = 1
     """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""

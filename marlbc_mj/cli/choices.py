@@ -4,6 +4,7 @@ A word that looks like a file or like Python is left to the command, once the fi
 """
 
 import json
+import sys
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
@@ -33,30 +34,33 @@ class Kind(NamedTuple):
     word: str  # for messages
     lists: tuple[str, ...]  # keys of the names that there are
     forms: tuple[str, ...] = ()  # what may be given instead of a name
+    registry: str = ""  # module and attribute of the names, which a program may have added to before it called the command line
 
 
-SCENARIO = Kind("scenario", ("scenarios",), ("FILE.toml", "FILE.py:NAME"))
-SUPERVISOR = Kind("supervisor", ("supervisors",), ("FILE.py:NAME", "CHECKPOINT.safetensors"))
-CONTROLLER = Kind("controller", ("controllers",), ("FILE.py:NAME",))
-ROBOT = Kind("robot", ("robots",), ("FILE.xml", "FILE.py", "FILE.py:NAME"))
-CHECKED_ROBOT = ROBOT._replace(forms=(*ROBOT.forms, "menagerie:FOLDER/FILE.xml"))
-MISSION = Kind("scenario", ("scenarios", "draws of the case study"), ("FILE.toml", "FILE.py:NAME"))
-SETTING = Kind("setting", ("settings of a scenario",))
-TRAINING_SETTING = Kind("setting", ("settings of training",))
-METHOD = Kind("method", ("training methods",))
-PRESET = Kind("preset", ("training presets",))
-DISTURBANCE = Kind("disturbance", ("disturbances",))
-COMPOSITION = Kind("composition", ("compositions",))
-REFERENCE = Kind("reference mode", ("reference modes",))
-FORMATION = Kind("formation", ("formations",))
-SPLIT = Kind("split", ("layout splits",))
-TRACK = Kind("track", ("suite tracks",))
-SUITE_MISSION = Kind("mission", ("suite missions",))
-QUESTION = Kind("study", ("ablation studies",))
-VARIANT = Kind("variant", ("study variants",))
-CALIBRATED = Kind("calibrated controller", ("calibrated controllers",))
-LISTED = Kind("kind", ())
-DEVICE = Kind("device", ("devices",))
+_SCENARIO = Kind("scenario", ("scenarios",), ("FILE.toml", "FILE.py:NAME"), "marlbc_mj.scenarios:SCENARIOS")
+_SUPERVISOR = Kind(
+    "supervisor", ("supervisors",), ("FILE.py:NAME", "CHECKPOINT.safetensors"), "marlbc_mj.supervisors:SUPERVISORS"
+)
+_CONTROLLER = Kind("controller", ("controllers",), ("FILE.py:NAME",), "marlbc_mj.controllers:CONTROLLERS")
+_ROBOT = Kind("robot", ("robots",), ("FILE.xml", "FILE.py", "FILE.py:NAME"), "marlbc_mj.robots:ROBOTS")
+_CHECKED_ROBOT = _ROBOT._replace(forms=(*_ROBOT.forms, "menagerie:FOLDER/FILE.xml"))
+_MISSION = _SCENARIO._replace(lists=("scenarios", "draws of the case study"))
+_SETTING = Kind("setting", ("settings of a scenario",))
+_TRAINING_SETTING = Kind("setting", ("settings of training",))
+_METHOD = Kind("method", ("training methods",), (), "marlbc_mj.training.methods:METHODS")
+_PRESET = Kind("preset", ("training presets",), (), "marlbc_mj.training.config:PRESETS")
+_DISTURBANCE = Kind("disturbance", ("disturbances",), (), "marlbc_mj.core.disturbances:DISTURBANCES")
+_COMPOSITION = Kind("composition", ("compositions",))
+_REFERENCE = Kind("reference mode", ("reference modes",))
+_FORMATION = Kind("formation", ("formations",), (), "marlbc_mj.scenarios.formations:FORMATIONS")
+_SPLIT = Kind("split", ("layout splits",))
+_TRACK = Kind("track", ("suite tracks",))
+_SUITE_MISSION = Kind("mission", ("suite missions",))
+_QUESTION = Kind("study", ("ablation studies",))
+_VARIANT = Kind("variant", ("study variants",), (), "marlbc_mj.studies.learners.variants:VARIANTS")
+_CALIBRATED = Kind("calibrated controller", ("calibrated controllers",))
+_LISTED = Kind("kind", ())
+_DEVICE = Kind("device", ("devices",))
 
 
 @cache
@@ -70,7 +74,9 @@ def names_of(kind: Kind) -> list[str]:
     """Names that can be given."""
     if not kind.lists:
         return [each.replace(" ", "-").lower() for each in selectable()]
-    return [name for each in kind.lists for name in selectable()[each]]
+    module, _, attribute = kind.registry.partition(":")
+    added = getattr(sys.modules.get(module), attribute, ()) if kind.registry else ()  # not imported for this
+    return list(dict.fromkeys([*(name for each in kind.lists for name in selectable()[each]), *added]))
 
 
 def check_word(kind: Kind, word: str) -> str:
@@ -157,33 +163,42 @@ def _existing(text: str) -> Path:
     return Path(text)
 
 
-ScenarioName = Annotated[str, _one(SCENARIO), _shown(SCENARIO)]
-ScenarioNames = Annotated[tuple[Annotated[str, _one(SCENARIO)], ...], _shown(SCENARIO)]
-MissionNames = Annotated[tuple[Annotated[str, _one(MISSION)], ...], _shown(MISSION)]
-SupervisorName = Annotated[str, _one(SUPERVISOR), _shown(SUPERVISOR)]
-SupervisorNames = Annotated[tuple[Annotated[str, _one(SUPERVISOR)], ...], _shown(SUPERVISOR)]
-SomeSupervisors = Annotated[tuple[Annotated[str, _one(SUPERVISOR)], ...] | None, _shown(SUPERVISOR, "SUPERVISOR ...")]
-ControllerName = Annotated[str, _one(CONTROLLER), _shown(CONTROLLER)]
-SomeControllers = Annotated[tuple[Annotated[str, _one(CONTROLLER)], ...] | None, _shown(CONTROLLER, "CONTROLLER ...")]
-RobotName = Annotated[str, _one(CHECKED_ROBOT), _shown(CHECKED_ROBOT)]
-RobotNames = Annotated[tuple[Annotated[str, _one(ROBOT)], ...], _shown(ROBOT)]
-SomeRobot = Annotated[Annotated[str, _one(ROBOT)] | None, _shown(ROBOT, "ROBOT")]
-SomeComposition = Annotated[Annotated[str, _one(COMPOSITION)] | None, _shown(COMPOSITION, "COMPOSITION")]
-Compositions = Annotated[tuple[Annotated[str, _one(COMPOSITION)], ...], _shown(COMPOSITION)]
-SomeCompositions = Annotated[tuple[Annotated[str, _one(COMPOSITION)], ...] | None, _shown(COMPOSITION, "COMPOSITION ...")]
-SomeReference = Annotated[Annotated[str, _one(REFERENCE)] | None, _shown(REFERENCE, "MODE")]
-SomeDisturbance = Annotated[Annotated[str, _one(DISTURBANCE)] | None, _shown(DISTURBANCE, "DISTURBANCE")]
-SomeFormation = Annotated[Annotated[str, _one(FORMATION)] | None, _shown(FORMATION, "FORMATION")]
-SomeSplit = Annotated[Annotated[str, _one(SPLIT)] | None, _shown(SPLIT, "SPLIT")]
-SomeDevice = Annotated[Annotated[str, _one(DEVICE)] | None, _shown(DEVICE, "DEVICE")]
-ScenarioSettings = Annotated[tuple[Annotated[str, _setting(SETTING)], ...], _shown(SETTING)]
-TrainingSettings = Annotated[tuple[Annotated[str, _setting(TRAINING_SETTING)], ...], _shown(TRAINING_SETTING)]
-MethodName = Annotated[str, _one(METHOD), _shown(METHOD)]
-PresetName = Annotated[str, _one(PRESET), _shown(PRESET)]
-TrackNames = Annotated[tuple[Annotated[str, _one(TRACK)], ...], _shown(TRACK)]
-SuiteMissionNames = Annotated[tuple[Annotated[str, _one(SUITE_MISSION)], ...], _shown(SUITE_MISSION)]
-QuestionNames = Annotated[tuple[Annotated[str, _one(QUESTION)], ...], _shown(QUESTION)]
-VariantNames = Annotated[tuple[Annotated[str, _one(VARIANT)], ...], _shown(VARIANT)]
-CalibratedNames = Annotated[tuple[Annotated[str, _one(CALIBRATED)], ...], _shown(CALIBRATED)]
-SomeKind = Annotated[Annotated[str, _one(LISTED)] | None, _shown(LISTED, "KIND")]
+def _unset(metavar: str) -> Any:
+    """Marks an option that has no value unless it is given; the help says nothing of a default."""
+    return arg(metavar=metavar, help_behavior_hint="")
+
+
+SomeNumber = Annotated[float | None, _unset("FLOAT")]
+SomeCount = Annotated[int | None, _unset("INT")]
+SomeRange = Annotated[tuple[float, float] | None, _unset("FLOAT FLOAT")]
+SomePath = Annotated[Path | None, _unset("PATH")]
+ScenarioName = Annotated[str, _one(_SCENARIO), _shown(_SCENARIO)]
+ScenarioNames = Annotated[tuple[Annotated[str, _one(_SCENARIO)], ...], _shown(_SCENARIO)]
+MissionNames = Annotated[tuple[Annotated[str, _one(_MISSION)], ...], _shown(_MISSION)]
+SupervisorName = Annotated[str, _one(_SUPERVISOR), _shown(_SUPERVISOR)]
+SupervisorNames = Annotated[tuple[Annotated[str, _one(_SUPERVISOR)], ...], _shown(_SUPERVISOR)]
+SomeSupervisors = Annotated[tuple[Annotated[str, _one(_SUPERVISOR)], ...] | None, _shown(_SUPERVISOR, "SUPERVISOR ...")]
+ControllerName = Annotated[str, _one(_CONTROLLER), _shown(_CONTROLLER)]
+SomeControllers = Annotated[tuple[Annotated[str, _one(_CONTROLLER)], ...] | None, _shown(_CONTROLLER, "CONTROLLER ...")]
+RobotName = Annotated[str, _one(_CHECKED_ROBOT), _shown(_CHECKED_ROBOT)]
+RobotNames = Annotated[tuple[Annotated[str, _one(_ROBOT)], ...], _shown(_ROBOT)]
+SomeRobot = Annotated[Annotated[str, _one(_ROBOT)] | None, _shown(_ROBOT, "ROBOT")]
+SomeComposition = Annotated[Annotated[str, _one(_COMPOSITION)] | None, _shown(_COMPOSITION, "COMPOSITION")]
+Compositions = Annotated[tuple[Annotated[str, _one(_COMPOSITION)], ...], _shown(_COMPOSITION)]
+SomeCompositions = Annotated[tuple[Annotated[str, _one(_COMPOSITION)], ...] | None, _shown(_COMPOSITION, "COMPOSITION ...")]
+SomeReference = Annotated[Annotated[str, _one(_REFERENCE)] | None, _shown(_REFERENCE, "MODE")]
+SomeDisturbance = Annotated[Annotated[str, _one(_DISTURBANCE)] | None, _shown(_DISTURBANCE, "DISTURBANCE")]
+SomeFormation = Annotated[Annotated[str, _one(_FORMATION)] | None, _shown(_FORMATION, "FORMATION")]
+SomeSplit = Annotated[Annotated[str, _one(_SPLIT)] | None, _shown(_SPLIT, "SPLIT")]
+SomeDevice = Annotated[Annotated[str, _one(_DEVICE)] | None, _shown(_DEVICE, "DEVICE")]
+ScenarioSettings = Annotated[tuple[Annotated[str, _setting(_SETTING)], ...], _shown(_SETTING)]
+TrainingSettings = Annotated[tuple[Annotated[str, _setting(_TRAINING_SETTING)], ...], _shown(_TRAINING_SETTING)]
+MethodName = Annotated[str, _one(_METHOD), _shown(_METHOD)]
+PresetName = Annotated[str, _one(_PRESET), _shown(_PRESET)]
+TrackNames = Annotated[tuple[Annotated[str, _one(_TRACK)], ...], _shown(_TRACK)]
+SuiteMissionNames = Annotated[tuple[Annotated[str, _one(_SUITE_MISSION)], ...], _shown(_SUITE_MISSION)]
+QuestionNames = Annotated[tuple[Annotated[str, _one(_QUESTION)], ...], _shown(_QUESTION)]
+VariantNames = Annotated[tuple[Annotated[str, _one(_VARIANT)], ...], _shown(_VARIANT)]
+CalibratedNames = Annotated[tuple[Annotated[str, _one(_CALIBRATED)], ...], _shown(_CALIBRATED)]
+SomeKind = Annotated[Annotated[str, _one(_LISTED)] | None, _shown(_LISTED, "KIND")]
 ExistingPath = Annotated[Path, _primitive(_existing, "PATH")]

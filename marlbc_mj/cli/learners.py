@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from marlbc_mj.cli.choices import TrainingSettings, VariantNames
+from marlbc_mj.cli.choices import SomeCount, SomePath, TrainingSettings, VariantNames
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import note
@@ -24,13 +24,13 @@ class StudyCommand:
     """Variants to train; all of them by default."""
     seeds: int = 5
     """Runs per variant, with seeds from 0 on."""
-    budget: int | None = None
+    budget: SomeCount = None
     """Mission steps per run; by default those of the preset `fast`."""
     workers: int = 2
     """Processes that share the runs, one thread each."""
-    out: Path | None = None
+    out: SomePath = None
     """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
-    source: Annotated[Path | None, arg(name="from")] = None
+    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
     """Only make table and figure again, from study.csv and curves.csv in this folder, there or in --out."""
     set: TrainingSettings = ()
     """Any setting of all runs, as for `marlbc train`."""

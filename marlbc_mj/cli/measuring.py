@@ -13,6 +13,7 @@ from marlbc_mj.cli.choices import (
     QuestionNames,
     ScenarioName,
     ScenarioNames,
+    SomePath,
     SupervisorName,
 )
 from marlbc_mj.cli.output import ReportOptions
@@ -22,7 +23,7 @@ from marlbc_mj.cli.output import ReportOptions
 class PerfCommand:
     """Measure this machine: bare mj_step, the closed loop, the Python loop, batches, an episode, a log."""
 
-    out: Path | None = None
+    out: SomePath = None
     """JSON file for the figures."""
     rounds: int = 9
     """Rounds, each running every variant once; medians are reported."""
@@ -50,7 +51,7 @@ class PerfCommand:
 class ScaleCommand:
     """Measure what a mission step costs per agent, and the memory of a world, for teams from 4 to 256 agents."""
 
-    out: Path | None = None
+    out: SomePath = None
     """Folder for scale.md, scale.json and figures/scale.{pdf,png}."""
     rounds: int = 7
     """Rounds, each running every size once; medians are reported."""
@@ -74,7 +75,7 @@ class AblationCommand:
 
     study: QuestionNames = ()
     """Studies to run; all of them by default."""
-    out: Path | None = None
+    out: SomePath = None
     """Folder for ablation.md, ablation.csv and index.html."""
     workers: int = 1
     """Processes that share the jobs, or tasks of a SLURM array."""
@@ -182,7 +183,7 @@ class OracleCommand:
     """Episodes that may be simulated."""
     threads: int = 2
     """Threads that share the worlds."""
-    out: Path | None = None
+    out: SomePath = None
     """Cache to add the schedule to; the one that comes with the package by default."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 

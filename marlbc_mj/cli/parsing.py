@@ -13,7 +13,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
 
 from marlbc_mj.cli.choices import WrongWord
-from marlbc_mj.util.text import nearest, one_line
+from marlbc_mj.util.text import nearest_word, one_line
 
 
 class Refusal(NamedTuple):
@@ -46,7 +46,7 @@ def parse(commands: Any, arguments: Sequence[str] | None, *, prog: str, descript
     Raises:
         ConfigurationError: a word that means nothing here.
     """
-    chosen = choose(commands, sys.argv[1:] if arguments is None else list(arguments), prog)
+    chosen = choose_command(commands, sys.argv[1:] if arguments is None else list(arguments), prog)
     refusal = _refused_word(chosen)
     if refusal is not None:
         _exit(prog, refusal)
@@ -69,7 +69,7 @@ def _of_tyro(chosen: Chosen, description: str | None) -> Any:
     return tyro.cli(chosen.kind, prog=chosen.prog, description=description, args=chosen.rest, config=(FlagCreatePairsOff,))
 
 
-def choose(commands: Any, given: list[str], prog: str) -> Chosen:
+def choose_command(commands: Any, given: list[str], prog: str) -> Chosen:
     """The command that the first words name."""
     chosen = Chosen(commands, prog, given)
     while chosen.rest and (known := subcommands_of(chosen.kind)) and chosen.rest[0] in known:
@@ -86,7 +86,7 @@ def _refused_word(chosen: Chosen) -> Refusal | None:
     listed = ", ".join(known)
     if not chosen.rest:
         return Refusal(f"Expected one of {{{listed}}}", chosen.prog)
-    like = nearest(chosen.rest[0], known)
+    like = nearest_word(chosen.rest[0], known)
     perhaps = f" perhaps {like!r};" if like else ""
     return Refusal(f"unknown command {chosen.rest[0]!r};{perhaps} choose from: {listed}", chosen.prog)
 
@@ -108,7 +108,7 @@ def _refusal(event: Any, kind: Any) -> Refusal | None:
         case "BadValue" if event.reason == "too_few_values":
             said = f"Missing value for argument {_name(event.argument)!r}. Expected {event.argument.lowered.nargs} values"
         case "InvalidChoice":
-            like = nearest(str(event.value), map(str, event.choices))
+            like = nearest_word(str(event.value), map(str, event.choices))
             perhaps = f"; perhaps {like!r}" if like else ""
             said = (
                 f"invalid choice {event.value!r} for argument {_name(event.argument)!r}{perhaps}. Expected one of {event.choices}"
@@ -130,7 +130,7 @@ def _name(argument: Any) -> str:
 def _suggestion(tokens: Sequence[str], kind: Any) -> str:
     """Options of the command that are spelled like unknown ones."""
     known = list(dict.fromkeys(options_of(kind)))
-    like = [nearest(token.partition("=")[0], known) for token in tokens if token.startswith("--")]
+    like = [nearest_word(token.partition("=")[0], known) for token in tokens if token.startswith("--")]
     found = list(dict.fromkeys(name for name in like if name is not None))
     return f"; perhaps {', '.join(found)}" if found else ""
 

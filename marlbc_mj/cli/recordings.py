@@ -6,7 +6,7 @@ from typing import Annotated
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.cli.choices import ExistingPath
+from marlbc_mj.cli.choices import ExistingPath, SomeNumber, SomePath
 from marlbc_mj.cli.output import OutputOptions, ReportOptions
 from marlbc_mj.util.progress import note
 
@@ -17,7 +17,7 @@ class VideoCommand:
 
     log: Positional[ExistingPath]
     """MCAP log."""
-    out: Path | None = None
+    out: SomePath = None
     """Video file, whose ending chooses the format; the log's name with .mp4 by default."""
     speed: float = 4.0
     """Mission seconds per video second."""
@@ -25,9 +25,9 @@ class VideoCommand:
     """Frames per second."""
     camera: str = "track"
     """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one of the model."""
-    start: float | None = None
+    start: SomeNumber = None
     """First mission time shown [s]."""
-    end: float | None = None
+    end: SomeNumber = None
     """Last mission time shown [s]."""
     size: str = "1280x720"
     """Width and height [pixel]."""
@@ -118,7 +118,7 @@ class LogRecoverCommand:
 
 @dataclass(frozen=True)
 class LogExportCommand:
-    """Write a log as a table, a row per mission step and agent (.csv, .jsonl, .parquet), as arrays (.npz), or for Rerun (.rrd)."""
+    """Write a log as a table, a row per mission step and agent (.csv, .jsonl, .parquet), as arrays (.npz) or for Rerun (.rrd)."""
 
     log: Positional[ExistingPath]
     """MCAP log."""

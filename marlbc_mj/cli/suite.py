@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from marlbc_mj.cli.choices import SomeCompositions, SomeControllers, SomeSupervisors, SuiteMissionNames, TrackNames
+from marlbc_mj.cli.choices import SomeCompositions, SomeControllers, SomeCount, SomeSupervisors, SuiteMissionNames, TrackNames
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -37,9 +37,9 @@ class SuiteCommand:
     """Fly every method with a shield as well."""
     quick: bool = False
     """The first 50 layouts of every mission, without supervisors that search."""
-    layouts: int | None = None
+    layouts: SomeCount = None
     """The first so many layouts of every mission."""
-    source: Annotated[Path | None, arg(name="from")] = None
+    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
     """Folder of results of the suite whose rows stand beside those that are flown."""
     page: bool = False
     """Fly nothing: write the page of the results in --from."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.choices import MethodName, PresetName, SomeDevice, TrainingSettings
+from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
@@ -26,13 +26,13 @@ class TrainCommand:
     """Hyper-parameters; those of paper are published."""
     seed: int = 0
     """Random seed of networks, exploration and starts."""
-    out: Path | None = None
+    out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
-    resume: Path | None = None
+    resume: SomePath = None
     """Folder of a run that was interrupted: it goes on, bit for bit, with its own settings."""
-    budget: int | None = None
+    budget: SomeCount = None
     """Mission steps, over all worlds."""
-    threads: int | None = None
+    threads: SomeCount = None
     """Threads of simulation and networks."""
     device: SomeDevice = None
     """Device of the networks."""

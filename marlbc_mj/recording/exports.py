@@ -24,8 +24,8 @@ _PAIRS = ("position", "velocity", "reference", "reference_velocity", "force")
 def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> None:
     """Write a log as a table, as arrays, or for Rerun (``.rrd``).
 
-    A table (``.csv``, ``.jsonl``, or ``.parquet``, which needs pyarrow) has a row per mission step and agent. Arrays (``.npz``) are
-    the fields of EpisodeLog and those of its substeps.
+    A table (``.csv``, ``.jsonl``, or ``.parquet``, which needs pyarrow) has a row per mission step and agent. Arrays (``.npz``)
+    are the fields of EpisodeLog and those of its substeps.
 
     Raises:
         ConfigurationError: an unknown suffix, a log that cannot be read, a package that is not installed, or an output that

@@ -266,7 +266,7 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
     """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
     some = [
         topic
-        for topic in (schemas.SUBSTEPS, schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD)
+        for topic in (schemas.SUBSTEP_ROWS, schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD)
         if topic.name in _topics_used(reader)
     ]
     found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *some)}
@@ -321,9 +321,9 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
 
 def _substeps(found: dict[str, list[dict[str, Any]]], metadata: dict[str, str], agents: int) -> Substeps | None:
     """All substeps; None in a log without."""
-    if schemas.SUBSTEPS.name not in found:
+    if schemas.SUBSTEP_ROWS.name not in found:
         return None
-    moments = [schemas.decode_substeps(row, agents) for row in found[schemas.SUBSTEPS.name]]
+    moments = [schemas.decode_substeps(row, agents) for row in found[schemas.SUBSTEP_ROWS.name]]
     positions, *others = (list(rows) for rows in zip(*moments, strict=True))
     position = np.concatenate([*(rows[:-1] for rows in positions), positions[-1][-1:]])
     return Substeps(_course(metadata, agents), position, *(np.concatenate(rows) for rows in others))

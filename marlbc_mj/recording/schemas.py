@@ -135,7 +135,7 @@ COMMUNICATION = Topic(
         "oldest": MessageField("number", "greatest of the ages [s]"),
     },
 )
-SUBSTEPS = Topic(
+SUBSTEP_ROWS = Topic(
     "/substeps",
     "marlbc.Substeps",
     "position, velocity, reference, reference velocity and force of every substep of a mission step, for metrics",
@@ -145,11 +145,11 @@ SUBSTEPS = Topic(
         "data": MessageField("string", "packed numbers, see encode_substeps"),
     },
 )
-TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEPS, PRIORITIES, WEIGHTS, METRICS)
+TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEP_ROWS, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-All logs written since 0.1.0 have ``SUBSTEPS``. Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and
+All logs written since 0.1.0 have ``SUBSTEP_ROWS``. Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and
 those whose communication is not ideal ``COMMUNICATION``.
 """
 
@@ -222,7 +222,7 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
 
 
 def encode_substeps(rows: Sequence[np.ndarray], after: np.ndarray) -> bytes:
-    """A message on ``SUBSTEPS``.
+    """A message on ``SUBSTEP_ROWS``.
 
     Its data are little-endian doubles: positions, with those at the end of the mission step behind them, velocities, references,
     reference velocities and forces; of each, agent by agent and axis by axis, all substeps. They are sorted by their bytes, first

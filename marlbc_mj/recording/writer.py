@@ -201,7 +201,7 @@ class LogWriter:
         reference = np.concatenate([first.reference, first.reference_velocity], axis=1)
         yield "/reference", schemas.encode(schemas.REFERENCE, reference)
         yield "/force", schemas.encode(schemas.FORCE, first.force)
-        yield schemas.SUBSTEPS.name, schemas.encode_substeps(frame.record, frame.after)
+        yield schemas.SUBSTEP_ROWS.name, schemas.encode_substeps(frame.record, frame.after)
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
         if self._posed:
             yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)

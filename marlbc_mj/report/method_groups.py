@@ -6,16 +6,16 @@ from typing import Generic, TypeVar
 
 from marlbc_mj.util.method_names import display_name, short_name
 
-Item = TypeVar("Item")
+MethodT = TypeVar("MethodT")
 
 
 @dataclass(frozen=True)
-class MethodGroup(Generic[Item]):
+class MethodGroup(Generic[MethodT]):
     """Methods that differ in one of their two parts."""
 
     kind: str  # "supervisor" or "controller": what they differ in
     other: str  # the name of the part that all of them have
-    rows: tuple[tuple[str, Item], ...]  # what each differs in, as people read it, and the method
+    rows: tuple[tuple[str, MethodT], ...]  # what each differs in, as people read it, and the method
 
     @property
     def words(self) -> str:
@@ -28,7 +28,7 @@ class MethodGroup(Generic[Item]):
         return f"{self.kind}s-{short_name(self.other)}"
 
 
-def method_groups(items: Sequence[Item], names: Callable[[Item], tuple[str, str]]) -> list[MethodGroup[Item]]:
+def method_groups(items: Sequence[MethodT], names: Callable[[MethodT], tuple[str, str]]) -> list[MethodGroup[MethodT]]:
     """Supervisors by the controller that they have; then controllers by their supervisor, where that shows what is not shown yet.
 
     Args:

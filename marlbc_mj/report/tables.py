@@ -10,7 +10,7 @@ from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 
-METRICS = "metrics-"
+METRICS_TABLES = "metrics-"
 """What names of the tables of all metrics begin with."""
 
 
@@ -59,7 +59,7 @@ def metrics_tables(results: Sequence[Result]) -> list[Table]:
 def _metrics_table(group: MethodGroup[Result]) -> Table:
     columns = (Column("", group.kind), score_column("return"), Column("switches", "each agent"), *map(score_column, _COLUMNS))
     return Table(
-        f"{METRICS}{group.suffix}",
+        f"{METRICS_TABLES}{group.suffix}",
         f"All metrics of each {group.kind}, {group.words}",
         columns,
         tuple(_metrics_row(name, result, len(columns)) for name, result in group.rows),

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 
-from marlbc_mj.util.text import nearest
+from marlbc_mj.util.text import nearest_word
 
 
 class MarlbcError(Exception):
@@ -30,6 +30,6 @@ class NoSpaceError(ConfigurationError):
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
     """The error for a name that is not in a list: says which one and which is spelled like it, and shows the list."""
     names = list(valid)
-    like = nearest(name, names) if isinstance(name, str) else None
+    like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"
     return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")

@@ -12,10 +12,19 @@ def one_line(text: object) -> str:
     return " ".join(str(text).split())
 
 
-def nearest(word: str, words: Iterable[str]) -> str | None:
+def nearest_word(word: str, words: Iterable[str]) -> str | None:
     """The word that is spelled most like ``word``, whatever their case; None where none is like it."""
-    from difflib import get_close_matches
+    if len(word) > _LONGEST:
+        return None
+    scored = [(_likeness(word.lower(), each.lower()), each) for each in words]
+    best = max(scored, key=lambda pair: pair[0], default=(0.0, ""))
+    return best[1] if best[0] >= LIKE else None
 
-    by_spelling = {each.lower(): each for each in words}
-    close = get_close_matches(word.lower(), by_spelling, 1, LIKE) if len(word) <= _LONGEST else []
-    return by_spelling[close[0]] if close else None
+
+def _likeness(one: str, other: str) -> float:
+    """From 0 to 1; what two dotted names have in common before their last dot does not count."""
+    from difflib import SequenceMatcher
+
+    (table, _, name), (same, _, like) = one.rpartition("."), other.rpartition(".")
+    pair = (name, like) if table == same else (one, other)
+    return SequenceMatcher(None, *pair).ratio()

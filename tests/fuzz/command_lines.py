@@ -50,7 +50,7 @@ SHORT: tuple[tuple[str, ...], ...] = (
     ("robot", "check", "cart.xml"),
     ("robot", "gate", "--robots", "nothing"),
     ("perf", "--rounds", "0"),
-    ("perf", "--json", "cell.toml"),
+    ("perf", "--out", "cell.toml"),
     ("scale", "--rounds", "0"),
     ("ablation", "--study", "nothing"),
     ("calibrate", "--controllers", "nothing"),
