@@ -11,6 +11,7 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.core.disturbances import DISTURBANCES
 from marlbc_mj.studies.learners import VARIANTS
 from marlbc_mj.supervisors import SUPERVISORS
 from marlbc_mj.training.methods import METHODS
@@ -19,7 +20,7 @@ from marlbc_mj.training.rivals import LEARNERS
 DOCS = Path(__file__).parent.parent / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 FENCE = re.compile(r'^```(\w+)(?: title="([\w./-]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
-MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp))""")
+MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp|gif))""")
 MOST_LINES = 60
 MOST_BYTES, MOST_BYTES_TOGETHER = 150_000, 1_500_000
 
@@ -58,7 +59,7 @@ def run_page(page: Path, folder: Path) -> None:
 @pytest.fixture
 def own_names():
     """What a page registers is forgotten again."""
-    before = [(registry, dict(registry)) for registry in (CONTROLLERS, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
+    before = [(registry, dict(registry)) for registry in (CONTROLLERS, DISTURBANCES, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
     yield
     for registry, entries in before:
         registry.clear()
@@ -73,8 +74,9 @@ def test_a_how_to_runs(page, tmp_path, monkeypatch):
     run_page(page, tmp_path)
 
 
-def test_there_are_six_how_tos():
-    assert [page.stem for page in HOW_TO] == ["controller", "leaderboard", "learner", "robot", "scenario", "supervisor"]
+def test_there_are_eight_how_tos():
+    pages = ["behavior", "controller", "disturbance", "leaderboard", "learner", "robot", "scenario", "supervisor"]
+    assert [page.stem for page in HOW_TO] == pages
 
 
 def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():

@@ -31,7 +31,7 @@ FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
 """Controllers of the frameworks in Figures 8 and 9."""
 _AGENT = 3  # index of the agent in Figure 9
 
-_PATHS = "colored by the highest behavior in force; black casing: inside the safe distance."
+_PATHS = "colored by the highest behavior in force; casing: inside the safe distance."
 _STRIPS = (
     "color and height of a strip show the highest behavior in force (OA: avoid the obstacle, FM: keep the formation, FR: form "
     "the column); beside it the number of switches. Grey: switches of the whole team in each second, and the most of them."
