@@ -106,7 +106,7 @@ def same_actuator(results: Sequence[Result]) -> str:
     if "sorlc" not in costs or not limited:
         return ""
     ours = costs["sorlc"]
-    first = f"Under {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
+    first = f"With supervisor {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
     return first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours) + _conclusion(costs, limited, ours)
 
 
