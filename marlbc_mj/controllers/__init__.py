@@ -48,6 +48,8 @@ def require_controller(found: object, name: str = "controller") -> Controller:
     Raises:
         ConfigurationError: it lacks a part of a controller, or its law cannot be called.
     """
+    if isinstance(found, type):
+        raise ConfigurationError(f"{name} is the class {found.__name__}; make one of it: {found.__name__}()")
     lacking = [each for each in CONTROLLER_PARTS if not hasattr(found, each)]
     if lacking:
         raise ConfigurationError(f"{name} is no controller: {type(found).__name__} lacks {', '.join(lacking)}")

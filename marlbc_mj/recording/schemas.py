@@ -149,8 +149,8 @@ TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEP_ROWS, PRIORITIES, WEIGHTS, METR
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-All logs written since 0.1.0 have ``SUBSTEP_ROWS``. Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and
-those whose communication is not ideal ``COMMUNICATION``.
+Logs have ``SUBSTEP_ROWS``, robots with a free joint ``POSE``, teams with a shield ``SHIELD``, and those whose communication is
+not ideal ``COMMUNICATION``.
 """
 
 

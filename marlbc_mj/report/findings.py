@@ -106,7 +106,7 @@ def same_actuator(results: Sequence[Result]) -> str:
     if "sorlc" not in costs or not limited:
         return ""
     ours = costs["sorlc"]
-    first = f"Under {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
+    first = f"With supervisor {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
     found = first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours)
     of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in chosen.values())
     return found + _conclusion(costs, limited, ours) if of_paper else found.rstrip()

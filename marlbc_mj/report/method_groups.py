@@ -20,7 +20,7 @@ class MethodGroup(Generic[MethodT]):
     @property
     def words(self) -> str:
         """What all have in common, for the end of a caption."""
-        return f"{'with' if self.kind == 'supervisor' else 'under'} {display_name(self.other)}"
+        return f"{'with' if self.kind == 'supervisor' else 'with supervisor'} {display_name(self.other)}"
 
     @property
     def suffix(self) -> str:

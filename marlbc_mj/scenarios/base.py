@@ -308,8 +308,10 @@ def with_changes(made: Mapping[str, Any], changes: Mapping[str, Any]) -> Scenari
     """
     known = [each.name for each in fields(Scenario)]
     if "agents" in changes:
-        any_number = f"make_scenario('field', agents={changes['agents']!r}) makes one of any size"
-        raise ConfigurationError(f"scenario {made['name']!r} has a team of {len(made['starts'])} of its own; {any_number}")
+        team = f"a team of {len(made['starts'])} of its own, and agents cannot be set"
+        raise ConfigurationError(
+            f"scenario {changes.get('name', made['name'])!r} has {team}; families such as 'field' and 'gates' take agents"
+        )
     for name in changes:
         if name not in known:
             raise unknown("field of a scenario", name, known)

@@ -20,6 +20,7 @@ from marlbc_mj.scenarios.formations import column, make_formation
 from marlbc_mj.scenarios.layout import Layout, motions_of
 from marlbc_mj.scenarios.obstacles import Range
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.settings import check_kinds
 
 NOMINAL = 0
 """Number of the layout that a scenario shows before a seed is drawn: a training one."""
@@ -136,6 +137,7 @@ class Family(Mission):
             raise ConfigurationError(
                 f"scenario {self.name!r} has no setting {sorted(unfit)[0]!r}; it has: {', '.join(sorted(own))}"
             )
+        check_kinds(family, f"scenario {family.name!r}: ")
         family.check()
         return family._scenario(rest)
 

@@ -67,14 +67,13 @@ def check_kinds(settings: Any, prefix: str = "") -> None:
     Raises:
         ConfigurationError: naming the first field that holds something else.
     """
-    for name, hint in annotations(type(settings)).items():
+    owner: Any = type(settings)
+    for name, hint in annotations(owner).items():
         kind = hint.__origin__ if hasattr(hint, "__metadata__") else hint
         value = getattr(settings, name)
         if kind in _KINDS:
-            wanted, right = (
-                _KINDS[kind],
-                isinstance(value, _ABSTRACT.get(kind, kind)) and (kind is bool or not isinstance(value, bool)),
-            )
+            wanted = _KINDS[kind]
+            right = isinstance(value, _ABSTRACT.get(kind, kind)) and isinstance(value, bool) == (kind is bool)
         elif is_dataclass(kind) and isinstance(kind, type):
             wanted, right = f"a {kind.__name__}", isinstance(value, kind)
         else:
