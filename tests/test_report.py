@@ -488,7 +488,7 @@ def test_comparison_figures(results: list[Result]) -> None:
     episodes = [result.trajectory for result in results if result.trajectory is not None]
     figure = trajectories(episodes)
     assert figure.get_figwidth() == plotting.DOUBLE
-    assert sum(axes.get_visible() for axes in figure.axes) == len(episodes)
+    assert sum(axes.axison for axes in figure.axes) == len(episodes) == 3 and figure.axes[3].get_legend() is not None
     assert len(pareto(results[:2]).axes) == 3 and len(pareto(results).axes) == 6  # supervisors above, controllers below
     assert curves.has_weights(episodes[0]) and not curves.has_weights(episodes[1])
     for draw in (curves.weight_norms, curves.weight_errors):

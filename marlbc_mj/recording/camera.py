@@ -35,7 +35,7 @@ CAMERAS = {
 }
 """What each camera shows; a model has others of its own."""
 SPOT = "at:"
-FAR = ("wide", "top")
+DISTANT = ("wide", "top")
 """Cameras from which agents are small."""
 
 Camera = Callable[[float], mujoco.MjvCamera]

@@ -20,11 +20,11 @@ HEADER, FOOTER = 48, 80  # heights of the bars
 SHARP = 3  # bars are drawn this many times larger and reduced, which smooths their edges
 PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
-FORMATIONS = {2: "in formation", 1: "in column"}
+TEAM_STATES = {2: "in formation", 1: "in column"}
 """What the team is in, by G."""
 MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "column", "AA": "agent avoidance"}
 
-Numbers = Literal["inside", "on", "above"]
+NumberPlace = Literal["inside", "on", "above"]
 """Where agents' numbers are: inside their balls, on badges that cover them, or on badges above them."""
 
 
@@ -47,7 +47,7 @@ class Caption:
     width: int
     height: int
     speed: float | None = None  # None: a still
-    numbers: Numbers = "inside"
+    numbers: NumberPlace = "inside"
     _bars: dict[object, Image.Image] = field(default_factory=dict)
 
     @property
@@ -204,8 +204,8 @@ def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
 
 def _draw_footer(pen: Pen, log: EpisodeLog, commands: Sequence[str], formation: int) -> None:
     pen.rule(0.5)
-    state = FORMATIONS.get(formation, "")
-    room = pen.width - 48 - pen.length(max(FORMATIONS.values(), key=len), 15, True)
+    state = TEAM_STATES.get(formation, "")
+    room = pen.width - 48 - pen.length(max(TEAM_STATES.values(), key=len), 15, True)
     widest = max(pen.length(_spelled(name), 14, True) for name in log.commands) + 22
     gap = 26 if len(commands) <= 6 else 8
     for agent, command in enumerate(commands):

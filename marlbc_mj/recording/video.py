@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from marlbc_mj.recording.camera import FAR, make_camera, project
+from marlbc_mj.recording.camera import DISTANT, make_camera, project
 from marlbc_mj.recording.caption import Caption
 from marlbc_mj.recording.encoding import COLORS, PALETTE_FRAMES, check_format, common_palette, encoder
 from marlbc_mj.recording.log import EpisodeLog
@@ -122,7 +122,7 @@ def _frames(
     """(height, width, 3) uint8 for every time [s]."""
     _check_size(*size)
     stage = make_stage(log)
-    caption = Caption(log, *size, speed, numbers="above" if stage.free else "on" if camera in FAR else "inside")
+    caption = Caption(log, *size, speed, numbers="above" if stage.free else "on" if camera in DISTANT else "inside")
     scene = size[0], caption.picture_height
     view = make_camera(camera, stage, scene[0] / scene[1])
     with Offscreen(stage, view, *scene, samples=samples) as offscreen:

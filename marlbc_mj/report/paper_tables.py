@@ -79,7 +79,7 @@ def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool)
     """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
     return _table(
         "control-cost",
-        f"Maximum and total control cost of each controller with supervisor {display_name(supervisor)}{_table_number(5, published)}",
+        f"Control cost of each controller, maximum and total, with supervisor {display_name(supervisor)}{_table_number(5, published)}",
         "controller",
         _Comparison(chosen, (COST_MAX, COST_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -93,7 +93,7 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
     """Table 6: maximum and total control input; blocks as in Table 5."""
     return _table(
         "control-input",
-        f"Maximum and total control input of each controller with supervisor {display_name(supervisor)}{_table_number(6, published)}",
+        f"Control input of each controller, maximum and total, with supervisor {display_name(supervisor)}{_table_number(6, published)}",
         "controller",
         _Comparison(chosen, (INPUT_MAX, INPUT_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
