@@ -79,7 +79,7 @@ def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool)
     """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
     return _table(
         "control-cost",
-        f"Control cost of each controller, maximum and total, with supervisor {display_name(supervisor)}{_table_number(5, published)}",
+        _controller_caption("cost", supervisor, 5, published),
         "controller",
         _Comparison(chosen, (COST_MAX, COST_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -93,7 +93,7 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
     """Table 6: maximum and total control input; blocks as in Table 5."""
     return _table(
         "control-input",
-        f"Control input of each controller, maximum and total, with supervisor {display_name(supervisor)}{_table_number(6, published)}",
+        _controller_caption("input", supervisor, 6, published),
         "controller",
         _Comparison(chosen, (INPUT_MAX, INPUT_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -101,6 +101,12 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
             "Total: integral of the Euclidean norm over the mission step, a sum over samples.",
         ),
     )
+
+
+def _controller_caption(quantity: str, supervisor: str, number: int, published: bool) -> str:
+    """The caption of Table 5 or 6."""
+    given = f"with supervisor {display_name(supervisor)}"
+    return f"Maximum and total control {quantity} of each controller {given}{_table_number(number, published)}"
 
 
 def _table_number(number: int, published: bool) -> str:
