@@ -138,7 +138,7 @@ class LogExportCommand:
 
 @dataclass(frozen=True)
 class LogCommand:
-    """Look into, salvage or convert MCAP logs."""
+    """Inspect, salvage or convert MCAP logs."""
 
     action: OmitSubcommandPrefixes[
         Annotated[LogInfoCommand, subcommand("info")]
@@ -147,5 +147,5 @@ class LogCommand:
     ]
 
     def run(self) -> None:
-        """Hand over to the action."""
+        """Run the chosen subcommand."""
         self.action.run()

@@ -1,4 +1,4 @@
-"""``marlbc train``: learn a mission supervisor, or go on learning."""
+"""``marlbc train``: train a mission supervisor, or resume a training."""
 
 import sys
 from dataclasses import dataclass, field, fields
@@ -21,7 +21,7 @@ class TrainCommand:
     """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
 
     method: Positional[MethodName] = "marlms"
-    """What is learned."""
+    """Training method."""
     preset: PresetName = "fast"
     """Hyper-parameters; those of paper are published."""
     seed: int = 0
@@ -29,7 +29,7 @@ class TrainCommand:
     out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
     resume: SomePath = None
-    """Folder of a run that was interrupted: it goes on, bit for bit, with its own settings."""
+    """Folder of an interrupted run, which continues bit for bit with its own settings."""
     budget: SomeCount = None
     """Mission steps, over all worlds."""
     threads: SomeCount = None
@@ -72,7 +72,7 @@ class TrainCommand:
         self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def run_general(self) -> None:
-        """Train the policy for every team; an interrupted run leaves the policy that it had."""
+        """Train the general policy; an interrupted run leaves its last policy."""
         from marlbc_mj.cli.terminal import general_display
         from marlbc_mj.training.general.run import judged_rank, train_general
         from marlbc_mj.training.run import Interrupted
@@ -91,7 +91,7 @@ class TrainCommand:
         self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def general_config(self) -> "GeneralConfig":
-        """The settings of the policy for every team, with the command line's changes.
+        """The settings of the general policy, with the command line's changes.
 
         Raises:
             ConfigurationError: an option that this method does not have.

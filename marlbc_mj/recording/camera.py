@@ -73,7 +73,7 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
 
 
 def _track(stage: Stage, position: np.ndarray, bounds: tuple[float, float]) -> Camera:
-    """From behind and above agents at (M, A, 2) [m], turned so that they, trails and what lies ahead are in the picture."""
+    """From behind and above agents at (M, A, 2) [m], turned so that the picture shows them, their trails and what lies ahead."""
     log = stage.log
     centroid = position.mean(axis=1, keepdims=True)
     reach = np.linalg.norm(position - centroid, axis=-1).max(axis=1, keepdims=True)

@@ -21,7 +21,7 @@ SHARP = 3  # bars are drawn this many times larger and reduced, which smooths th
 PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
 TEAM_STATES = {2: "in formation", 1: "in column"}
-"""What the team is in, by G."""
+"""The team's formation in words, by G."""
 MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "column", "AA": "agent avoidance"}
 
 NumberPlace = Literal["inside", "on", "above"]
@@ -30,7 +30,7 @@ NumberPlace = Literal["inside", "on", "above"]
 
 @lru_cache(maxsize=64)
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans as matplotlib brings it along."""
+    """DejaVu Sans, which comes with matplotlib."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), max(size, 4))
 
@@ -52,17 +52,19 @@ class Caption:
 
     @property
     def scale(self) -> float:
-        """Size of this frame's bars, 1 in a picture of 1280 x 720; text shrinks less than a picture, or it could not be read."""
+        """Size of this frame's bars, 1 in a picture of 1280 x 720; text shrinks less than the picture, so that it stays
+        legible.
+        """
         return min(self.width / FULL[0], 1.5 * self.height / FULL[1]) ** 0.6
 
     @property
     def header(self) -> int:
-        """Height of the upper bar."""
+        """Height of the upper bar [pixels]."""
         return round(HEADER * self.scale)
 
     @property
     def picture_height(self) -> int:
-        """What the bars leave."""
+        """Height of the scene between the bars [pixels]."""
         return self.height - self.header - round(FOOTER * self.scale)
 
     def frame(self, picture: np.ndarray, time: float, step: int, labels: np.ndarray, radii: np.ndarray) -> Image.Image:
@@ -149,7 +151,7 @@ class Pen:
         return _font(round(size * self.scale), bold)
 
     def length(self, text: str, size: float, bold: bool = False) -> float:
-        """How wide a text will be."""
+        """Width of a text [pixels of the full picture]."""
         return float(self.font(size, bold).getlength(text)) / self.scale
 
     def text(self, text: str, y: float, size: float, color: str, *, bold: bool = False, gap: float = 0.0) -> None:

@@ -1,4 +1,4 @@
-"""What a log looks like at one time: the posed model, and the marks that belong in the picture but not in the model.
+"""A log at one time as a picture shows it: the posed model, and marks that are not part of the model.
 
 Marks are flat shapes on the ground, added to a scene when it is drawn, so physics never pays for them.
 """
@@ -98,7 +98,7 @@ class Stage:
         return [mark for i, trail in enumerate(self.trails) for mark in trail.until(time, here[i])]
 
     def _links(self, time: float) -> list[Mark]:
-        """Who hears whom, where agents talk."""
+        """Links of a team with communication."""
         if not self.log.link.shape[1]:
             return []
         here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
@@ -211,7 +211,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
 
 
 def _place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, discs: list[int], obstacles: np.ndarray, unit: float) -> None:
-    """Obstacles (K, 3) where an episode has them, and as large."""
+    """Set the places and radii of obstacles (K, 3)."""
     least = unit * (LEAST_SOLID if model.nmocap else POINT_RADIUS)
     for geom, (x, y, radius) in zip(discs, obstacles, strict=True):
         model.geom_size[geom, 0] = max(radius, least)

@@ -77,7 +77,7 @@ def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float,
 
 
 def _discs(episode: Trajectory) -> np.ndarray:
-    """(K, 3) obstacles to draw: of those that move, where and when each is nearest to an agent."""
+    """(K, 3) obstacles to draw: moving ones at the place and time at which they are nearest to an agent."""
     every = episode.scenario.substeps
     return nearest_places(episode.time[::every], episode.position[:-1:every], episode.obstacles, episode.motions)
 

@@ -305,7 +305,7 @@ def has_weights(trajectory: Trajectory) -> bool:
 
 
 def flat_after(trajectory: Trajectory) -> float:
-    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they always do."""
+    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they never stop."""
     read, last = network_weights(trajectory), 0
     for matrix in (read.actor, read.critic):
         norms = np.linalg.norm(matrix, axis=(-2, -1))

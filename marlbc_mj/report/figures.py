@@ -74,7 +74,7 @@ def plots(results: Sequence[Result]) -> list[Plot]:
 
 
 def _without_number(caption: str) -> str:
-    """A caption as another mission has it."""
+    """A caption without the paper's figure number."""
     text = re.sub(r"^Figure \d+: ", "", caption)
     return text[:1].upper() + text[1:]
 

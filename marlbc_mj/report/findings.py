@@ -1,4 +1,4 @@
-"""What a run says about the paper's comparisons: which published orders hold, and what the same actuator changes."""
+"""Findings of a run: which published orders hold, and what an equal actuator changes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -127,7 +127,7 @@ def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: fl
 
 
 def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float) -> str:
-    """What LQR costs, and how safe it is."""
+    """Cost and safety of LQR."""
     metrics = chosen["lqr"].metrics if "lqr" in chosen else None
     if metrics is None:
         return ""
@@ -138,7 +138,7 @@ def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float
 
 
 def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: float) -> str:
-    """What that does to the published conclusion, for the published rivals."""
+    """Whether the published conclusion still holds for the published rivals."""
     rivals = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
     reversed_for = [name for name in rivals if limited[name] < ours < costs[name]]
     before = [name for name in rivals if limited[name] < ours and costs[name] <= ours]

@@ -134,7 +134,7 @@ def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -
 
 
 def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
-    """What a page says about a scenario, by name."""
+    """Facts about a scenario for the page, by name."""
     return [
         ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
         ("Composition", scenario.composition),
@@ -149,7 +149,7 @@ def origin_facts(config: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
-    """What lies beside the page and is worth a link."""
+    """Files beside the page, to be linked."""
     names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
     files = [folder / name for name in names if (folder / name).exists()]
     figures = [folder / "figures"] if (folder / "figures").is_dir() else []

@@ -110,7 +110,7 @@ def _controller_caption(quantity: str, supervisor: str, number: int, published: 
 
 
 def _table_number(number: int, published: bool) -> str:
-    """What a caption says of the paper's table that ours stands beside."""
+    """The number of the corresponding table of the paper, for a caption."""
     return f" (Table {number} of the paper)" if published else ""
 
 
@@ -169,7 +169,7 @@ class _Comparison:
         return (SAME_ORDER, *marks, *([""] if self.relative else []))
 
     def notes(self) -> list[str]:
-        """What the columns are, what is published but did not run here, and what failed."""
+        """Notes on columns, on published methods that did not run here, and on failures."""
         told = [n for n in TOLD if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
         notes = (
             [f"Told the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
@@ -256,14 +256,14 @@ def _decision_columns(shares: bool, published: bool) -> list[Column]:
 
 
 def _measured(result: Result, shares: bool) -> list[str]:
-    """What this run took: median, 99th percentile and, with ``shares``, the share of the network or solver."""
+    """Times of this run: median, 99th percentile and, with ``shares``, the share of the network or solver."""
     team, share = (result.metrics["team"] if result.metrics else None), result.solver_share
     cells = [significant(team["decision_ms_median"]), significant(team["decision_ms_p99"])] if team else [FAILED, DASH]
     return cells + ([DASH if share is None else fixed(100 * share, 0)] if shares else [])
 
 
 def _beside(values: Sequence[float] | None, median: float | None) -> list[str]:
-    """What the paper's four agents took, and their sum over our median."""
+    """Published times of the four agents, and their sum over our median."""
     if values is None:
         return [DASH] * 5
     return [*(f"{value:.1f}" for value in values), significant(sum(values) / median, 2) if median else DASH]

@@ -1,4 +1,4 @@
-"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and the errata that one needs to read them."""
+"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and the errata that are needed to read them."""
 
 from collections.abc import Mapping
 from typing import NamedTuple

@@ -28,7 +28,7 @@ _PANELS = {
     "violation_time_worst": "lower left is better",
     "formation_error_mean": "lower left is better",
 }
-"""Scores on the ordinates, and where the better methods are."""
+"""Scores on the ordinates, and the corner in which better methods are."""
 
 
 class Group(NamedTuple):

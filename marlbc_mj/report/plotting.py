@@ -18,7 +18,7 @@ SINGLE = 3.5  # width of a column [in]
 DOUBLE = 7.16  # width of two columns and the gap between them [in]
 GREY = "#6E6E6E"
 LINE_STYLES = ("-", (0, (5, 1.2)), (0, (3, 1, 1, 1)), (0, (1.2, 1)))
-BINS = 500  # per curve: more than a printed column resolves
+BINS = 500  # per curve: more than a column in print resolves
 
 _STYLE: Any = {
     "font.family": "sans-serif",

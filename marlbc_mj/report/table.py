@@ -104,7 +104,7 @@ def pipe_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A ``table*`` for a document that loads booktabs and graphicx; one that is wider than the text is made as narrow."""
+    """A ``table*`` for a document that loads booktabs and graphicx; a table wider than the text is scaled down to its width."""
     count = len(table.columns)
     body = [_latex_row(row) for row in table.rows]
     for at in sorted(table.rules, reverse=True):

@@ -1,4 +1,4 @@
-"""Every method on the same draws around a scenario, as results: scalars only, so memory stays flat."""
+"""Every method on the same draws around a scenario, as scalars only, so that memory stays small."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
