@@ -1,4 +1,4 @@
-"""The advice that a command gives where compiled code cannot be cached."""
+"""What is said where compiled code cannot be kept."""
 
 import sys
 

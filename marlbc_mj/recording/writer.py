@@ -250,7 +250,7 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
 
 
 def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[str, str]:
-    """The scenario's fields of an :class:`EpisodeLog`, as strings that read back exactly."""
+    """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
         "composition": scenario.composition,
