@@ -59,7 +59,7 @@ def test_wrong_requests_are_refused(switch: Scenario) -> None:
         calibrate("pd")
     with pytest.raises(ConfigurationError, match="tolerance must be positive"):
         calibrate("finite-time", switch, tolerance=0.0)
-    with pytest.raises(SimulationError, match="no gain from 2 to 32 /s gives the printed maximum"):
+    with pytest.raises(SimulationError, match="no gain from 2 to 32 /s gives the published maximum"):
         calibrate("finite-time", replace(switch, schedule=(Window(0.0, 0.0, -1, "FM"),)))
 
 
@@ -78,7 +78,7 @@ def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatc
 def test_table_has_a_row_for_each_gain() -> None:
     made = Calibration("x", (384.0, 768.0), 7.9, 8.0, (383.99999, 768.0), (385.0, 769.0), 5)
     assert calibration_lines([made])[2:] == [
-        "| x, printed | – | 384 / 768 | – |",
+        "| x, published | – | 384 / 768 | – |",
         "| x, found | 7.9000 | 384.00 / 768.00 | +0.00% / +0.00% |",
         "| x, shipped | 8.0000 | 385.00 / 769.00 | +0.26% / +0.13% |",
     ]

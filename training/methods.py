@@ -1,4 +1,4 @@
-"""Methods of learning by name: what each changes in a preset."""
+"""Training methods by name: their changes of a preset."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, Any

@@ -1,6 +1,5 @@
-"""Families of missions of one's own: what is in the way makes the family, and every seed places it anew.
-
-What all share is in :mod:`marlbc_mj.scenarios.family`. A family is used by name, from a TOML file, or as a Python object:
+"""Families of missions, which differ in their obstacles; every seed draws new places. Their base is in
+:mod:`marlbc_mj.scenarios.family`. A family is used by name, from a TOML file, or as a Python object:
 ``Field(agents=9, formation="grid").build()``.
 """
 
@@ -59,7 +58,7 @@ class Field(Family):
             )
 
     def check_discs(self, count: int, radius: Range) -> None:
-        """Raise ConfigurationError for a number or a range of radii that cannot be."""
+        """Raise ConfigurationError for an invalid number or range of radii."""
         if count < 1:
             raise self.infeasible(f"obstacles must be at least 1, got {count}; the family 'open' has none")
         if not (np.isfinite(radius).all() and 0 <= radius[0] <= radius[1]):

@@ -1,4 +1,5 @@
-"""How safe and how good supervisors are where nobody tuned them: families of missions under both compositions, shield on and off.
+"""Safety and performance of supervisors on missions that they were not tuned for: families of missions under both compositions,
+shield on and off.
 
 Of every layout few numbers are kept, see :mod:`marlbc_mj.results.layouts`.
 """
@@ -49,7 +50,7 @@ VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
 OWN = "own"
-"""In the place of a composition: the supervisor's own velocities."""
+"""Stands for a composition where a supervisor gives its own velocities."""
 FIRST_SEED = 70_000
 
 

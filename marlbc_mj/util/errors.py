@@ -1,4 +1,4 @@
-"""The two ways in which this package refuses to go on; every message names the value and the valid ones."""
+"""The errors that this package raises on purpose; every message names the value and the valid ones."""
 
 from collections.abc import Iterable
 
@@ -22,7 +22,7 @@ class SimulationError(MarlbcError, RuntimeError):
 
 
 class NoSpaceError(ConfigurationError):
-    """An output that the disk has no room for: the command was right, what it was to leave is missing. Exit status 3."""
+    """An output that the disk has no room for; the command itself was right. Exit status 3."""
 
     exit_status = 3
 

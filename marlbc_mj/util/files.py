@@ -1,4 +1,4 @@
-"""Output folders and files, which appear whole or not at all, and never in the place of what somebody else wrote."""
+"""Output folders and files, which appear whole or not at all, and never replace files of others."""
 
 import errno
 import json
@@ -65,7 +65,7 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 
 def _counts_not(name: str) -> bool:
-    """Whether what has this name in an output folder is something unfinished of this program's."""
+    """Whether a name in an output folder belongs to an unfinished output of this program."""
     return PARTIAL in name or name == JOBS_FOLDER
 
 

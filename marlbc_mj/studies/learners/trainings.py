@@ -1,4 +1,4 @@
-"""The study of learners: one training per variant and seed, in a folder of its own, where it goes on after a stop.
+"""The study of learners: one training per variant and seed, in a folder of its own, in which it resumes after a stop.
 
 A run that finished leaves ``DONE`` with the hash of its configuration, one that failed ``FAILED`` with its reason.
 """

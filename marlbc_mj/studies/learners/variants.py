@@ -14,7 +14,7 @@ class Variant:
 
     line: str
     group: str
-    """What it is compared for: learner, preset or rival."""
+    """Group of the comparison: learner, preset or rival."""
     method: str = "marlms"
     preset: str = "fast"
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -42,9 +42,9 @@ VARIANTS: dict[str, Variant] = {
         "preset",
         changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
     ),
-    "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
+    "printed-state": Variant("the published state", "preset", changes={"state": "printed"}),
     "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
-    "paper": Variant("the printed hyper-parameters, state, reward and orders", "preset", preset="paper"),
+    "paper": Variant("the published hyper-parameters, state, reward and orders", "preset", preset="paper"),
     "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
     "vdn": Variant("value decomposition", "rival", "vdn"),
     "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
