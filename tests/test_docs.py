@@ -104,6 +104,13 @@ def test_pages_load_nothing_from_elsewhere():
     assert "font: false" in (DOCS.parent / "mkdocs.yml").read_text()
 
 
+def test_search_works_in_pages_opened_from_the_disk():
+    """Browsers start no workers there: the index is a script, and a shim of the project's own pages stands in for workers."""
+    settings = (DOCS.parent / "mkdocs.yml").read_text()
+    assert "  - offline" in settings and "polyfills: [assets/iframe-worker.js]" in settings
+    assert "window.Worker=o" in (DOCS / "assets" / "iframe-worker.js").read_text()
+
+
 def test_every_page_is_in_the_navigation():
     """And everything in the navigation is a page."""
     listed = set(re.findall(r"^\s+- [^:]+: (\S+\.md)$", (DOCS.parent / "mkdocs.yml").read_text(), re.MULTILINE))

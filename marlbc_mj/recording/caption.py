@@ -55,7 +55,7 @@ class Caption:
         """Size of this frame's bars, 1 in a picture of 1280 x 720; text shrinks less than the picture, so that it stays
         legible.
         """
-        return min(self.width / FULL[0], 1.5 * self.height / FULL[1]) ** 0.6
+        return float(min(self.width / FULL[0], 1.5 * self.height / FULL[1]) ** 0.6)
 
     @property
     def header(self) -> int:

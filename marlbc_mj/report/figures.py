@@ -34,7 +34,7 @@ _AGENT = 3  # index of the agent in Figure 9
 _PATHS = "colored by the highest behavior in force; casing: inside the safe distance."
 _STRIPS = (
     "color and height of a strip show the highest behavior in force (OA: avoid the obstacle, FM: keep the formation, FR: form "
-    "the column); beside it the number of switches. Grey: switches of the whole team in each second, and the most of them."
+    "the column); beside it the number of switches. Grey: the team's switches in each second, with their maximum."
 )
 _FORCES = (
     "Applied force. Left and middle: light, everything the force reaches within a pixel column; dark, its mean. "

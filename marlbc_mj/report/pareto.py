@@ -123,7 +123,7 @@ def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, An
     inch = axes.figure.dpi_scale_trans
     shifts = _asides(72.0 * inch.inverted().transform(axes.transData.transform(points)))
     for point, shift, style in zip(points, shifts, styles, strict=True):
-        aside = axes.transData + ScaledTranslation(*shift / 72.0, inch)
+        aside = axes.transData + ScaledTranslation(shift[0] / 72.0, shift[1] / 72.0, inch)
         if shift.any():
             line = {"arrowstyle": "-", "linewidth": 0.5, "color": pl.GREY, "shrinkA": 0.0, "shrinkB": 0.0}
             axes.annotate("", point, tuple(shift), textcoords="offset points", arrowprops=line, annotation_clip=False)
@@ -139,7 +139,7 @@ def _asides(places: np.ndarray) -> np.ndarray:
     for place in places:
         free = [o for o in offsets if all(np.hypot(*(place + o - other)) > 0.97 * _APART for other in shown)]
         shown.append(place + free[0])
-    return np.array(shown) - places
+    return np.asarray(np.array(shown) - places)
 
 
 def _draw_floor(axes: Axes, cost: float) -> None:
