@@ -183,7 +183,7 @@ def test_a_robot_that_flies_off_is_status_3(monkeypatch, tmp_path, capsys):
 def test_perf_does_not_overwrite(tmp_path, capsys):
     (tmp_path / "perf.json").write_text("mine")
     with pytest.raises(SystemExit):
-        main(["perf", "--json", str(tmp_path / "perf.json")])
+        main(["perf", "--out", str(tmp_path / "perf.json")])
     assert "--overwrite" in capsys.readouterr().err and (tmp_path / "perf.json").read_text() == "mine"
 
 
@@ -219,7 +219,9 @@ def test_package_and_home_that_cannot_be_written(tmp_path):
     line = (
         f"mount --bind {package} {package} && mount -o remount,ro,bind {package} && mkdir {tmp_path}/home && "
         f"mount -t tmpfs -o ro tmpfs {tmp_path}/home && cd / && HOME={tmp_path}/home {sys.executable} -c "
-        "'from marlbc_mj.supervisors import prediction; from marlbc_mj.cli import main; main([\"list\"])'"
+        "'from marlbc_mj.supervisors import prediction; from marlbc_mj.scenarios import SCENARIOS; "
+        "from marlbc_mj.cli import main; "
+        '[make() for make in SCENARIOS.values()]; main(["list"])\''
     )
     done = subprocess.run(["unshare", "-m", "sh", "-c", line], env=ENVIRONMENT, capture_output=True, text=True, check=False)
     if "unshare" in done.stderr or "mount" in done.stderr:

@@ -241,7 +241,7 @@ class RunCommand:
         from marlbc_mj.util.provenance import versions
 
         scenario = self.mission.build(self.scenario)
-        if self.seed and not scenario.draws:
+        if self.seed > 0 and not scenario.draws:
             note(f"{self.scenario} draws nothing: seed {self.seed} gives the same episode as any other")
         with self.output.progress(ends=False) as told:
             result = run_single(

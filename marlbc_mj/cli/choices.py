@@ -44,6 +44,8 @@ _SUPERVISOR = Kind(
 _CONTROLLER = Kind("controller", ("controllers",), ("FILE.py:NAME",), "marlbc_mj.controllers:CONTROLLERS")
 _ROBOT = Kind("robot", ("robots",), ("FILE.xml", "FILE.py", "FILE.py:NAME"), "marlbc_mj.robots:ROBOTS")
 _CHECKED_ROBOT = _ROBOT._replace(forms=(*_ROBOT.forms, "menagerie:FOLDER/FILE.xml"))
+_GATE_SUPERVISOR = Kind("supervisor", ("supervisors of the gate",))
+_GATE_CONTROLLER = Kind("controller", ("controllers of the gate",))
 _MISSION = _SCENARIO._replace(lists=("scenarios", "draws of the case study"))
 _SETTING = Kind("setting", ("settings of a scenario",))
 _TRAINING_SETTING = Kind("setting", ("settings of training",))
@@ -180,6 +182,8 @@ SupervisorNames = Annotated[tuple[Annotated[str, _one(_SUPERVISOR)], ...], _show
 SomeSupervisors = Annotated[tuple[Annotated[str, _one(_SUPERVISOR)], ...] | None, _shown(_SUPERVISOR, "SUPERVISOR ...")]
 ControllerName = Annotated[str, _one(_CONTROLLER), _shown(_CONTROLLER)]
 SomeControllers = Annotated[tuple[Annotated[str, _one(_CONTROLLER)], ...] | None, _shown(_CONTROLLER, "CONTROLLER ...")]
+GateSupervisorNames = Annotated[tuple[Annotated[str, _one(_GATE_SUPERVISOR)], ...], _shown(_GATE_SUPERVISOR)]
+GateControllerName = Annotated[str, _one(_GATE_CONTROLLER), _shown(_GATE_CONTROLLER)]
 RobotName = Annotated[str, _one(_CHECKED_ROBOT), _shown(_CHECKED_ROBOT)]
 RobotNames = Annotated[tuple[Annotated[str, _one(_ROBOT)], ...], _shown(_ROBOT)]
 SomeRobot = Annotated[Annotated[str, _one(_ROBOT)] | None, _shown(_ROBOT, "ROBOT")]

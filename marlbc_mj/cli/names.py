@@ -61,6 +61,7 @@ def _of_studies() -> dict[str, dict[str, str]]:
     from marlbc_mj.studies.ablation import QUESTIONS
     from marlbc_mj.studies.calibration import CALIBRATED
     from marlbc_mj.studies.learners.variants import VARIANTS
+    from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, GATE_SUPERVISORS
     from marlbc_mj.studies.safety import DRAG_DRAWS
     from marlbc_mj.studies.suite.definition import TRACKS, missions_of
 
@@ -71,6 +72,8 @@ def _of_studies() -> dict[str, dict[str, str]]:
         "ablation studies": {name: question.caption for name, question in QUESTIONS.items()},
         "study variants": {name: variant.line for name, variant in VARIANTS.items()},
         "calibrated controllers": dict.fromkeys(CALIBRATED, "its velocity gain"),
+        "supervisors of the gate": dict.fromkeys(GATE_SUPERVISORS, "with thresholds of the robot's size"),
+        "controllers of the gate": dict.fromkeys(GATE_CONTROLLERS, "with the robot's gains"),
         "draws of the case study": {name: f"drag times {drag[0]:g}" for name, drag in DRAG_DRAWS.items()},
     }
 

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.cli.choices import RobotName, RobotNames
+from marlbc_mj.cli.choices import GateControllerName, GateSupervisorNames, RobotName, RobotNames
 from marlbc_mj.cli.output import ReportOptions
 
 
@@ -38,10 +38,10 @@ class RobotGateCommand:
 
     robots: RobotNames = ()
     """Robots; all but the point mass by default."""
-    supervisors: tuple[str, ...] = ("scripted", "fsams-hysteresis", "mpcms")
+    supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms")
     """Supervisors; the first one's episodes are shown."""
-    controller: str = "pd"
-    """Controller with the robot's gains: pd or sorlc-scaled."""
+    controller: GateControllerName = "pd"
+    """Controller, with the robot's gains."""
     out: Path = Path("out/robots")
     """Folder of gate.md, gate.json, PNG and MP4."""
     clips: bool = True

@@ -221,7 +221,7 @@ def _render_videos(
             key = result.key
             path = folder / "video" / f"{key}.mp4"
             log = read_log(folder / "logs" / f"{key}.mcap")
-            render_video(log, path, progress=partial(progress, f"video {key}"))
+            render_video(log, path, progress=partial(progress, f"video of {result.display}"))
             videos.append(path)
     except MarlbcError as error:
         return videos, [f"no video: {error}"]

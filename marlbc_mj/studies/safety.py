@@ -24,6 +24,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
@@ -126,7 +127,7 @@ class SafetyStudy:
     def run(self, job: SafetyJob, watch: Watch) -> Marks:
         scenario, cell = ground(job.cell.mission), job.cell
         composition = None if cell.composition == OWN else cell.composition
-        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", cell.supervisor))
+        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", display_name(cell.supervisor)))
 
         def fly(seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
             return evaluate_batch(

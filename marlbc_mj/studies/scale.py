@@ -29,6 +29,7 @@ from marlbc_mj.studies.runner import Conclusion, run_study
 from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import cpu, provenance
 
@@ -198,7 +199,7 @@ def scale_table(figures: dict[str, Any]) -> Table:
         Column("", "agents"),
         Column("mission step", "µs per agent"),
         Column("mission step", f"of {SIZES[0]} agents'"),
-        *(Column("decision", f"{name}, µs per agent") for name in SCALED_SUPERVISORS),
+        *(Column("decision", f"{display_name(name)}, µs per agent") for name in SCALED_SUPERVISORS),
         Column("memory", "KiB per world"),
         Column("memory", "KiB per agent"),
     )

@@ -76,7 +76,7 @@ def display_name(name: str) -> str:
 def display_key(key: str) -> str:
     """Display name of a method by its key, ``mpcms+sorlc``; any other text as it is."""
     supervisor, plus, controller = key.partition("+")
-    return display_method(supervisor, controller) if plus else key
+    return display_method(supervisor, controller) if plus and " " not in key else key
 
 
 def display_method(supervisor: str, controller: str) -> str:
