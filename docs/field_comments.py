@@ -42,8 +42,8 @@ class FieldComments(Extension):
 
     def on_class_members(self, *, cls: Class, **_: Any) -> None:
         """A class, once all of its fields are known."""
-        own = (each for each in cls.attributes.values() if not each.is_alias)
-        fields = [each for each in own if not each.name.startswith("_") and "class-attribute" in each.labels]
+        own = [each for each in cls.attributes.values() if not each.is_alias and not each.name.startswith("_")]
+        fields = [each for each in own if "property" not in each.labels and (each.docstring or "class-attribute" in each.labels)]
         if not fields:
             return
         lines = [f"    {each.name}: {_one_line(each)}" for each in fields]
@@ -56,6 +56,6 @@ class FieldComments(Extension):
 def _one_line(field: Attribute) -> str:
     """What is known of a field: its text, and its default where that is short."""
     text = "" if field.docstring is None else " ".join(field.docstring.value.split())
-    default = "" if field.value is None else str(field.value)
+    default = "" if field.value is None or "class-attribute" not in field.labels else str(field.value)
     shown = f"`{default}` by default" if default and len(default) <= 24 and not default.startswith("field(") else ""
     return "; ".join(part for part in (text, shown) if part) or "\N{EN DASH}"
