@@ -47,7 +47,7 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
         "duration": 0.05 * steps,
         "disturbance": LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
         "schedule": _schedule(unit / speed),
-        "description": "a point obstacle and a gate for four real robots, scaled to --robot",
+        "description": "a point obstacle and a gate for four robots, scaled to --robot",
         "speed_limit": top,
         "acceleration_limit": brake,
         **body.scale(),

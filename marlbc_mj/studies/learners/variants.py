@@ -32,7 +32,7 @@ VARIANTS: dict[str, Variant] = {
     "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
     "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
     "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
-    "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
+    "no-risk": Variant("no learned risks: a cost of coming too close makes the policy careful", "learner", changes=CARE),
     "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
     "uniform-starts": Variant(
         "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
@@ -49,7 +49,7 @@ VARIANTS: dict[str, Variant] = {
     "vdn": Variant("value decomposition", "rival", "vdn"),
     "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
     "central": Variant("one network over joint orders", "rival", "central"),
-    "rlms": Variant("single agents side by side", "rival", "rlms"),
+    "rlms": Variant("agents that learn alone", "rival", "rlms"),
     "mappo": Variant("multi-agent PPO", "rival", "mappo"),
 }
 """Method, preset and changes by name."""
