@@ -12,6 +12,7 @@ import marlbc_mj
 from marlbc_mj.cli import Command, main, parsing
 from marlbc_mj.cli.choices import selectable
 from marlbc_mj.cli.names import registered
+from marlbc_mj.cli.terminal import seldom
 
 
 def said_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -148,6 +149,20 @@ def test_one_kind_can_be_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert json.loads(capsys.readouterr().out) == {"robots": selectable()["robots"]}
     main(["list", "--quiet"])
     assert capsys.readouterr().out == ""
+
+
+def test_a_line_per_method_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
+    """By its name for people, once, when it has ended; what takes minutes tells of itself now and then, too."""
+    tell = seldom()
+    for done in range(201):
+        tell("fsams+sorlc", done, 200)
+    tell("jobs", 3, 26)
+    assert re.fullmatch(r"FSAMS \+ SORLC: 200 of 200 in \d+\.\d s\n", capsys.readouterr().err)
+    often = seldom(every=0.0, ends=False)
+    for done in (0, 100, 200):
+        often("mpcms+pd", done, 200)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines and all(line.startswith("MPCMS + Saturated PD: ") and line.endswith(" s left") for line in lines)
 
 
 def test_every_command_can_be_quiet_and_those_that_report_give_json() -> None:

@@ -97,7 +97,8 @@ def _defaults(settings: Any, prefix: str = "") -> dict[str, str]:
     from marlbc_mj.util.settings import annotations
 
     found: dict[str, str] = {}
-    for name in annotations(type(settings)):
+    owner: Any = type(settings)
+    for name in annotations(owner):
         value = getattr(settings, name)
         inner = _defaults(value, f"{prefix}{name}.") if is_dataclass(value) else {prefix + name: f"default {value}"}
         found.update(inner)

@@ -335,12 +335,13 @@ def _course(metadata: dict[str, str], agents: int) -> Course:
     Raises:
         ValueError: numbers that no scenario has.
     """
-    numbers = [float(metadata[name]) for name in ("substep", "mission_step", "safe_distance", "scenario_force_limit")]
-    origin, velocity = np.array(json.loads(metadata["path"]), dtype=np.float64).reshape(2, 2).tolist()
+    numbers = {name: float(metadata[name]) for name in ("substep", "mission_step", "safe_distance", "scenario_force_limit")}
+    (x, y), (vx, vy) = np.array(json.loads(metadata["path"]), dtype=np.float64).reshape(2, 2).tolist()
     formations = np.array(json.loads(metadata["slots"]), dtype=np.float64).reshape(2, agents, 2)
-    if not (np.array(numbers) > 0).all() or not np.isfinite([*numbers, *origin, *velocity, *formations.ravel()]).all():
+    limit, given = numbers.pop("scenario_force_limit"), [*numbers.values(), x, y, vx, vy, *formations.ravel()]
+    if not min(*numbers.values(), limit) > 0 or not np.isfinite([*given, limit]).all():
         raise ValueError("substep, safe_distance, force_limit, path or slots are no numbers of a scenario")
-    return Course(*numbers, tuple(origin), tuple(velocity), formations)
+    return Course(**numbers, force_limit=limit, path_origin=(x, y), path_velocity=(vx, vy), formations=formations)
 
 
 def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:

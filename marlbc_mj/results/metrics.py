@@ -107,9 +107,20 @@ def _of_trajectory(episode: Trajectory) -> _Flown:
 def _of_log(log: EpisodeLog) -> _Flown:
     if log.substeps is None:
         raise ConfigurationError("the log holds mission steps only, and metrics need every substep; fly the episode again")
-    course, position, *others = log.substeps
-    clearance = clearances_after(position[1:], log.obstacles, log.motions, course.substep)
-    return _Flown(course, position, *others, log.command, log.reward, log.decision_ms, shield_counts_of(log.shield), clearance)
+    every = log.substeps
+    return _Flown(
+        every.course,
+        every.position,
+        every.velocity,
+        every.reference,
+        every.reference_velocity,
+        every.force,
+        log.command,
+        log.reward,
+        log.decision_ms,
+        shield_counts_of(log.shield),
+        clearances_after(every.position[1:], log.obstacles, log.motions, every.course.substep),
+    )
 
 
 def _agent(flown: _Flown, agent: int) -> AgentMetrics:
