@@ -64,11 +64,11 @@ def test_wrong_requests_are_refused(switch: Scenario) -> None:
 
 
 def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, switch: Scenario) -> None:
-    """Printed, found and shipped row of each controller; an unknown controller is one line."""
+    """Published, found and shipped row of each controller; an unknown controller is one line."""
     monkeypatch.setattr("marlbc_mj.studies.calibration.paper", lambda: switch)
     main(["calibrate", "--controllers", "fixed-time"])
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("|")[1].strip() for line in lines[2:]] == [f"fixed-time, {row}" for row in ("printed", "found", "shipped")]
+    assert [line.split("|")[1].strip() for line in lines[2:]] == [f"fixed-time, {row}" for row in ("published", "found", "shipped")]
     with pytest.raises(SystemExit) as stopped:
         main(["calibrate", "--controllers", "pd"])
     assert stopped.value.code == 2
