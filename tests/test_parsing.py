@@ -4,7 +4,9 @@ import json
 import re
 import subprocess
 import sys
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import tyro
 
@@ -12,6 +14,8 @@ import marlbc_mj
 from marlbc_mj.cli import Command, main, parsing
 from marlbc_mj.cli.choices import selectable
 from marlbc_mj.cli.names import registered
+from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.cli.parsing import Refusal
 from marlbc_mj.cli.terminal import seldom
 
 
@@ -163,6 +167,21 @@ def test_a_line_per_method_where_nobody_watches(capsys: pytest.CaptureFixture[st
         often("mpcms+pd", done, 200)
     lines = capsys.readouterr().err.splitlines()
     assert lines and all(line.startswith("MPCMS + Saturated PD: ") and line.endswith(" s left") for line in lines)
+
+
+def test_a_document_holds_numbers_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of dataclasses, named tuples and arrays; NumPy's numbers are numbers, and what is not finite is null."""
+
+    class Row(NamedTuple):
+        passed: Any
+        values: Any
+
+    rows = {"rows": [Row(np.bool_(True), np.array([1.5, np.inf])), Row(np.int64(3), Refusal("a", "b"))]}
+    ReportOptions(json=True).report("text", rows)
+    first, second = {"passed": True, "values": [1.5, None]}, {"passed": 3, "values": {"said": "a", "command": "b"}}
+    assert json.loads(capsys.readouterr().out) == {"rows": [first, second]}
+    ReportOptions(quiet=True).report("text", rows)
+    assert capsys.readouterr().out == ""
 
 
 def test_every_command_can_be_quiet_and_those_that_report_give_json() -> None:

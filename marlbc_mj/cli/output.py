@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 from marlbc_mj.cli.terminal import Told, no_display, progress_bars, progress_lines
@@ -76,16 +76,20 @@ class ReportOptions(OutputOptions):
 
 
 def _plain(value: Any) -> Any:
-    """JSON data; named tuples keep their names."""
+    """JSON data: what has named parts becomes an object, numbers that are not finite become null."""
     from marlbc_mj.util.provenance import plain_data
 
     return plain_data(_named(value), not_finite=lambda _: None)
 
 
 def _named(value: Any) -> Any:
-    """Nested named tuples as dicts."""
+    """Nested dataclasses and named tuples as dicts, and NumPy's numbers as Python's."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return {each.name: _named(getattr(value, each.name)) for each in fields(value)}
     if isinstance(value, tuple) and hasattr(value, "_asdict"):
         return {name: _named(entry) for name, entry in value._asdict().items()}
     if isinstance(value, dict):
         return {key: _named(entry) for key, entry in value.items()}
-    return [_named(entry) for entry in value] if isinstance(value, (list, tuple)) else value
+    if isinstance(value, (list, tuple)):
+        return [_named(entry) for entry in value]
+    return value.item() if hasattr(value, "dtype") and getattr(value, "ndim", 1) == 0 else value
