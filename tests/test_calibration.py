@@ -27,7 +27,7 @@ def result(request: pytest.FixtureRequest, switch: Scenario) -> Calibration:
 
 
 def test_search_finds_the_printed_maximum(result: Calibration) -> None:
-    """The largest maximum is the printed one, within the tolerance; found gain and default differ by less than 1 %."""
+    """The largest maximum is the published one, within the tolerance; found gain and default differ by less than 1 %."""
     assert max(result.at_found) == pytest.approx(max(result.printed), rel=1e-4)
     assert result.found == pytest.approx(result.shipped, rel=0.01)
     assert result.shipped == CALIBRATED[result.controller].velocity_gain
@@ -35,7 +35,7 @@ def test_search_finds_the_printed_maximum(result: Calibration) -> None:
 
 
 def test_one_gain_explains_all_agents_but_one(result: Calibration) -> None:
-    """Every other maximum is within half a percent of the printed one, too; agent 2's under fixed-time is not."""
+    """Every other maximum is within half a percent of the published one, too; agent 2's under fixed-time is not."""
     exceptions = {"finite-time": set(), "fixed-time": {1}}[result.controller]
     for errors in (result.errors, result.shipped_errors):
         assert {agent for agent, error in enumerate(errors) if abs(error) > 0.005} == exceptions

@@ -127,7 +127,7 @@ def test_progress_and_rows_grow_with_methods_times_seeds(results: SeedResults, t
 
 
 def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
-    """A drag a million times the printed one throws every episode out of the physical range; the rest is reported."""
+    """A drag a million times the published one throws every episode out of the physical range; the rest is reported."""
     wild: Scenario = paper(duration=2.0, disturbance=PaperDrag(1e6))
     results = run_seeds(wild, ("scripted",), ("pd", "sorlc"), seed_range(3))
     for method in results.methods:
