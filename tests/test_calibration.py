@@ -68,7 +68,8 @@ def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatc
     monkeypatch.setattr("marlbc_mj.studies.calibration.paper", lambda: switch)
     main(["calibrate", "--controllers", "fixed-time"])
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("|")[1].strip() for line in lines[2:]] == [f"fixed-time, {row}" for row in ("published", "found", "shipped")]
+    rows = [line.split("|")[1].strip() for line in lines[2:]]
+    assert rows == ["fixed-time, published", "fixed-time, found", "fixed-time, shipped"]
     with pytest.raises(SystemExit) as stopped:
         main(["calibrate", "--controllers", "pd"])
     assert stopped.value.code == 2
