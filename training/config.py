@@ -1,4 +1,4 @@
-"""What a training run is: one frozen dataclass, its presets, and how it is read from JSON data and from texts."""
+"""Configuration of a training run: one frozen dataclass, its presets, and conversion from JSON data and texts."""
 
 import math
 from collections.abc import Mapping
@@ -110,7 +110,7 @@ class TrainConfig:
     learner: Literal["lenient", "hysteretic", "plain"] = "lenient"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
     hash: Literal["autoencoder", "plain"] = "autoencoder"
-    """What is hashed: the codes of an auto-encoder (autoencoder) or the states as they are (plain)."""
+    """Input of the hash: the codes of an auto-encoder (autoencoder) or the states as they are (plain)."""
     bits: Annotated[int, AT_LEAST_ONE, _BITS] = 16
     """Bits of a hash code."""
     cool_by: Annotated[float, POSITIVE] = 0.35
@@ -127,7 +127,7 @@ class TrainConfig:
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by more than this."""
     shaping: Shaping = SHAPING
-    """The reward that is learned from."""
+    """Reward shaping."""
     ppo: PPO = DEFAULT_PPO
     """Settings of MAPPO alone."""
 

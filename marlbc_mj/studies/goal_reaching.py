@@ -79,7 +79,7 @@ class GoalShares(NamedTuple):
 
 
 def draw_goals(rng: np.random.Generator) -> GoalDraw:
-    """Rectangles anywhere in the square, then starts and goals where there is room."""
+    """Random rectangles in the square, then starts and goals in the remaining room."""
     middles, angles = rng.uniform(0.0, SIDE, (BOXES, 2)), rng.uniform(0.0, 2.0 * np.pi, BOXES)
     halves = 0.5 * rng.uniform(*SIDES, (BOXES, 2))
     boxes = tuple(Box(*each) for each in zip(middles, halves, angles.tolist(), strict=True))

@@ -1,4 +1,5 @@
-"""How safe and how good supervisors are where nobody tuned them: families of missions under both compositions, shield on and off.
+"""Safety and performance of supervisors on missions that they were not tuned for: families of missions under both compositions,
+shield on and off.
 
 Of every layout few numbers are kept, see :mod:`marlbc_mj.results.layouts`.
 """
@@ -23,6 +24,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
@@ -49,7 +51,7 @@ VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
 OWN = "own"
-"""In the place of a composition: the supervisor's own velocities."""
+"""Stands for a composition where a supervisor gives its own velocities."""
 FIRST_SEED = 70_000
 
 
@@ -125,7 +127,7 @@ class SafetyStudy:
     def run(self, job: SafetyJob, watch: Watch) -> Marks:
         scenario, cell = ground(job.cell.mission), job.cell
         composition = None if cell.composition == OWN else cell.composition
-        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", cell.supervisor))
+        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", display_name(cell.supervisor)))
 
         def fly(seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
             return evaluate_batch(
@@ -149,7 +151,7 @@ class SafetyStudy:
             write_json(out / "config.json", {**provenance(), "study": self})
             write_cells(rows, out / "safety.csv")
             (out / "safety.md").write_text(text, encoding="utf-8")
-        return Report(text)
+        return Report(text, rows)
 
 
 def ground(name: str) -> Scenario:

@@ -1,4 +1,4 @@
-"""What shield and set-based composition cost in time: ratios of a mission step at 4, 16 and 64 agents, in turns in one process.
+"""Time cost of shield and set-based composition: ratios of a mission step at 4, 16 and 64 agents, in turns in one process.
 
 ``python -m marlbc_mj.studies.shield_cost [ROUNDS]``. Every agent flies OA>AA>FM in a grid formation among as many discs. *Far*
 has no obstacle and a formation so wide that nothing is ever within reach: what the shield's early exit costs.

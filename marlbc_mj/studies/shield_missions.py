@@ -1,4 +1,4 @@
-"""Does a shield ever fail in a mission? Many missions of every family and size, under supervisors that mean harm.
+"""Does a shield ever fail in a mission? Many missions of every family and size, under hostile supervisors.
 
 ``python -m marlbc_mj.studies.shield_missions [--missions N] [--seconds S] [--agents 2,4,8] [--families field,forest] [--seed K]``
 draws layouts that no training seed draws. In every other mission all agents are sent against an obstacle or another agent at
@@ -32,7 +32,7 @@ CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
 
 @dataclass
 class ShieldedMission:
-    """What happened in the missions of one family and size."""
+    """Outcomes of the missions of one family and size."""
 
     missions: int = 0
     violations: int = 0  # missions
@@ -111,7 +111,7 @@ def mission_of(family: str, agents: int, seconds: float) -> Scenario:
 
 def report_missions(arguments: Sequence[str] | None = None) -> None:
     """Print a row per family and size, and what all together say."""
-    parser = argparse.ArgumentParser(description="Missions with a shield, under supervisors that mean harm.")
+    parser = argparse.ArgumentParser(description="Missions with a shield, under hostile supervisors.")
     parser.add_argument("--missions", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=1e9)
     parser.add_argument("--agents", default="2,4,8,16,32,64")

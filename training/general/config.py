@@ -1,4 +1,4 @@
-"""What a training run of the general policy is: one frozen dataclass, and what learner and exploration take of it."""
+"""Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -167,7 +167,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
-    """What learner and exploration take of a configuration, under the names that they know."""
+    """The parts of a configuration that learner and exploration use, under their names."""
     return make_config(
         "fast",
         **{"method": "marlms" if config.learner == "lenient" else {"hysteretic": "hysteretic", "plain": "iql"}[config.learner]},

@@ -30,7 +30,7 @@ from marlbc_mj.util.provenance import provenance
 
 CURVE = "eval.csv"
 GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
-"""What a run calls after every decision, with its last evaluation."""
+"""Callback of a run after every decision, with its last evaluation."""
 
 
 def train_general(

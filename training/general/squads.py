@@ -1,4 +1,4 @@
-"""Squads: worlds of one family and team that learn together with others, each with what its agents have heard of each other."""
+"""Squads: worlds of one family and team that learn together with others, each with the messages that its agents have heard."""
 
 from typing import Any, NamedTuple
 
@@ -18,7 +18,7 @@ from marlbc_mj.util.seeding import stream
 
 
 class SquadOutcome(NamedTuple):
-    """What a decision of W teams led to."""
+    """Outcome of one decision of W teams."""
 
     reward: np.ndarray  # (W, N) float32
     final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
