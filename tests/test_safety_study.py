@@ -36,7 +36,7 @@ def test_every_layout_of_every_cell_is_in_one_job() -> None:
     assert len(set(jobs)) == len(jobs) and {job.cell for job in jobs} == set(cells) and len(set(cells)) == len(cells)
     for cell in cells:
         seeds = [seed for job in jobs if job.cell == cell for seed in job.seeds]
-        assert seeds == list(range(70_000, 70_000 + (20 if cell.supervisor in SEARCHES else 250)))
+        assert seeds == list(range(80_000, 80_000 + (20 if cell.supervisor in SEARCHES else 250)))
         assert (cell.composition == OWN) == (cell.supervisor in VELOCITY_GIVERS)
     assert {cell.composition for cell in cells} == {*COMPOSITIONS, OWN}
 

@@ -275,7 +275,7 @@ class SafetyCommand:
     missions: Positional[tuple[str, ...]] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, see `marlbc list`, or draws around the case study."""
     supervisors: tuple[str, ...] | None = None
-    """Supervisors to run; by default every one that needs neither learning nor a known map, and scripted."""
+    """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
     compositions: tuple[str, ...] = ("null-space", "set-based")
     """How orders become references."""
     shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
@@ -284,7 +284,7 @@ class SafetyCommand:
     """Layouts of every supervisor on every mission."""
     searched: int = 100
     """Layouts of mpcms and rollout, which take seconds each."""
-    seed: int = 70_000
+    seed: int = 80_000
     """First seed of the layouts."""
     controller: str = "sorlc"
     """Controller that all run with."""

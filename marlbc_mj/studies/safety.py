@@ -42,15 +42,17 @@ ORDER_GIVERS = (
     "lookahead-distributed",
     "mpcms",
     "rollout",
+    "marlms",
+    "marlms-general",
 )
-"""Supervisors whose orders are composed, under either composition."""
+"""Supervisors whose orders are composed, under either composition; the last one refuses all but the set-based one."""
 VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 """Supervisors that give velocities, so that the composition does not matter."""
 SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
 OWN = "own"
 """In the place of a composition: the supervisor's own velocities."""
-FIRST_SEED = 70_000
+FIRST_SEED = 80_000
 
 
 class SafetyJob(NamedTuple):
