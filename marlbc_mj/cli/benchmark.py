@@ -322,7 +322,7 @@ class SafetyCommand:
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, or draws around the case study."""
     supervisors: SomeSupervisors = None
-    """Supervisors to run; by default every one that needs neither learning nor a known map, and scripted."""
+    """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
     compositions: Compositions = ("null-space", "set-based")
     """How orders become references."""
     shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
@@ -331,7 +331,7 @@ class SafetyCommand:
     """Layouts of every supervisor on every mission."""
     searched: int = 100
     """Layouts of mpcms and rollout, which take seconds each."""
-    seed: int = 70_000
+    seed: int = 80_000
     """First seed of the layouts."""
     controller: ControllerName = "sorlc"
     """Controller that all run with."""

@@ -14,8 +14,8 @@ from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.run import (
     CHECKPOINT,
     COUNTED,
+    MEMORY_SETTINGS,
     RESUME,
-    SIZES,
     Interrupted,
     TrainingScores,
     begin_folder,
@@ -48,7 +48,7 @@ def train_general(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite), enough_memory(SIZES):
+    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
         run = GeneralRun(config, out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
@@ -66,7 +66,7 @@ def resume_general(out: Path, *, progress: GeneralProgress | None = None) -> Int
         SimulationError: a world diverged.
     """
     path = saved_run(out)
-    with alone_in(out, overwrite=True), enough_memory(SIZES):
+    with alone_in(out, overwrite=True), enough_memory(MEMORY_SETTINGS):
         return _restored(path).go(progress)
 
 
