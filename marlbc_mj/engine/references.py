@@ -219,7 +219,7 @@ def entry(function: Law, *arguments: Any) -> Any:
     taken = tuple(own if isinstance(kind, RecordType) else kind for own, kind in zip(given, kinds, strict=True))
     function.compile(taken)  # type: ignore[attr-defined]
     found = function.overloads[taken]  # type: ignore[attr-defined]
-    if found.signature.return_type != types.int64:
+    if types.unliteral(found.signature.return_type) != types.int64:
         raise TypeError(f"{function} returns {found.signature.return_type}; called by address, it must return a whole number")
     return Entry(int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name)), tuple(kinds))
 
