@@ -186,10 +186,11 @@ class Killer:
         until = time.monotonic() + ORPHANS_END
         while (alive := list(self.processes())) and time.monotonic() < until:
             time.sleep(0.2)
+        names = [_command_line(process) for process in alive]
         for process in alive:
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
-        return [f"{len(alive)} processes stay"] * bool(alive) + torn(_output(name, out))
+        return [f"{len(alive)} processes stay: {names}"] * bool(alive) + torn(_output(name, out))
 
     def processes(self) -> Iterator[int]:
         """Those that descend from a command of ours."""
@@ -247,10 +248,15 @@ def _descendants(parent: int) -> list[int]:
 
 
 def _is_worker(process: int) -> bool:
+    line = _command_line(process)
+    return "spawn_main" in line or line.startswith(RAY_PARTS) or "/raylet" in line
+
+
+def _command_line(process: int) -> str:
+    """What a process was started as; empty if it has gone."""
     with suppress(OSError):
-        line = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-        return "spawn_main" in line or line.startswith(RAY_PARTS) or "/raylet" in line
-    return False
+        return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:200]
+    return ""
 
 
 def _output(name: str, out: Path) -> Path:
