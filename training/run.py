@@ -34,7 +34,7 @@ TABLES = ("eval.csv", "progress.csv")
 COUNTED = ("wall_s", "mission_steps")
 """First columns of both tables."""
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
-SIZES = "these settings (worlds, hidden, copies, capacity, batch)"
+SIZED_BY = "these settings (worlds, hidden, copies, capacity, batch)"
 """What a run's memory depends on, for messages."""
 TrainingScores = dict[str, float]
 """A line of eval.csv or progress.csv."""
@@ -95,7 +95,7 @@ def train(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite), enough_memory(SIZES):
+    with alone_in(out, overwrite=overwrite), enough_memory(SIZED_BY):
         run = TrainingRun(make_trainer(config), out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
@@ -133,7 +133,7 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
     path = out / RESUME
     if not path.is_file():
         raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
-    with alone_in(out, overwrite=True), enough_memory(SIZES):
+    with alone_in(out, overwrite=True), enough_memory(SIZED_BY):
         return _restored(path).go(progress)
 
 

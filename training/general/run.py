@@ -9,7 +9,7 @@ from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.run import CHECKPOINT, SIZES, Interrupted, TrainingScores, begin_folder, stopper, write_table
+from marlbc_mj.training.run import CHECKPOINT, SIZED_BY, Interrupted, TrainingScores, begin_folder, stopper, write_table
 from marlbc_mj.util.errors import enough_memory
 from marlbc_mj.util.files import alone_in
 from marlbc_mj.util.provenance import provenance
@@ -34,7 +34,7 @@ def train_general(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite), enough_memory(SIZES):
+    with alone_in(out, overwrite=overwrite), enough_memory(SIZED_BY):
         run = GeneralRun(config, out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
