@@ -7,7 +7,6 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import cloudpickle
 import gymnasium
@@ -299,19 +298,6 @@ def test_joblib_plays_copies_in_its_workers():
     env.reset(seed=0)
     one, two = joblib.Parallel(n_jobs=2)(joblib.delayed(played)(env, 5) for _ in range(2))
     assert (one == two).all() and (one == played(env, 5)).all()
-
-
-@pytest.mark.slow
-def test_ray_plays_a_copy_in_its_worker():
-    ray: Any = pytest.importorskip("ray")
-    env = PaperFormation(duration=2.0)
-    env.reset(seed=0)
-    ray.init(address="local", num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
-    try:
-        there = ray.get(ray.remote(lambda copied, steps: [copied.step(JOINT)[0] for _ in range(steps)]).remote(env, 5))
-    finally:
-        ray.shutdown()
-    assert (np.array(there) == played(env, 5)).all()
 
 
 @pytest.mark.filterwarnings("ignore")  # of these libraries
