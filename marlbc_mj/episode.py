@@ -11,8 +11,8 @@ from marlbc_mj.core.behaviors import clearances, clearances_among
 from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.core.motion import NUMBERS, moved
 from marlbc_mj.core.shield import ShieldCounts
-from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.records import Record
 from marlbc_mj.engine.world import Step, World
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors import OneTeamSupervisor, Supervisor, ask_supervisor, batched, carry_out, start_supervisor

@@ -4,6 +4,7 @@ The arena is made from the very MJCF that the engine compiles, and composer's ho
 the compiled loop runs, so a composer episode equals a :class:`~marlbc_mj.engine.world.World` episode.
 """
 
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import dm_env
@@ -13,9 +14,8 @@ from dm_control.composer.observation import observable
 from dm_env import specs
 
 from marlbc_mj.controllers import SORLC, Controller
-from marlbc_mj.core.laws import Law
 from marlbc_mj.core.shield import Shield
-from marlbc_mj.engine import loop, team
+from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -61,10 +61,9 @@ class FormationTask(composer.Task):
         self._arena = FormationArena(self.plan.xml)
         self._record = team.make_record(self.plan, worlds=1, recording=False)
         self._orders_alone = np.zeros((1, 0, 2))  # the orders make v_r
-        self._plant = self.plan.plant
-        self._native: loop.Native | None = None  # the physics of the present episode
-        self._apply: Law = loop.apply_compiled if self.plan.native else loop.apply
-        self._settle: Law = loop.settle_compiled if self.plan.native else loop.settle
+        self._arguments: tuple[Any, ...] = ()  # what the loop takes in the present episode
+        parts = (loop.start_compiled, loop.apply_compiled, loop.settle_compiled)
+        self._start, self._apply, self._settle = parts if self.plan.native else (loop.start, loop.apply, loop.settle)
         self._substep = 0
         self.set_timesteps(control_timestep=scenario.mission_step, physics_timestep=scenario.substep)
         self._observables = self._make_observables()
@@ -99,9 +98,10 @@ class FormationTask(composer.Task):
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Draw the episode: from the seed that makes world 0 of ``World.reset(seed)``, for a seed taken from ``random_state``."""
         qpos_index, qvel_index, ctrl_index = find_indices(physics.model.ptr, self.scenario)
-        self._plant = self.plan.plant._replace(qpos_index=qpos_index, qvel_index=qvel_index, ctrl_index=ctrl_index)
+        plant = self.plan.plant._replace(qpos_index=qpos_index, qvel_index=qvel_index, ctrl_index=ctrl_index)
         side = self.plan.compiled_side if self.plan.native else self.plan.python_side
-        self._native = side([physics.data.ptr])
+        plan = replace(self.plan, plant=plant)
+        self._arguments = drivers.hand_over(plan, side([physics.data.ptr]), self.state, self._record, plan.native)
         seed = int(random_state.randint(2**31))
         starts = team.reset(self.plan, self.state, 0, stream(seed, 0))
         team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
@@ -113,24 +113,26 @@ class FormationTask(composer.Task):
             ConfigurationError: another shape, no whole numbers, or an index that is no order.
         """
         orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
-        loop.begin(0, orders, self._orders_alone, self.plan.mission, self.plan.behaviors, self.state)
-        loop.shield_references(0, self.plan.mission, self.plan.behaviors, self._plant, self.state)
+        self._start(0, orders, self._orders_alone, *self._arguments[:-1])
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
-        failed = self._apply(0, self._substep, self.plan.mission, self._native, self._plant, self.state)
+        mission, _, native, plant, state, _ = self._arguments
+        failed = self._apply(0, self._substep, mission, native, plant, state)
         if failed:
             raise team.diverged(self.plan, self.state, 0, failed, int(self.state.steps[0]))
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Measure, and advance the reference position."""
-        self._settle(0, self._substep, self.plan.mission, self._native, self._plant, self.state, self._record)
+        mission, _, native, plant, state, record = self._arguments
+        self._settle(0, self._substep, mission, native, plant, state, record)
         self._substep += 1
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Clearances, formation identifier and reward."""
-        loop.finish(0, self.plan.mission, self.state)
+        mission, _, _, _, state, _ = self._arguments
+        loop.finish(0, mission, state)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         """r1 + r2 of (13)."""

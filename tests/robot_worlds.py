@@ -7,7 +7,7 @@ import numpy as np
 
 from marlbc_mj.core import laws
 from marlbc_mj.core.disturbances import LinearDrag
-from marlbc_mj.engine.loop import Record
+from marlbc_mj.engine.records import Record
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import make_robot
 from marlbc_mj.studies.robot_check import step_scenario

@@ -172,6 +172,14 @@ def inlined(function: Law) -> Law:
     return cast(Law, register_jitable(inline="always")(function))
 
 
+def on_both_paths(function: Law) -> Law:
+    """A part of the loop that runs as Python when Python calls it, and is compiled when compiled code does.
+
+    So it may be handed objects (laws, MuJoCo's step) or their addresses. Unlike :func:`inlined` it is typed and compiled once.
+    """
+    return cast(Law, register_jitable(error_model="numpy", _nrt=False)(function))
+
+
 @inlined
 def clip(value, limit):
     """Saturation (2): ``value`` within +-limit. NaN passes through, so that the run stops instead of going on at the limit."""

@@ -1,6 +1,6 @@
 """Between planar forces and MuJoCo's controls, and back: directly, or by the robot's own laws."""
 
-from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.engine.native import as_drive, as_reading
 
 DIVERGED = 1e9
@@ -25,7 +25,7 @@ def out_of_range(spans, ctrl):
     return 0
 
 
-@inlined
+@on_both_paths
 def actuate(drive, plant, state, qpos, qvel, force, h, ctrl):
     """Turn planar forces (N, 2) into ctrl: as they are for direct robots, by the robot's ``drive`` law for others.
 
@@ -43,7 +43,7 @@ def actuate(drive, plant, state, qpos, qvel, force, h, ctrl):
     return failed
 
 
-@inlined
+@on_both_paths
 def read_robot(reading, plant, state, qpos, qvel, actuator_force, p, v, force):
     """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators really gave."""
     if plant.spans.shape[1] > 0:

@@ -4,7 +4,7 @@ Two compositions: in the null space (12), :func:`compose`, where errata 5 and 6 
 where avoidance is an inequality. The engine, predictions of supervisors and older frameworks all go through :func:`compose_team`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,10 +12,11 @@ from marlbc_mj.core.barriers import Barrier, bound_neighbors, bound_obstacles
 from marlbc_mj.core.behaviors import NEAREST_NEIGHBOR, NEAREST_OBSTACLE
 from marlbc_mj.core.braking import restrain
 from marlbc_mj.core.cells import fill, nearest, room
+from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.core.halfplanes import closest
-from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.nullspace import add_behavior
 from marlbc_mj.engine.native import as_behavior
+from marlbc_mj.engine.references import call
 
 WORKSPACE = 9
 """Rows of two numbers that a :class:`TeamView` is made from."""
@@ -35,7 +36,7 @@ class Behaviors(NamedTuple):
     virtual: bool  # behaviors are evaluated at p_r; else at the measured p
     speed_limit: float  # of references [m/s]
     acceleration_limit: float  # of references [m/s^2]
-    set_based: bool  # composition: avoidance as inequalities; else (12), all behaviors as equalities
+    compose: Any  # entry of the composition: null_space_team or set_based_team
     keeps: np.ndarray  # (M,) distance that an inequality task keeps [m]; 0 for an equality task
     rate: float  # from here on: how inequality tasks bound references, as in Barrier. Flat, for loops over threads
     margin: float
@@ -83,7 +84,7 @@ def path_at(t, path, out):
         out[1, axis] = path[1, axis]
 
 
-@inlined
+@on_both_paths
 def make_view(t, behaviors, at, obstacles, grid, workspace):
     """The :class:`TeamView` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids, where there is room, are filled."""
     path = workspace[0:2]
@@ -95,7 +96,7 @@ def make_view(t, behaviors, at, obstacles, grid, workspace):
     return TeamView(at, obstacles, path, grid, workspace[2], workspace[3:5], workspace[5:7], workspace[7:9])
 
 
-@inlined
+@on_both_paths
 def desired_velocity(j, i, behaviors, view):
     """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the view; returns the Jacobian's rows.
 
@@ -118,7 +119,7 @@ def desired_velocity(j, i, behaviors, view):
     return law(behaviors.params[j, i], view.at[i], view.path, obstacles, team, own, view.velocity, view.jacobian)
 
 
-@inlined
+@on_both_paths
 def compose(order, i, behaviors, view, v_r):
     """v_r = v^1 + sum_j N^{1..j-1} v^j, N = I - A^+ A (12), for agent ``i``, into ``v_r`` (2,) [m/s].
 
@@ -160,6 +161,30 @@ def compose_set_based(order, i, behaviors, barrier, view, planes, v_r):
 
 
 @allocation_free
+def set_based_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
+    """:func:`compose_set_based` for every agent; arguments as of :func:`compose_team`. Returns 0."""
+    barrier = barrier_of(behaviors)
+    view = make_view(t, behaviors, at, obstacles, grid[:0], workspace)
+    planes = workspace[WORKSPACE:].reshape(((workspace.shape[0] - WORKSPACE) // PLANE_ROWS, 2 * PLANE_ROWS))
+    for i in range(orders.shape[0]):
+        before = view.pair[0]
+        before[0], before[1] = v_r[i, 0], v_r[i, 1]
+        compose_set_based(behaviors.table[orders[i]], i, behaviors, barrier, view, planes, v_r[i])
+        if barrier.braking < np.inf:
+            restrain(i, before, barrier, at, obstacles, v_r)
+    return 0
+
+
+@allocation_free
+def null_space_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
+    """:func:`compose` (12) for every agent; arguments as of :func:`compose_team`. Returns 0."""
+    view = make_view(t, behaviors, at, obstacles, grid, workspace)
+    for i in range(orders.shape[0]):
+        compose(behaviors.table[orders[i]], i, behaviors, view, v_r[i])
+    return 0
+
+
+@allocation_free
 def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
     """Reference velocities ``v_r`` (N, 2) [m/s] of a team at ``t`` [s], by the composition of its scenario.
 
@@ -173,20 +198,7 @@ def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
         workspace: (WORKSPACE, 2) scratch; a set-based composition has PLANE_ROWS more for every half-plane.
         v_r: (N, 2), written in place. A set-based composition of limited acceleration reads the velocities before in it.
     """
-    if behaviors.set_based:
-        barrier = barrier_of(behaviors)
-        view = make_view(t, behaviors, at, obstacles, grid[:0], workspace)
-        planes = workspace[WORKSPACE:].reshape(((workspace.shape[0] - WORKSPACE) // PLANE_ROWS, 2 * PLANE_ROWS))
-        for i in range(orders.shape[0]):
-            before = view.pair[0]
-            before[0], before[1] = v_r[i, 0], v_r[i, 1]
-            compose_set_based(behaviors.table[orders[i]], i, behaviors, barrier, view, planes, v_r[i])
-            if barrier.braking < np.inf:
-                restrain(i, before, barrier, at, obstacles, v_r)
-        return
-    view = make_view(t, behaviors, at, obstacles, grid, workspace)
-    for i in range(orders.shape[0]):
-        compose(behaviors.table[orders[i]], i, behaviors, view, v_r[i])
+    call(behaviors.compose, t, orders, behaviors, at, obstacles, grid, workspace, v_r)
 
 
 @allocation_free

@@ -1,50 +1,52 @@
-"""How the compiled loop is called: what a World hands over is bundled once, and worlds are stepped in series or by threads."""
+"""How the loop is called: what a World hands over is referred to once, and worlds are stepped in series or by threads."""
 
 import numba
 import numpy as np
-from numba import types
-from numba.experimental import structref
 
 from marlbc_mj.core.laws import compiled, threaded
-from marlbc_mj.engine.loop import mission_step
+from marlbc_mj.engine.loop import mission_step, shield_forces, shield_references
+from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.records import Arguments, Native, Record, Team
+from marlbc_mj.engine.references import call, entry, refer
 
 
-@structref.register
-class _ArgumentsType(types.StructRef):
-    """numba's type of :class:`Arguments`."""
+def hand_over(plan: Plan, native: Native, team: Team, record: Record, compiled_loop: bool) -> Arguments:
+    """The parts as the loop takes them: referred to, with the entries of what this team needs if the loop is compiled."""
+    mission, plant, team, record = map(refer, (plan.mission, plan.plant, team, record))
+    arguments = Arguments(mission, plan.behaviors, native, plant, team, record)
+    return _with_entries(arguments) if compiled_loop else arguments
 
 
-class Arguments(structref.StructRefProxy):
-    """What a World hands to the compiled loop at every mission step, bundled: passing it costs 1 us, its seventy parts 25 us."""
-
-
-structref.define_proxy(Arguments, _ArgumentsType, ["mission", "behaviors", "native", "plant", "team", "record"])
+def _with_entries(a: Arguments) -> Arguments:
+    native = a.native
+    if a.team.last_substep.shape[1] > 0:
+        native = native._replace(shield_forces=entry(shield_forces, 0, 0.0, 0.0, a.plant, a.team))
+    elif a.team.interventions.shape[1] > 0:
+        native = native._replace(shield_references=entry(shield_references, 0, a.mission, a.behaviors, a.plant, a.team))
+    orders, given = np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 2))
+    step = entry(mission_step, 0, orders, given, *a._replace(native=refer(native)))
+    return a._replace(native=refer(native._replace(mission_step=step)))
 
 
 @compiled
-def bundle(mission, behaviors, native, plant, team, record):
-    """The :class:`Arguments` of one World."""
-    return Arguments(mission, behaviors, native, plant, team, record)
-
-
-@compiled
-def play(b, sequence, given, mission, behaviors, native, plant, team, record):
+def play(b, sequence, given, a):
     """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
 
     Returns the sum of rewards, up to the step that failed if one did; ``team.status`` tells.
     """
     total = 0.0
     for m in range(sequence.shape[0]):
-        if mission_step(b, sequence[m], given, mission, behaviors, native, plant, team, record):
+        orders = sequence[m]
+        if call(a.native.mission_step, b, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record):
             break
-        total += team.reward[b]
+        total += a.team.reward[b]
     return total
 
 
 @threaded
-def _share_out(returns, sequence, given, mission, behaviors, native, plant, team, record):
+def _share_out(returns, sequence, given, a):
     for b in numba.prange(returns.shape[0]):
-        returns[b] = play(np.int64(b), sequence, given, mission, behaviors, native, plant, team, record)
+        returns[b] = play(np.int64(b), sequence, given, a)
 
 
 @compiled
@@ -53,7 +55,7 @@ def play_parallel(returns, sequence, given, a):
 
     Returns how many worlds failed.
     """
-    _share_out(returns, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+    _share_out(returns, sequence, given, a)
     return np.count_nonzero(a.team.status)
 
 
@@ -61,5 +63,5 @@ def play_parallel(returns, sequence, given, a):
 def play_serial(returns, sequence, given, a):
     """:func:`play` of every world into ``returns`` (B,), one after the other. Returns how many worlds failed."""
     for b in range(returns.shape[0]):
-        returns[b] = play(b, sequence, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record)
+        returns[b] = play(b, sequence, given, a)
     return np.count_nonzero(a.team.status)

@@ -3,22 +3,20 @@
 The compiled loop runs it for every world; the Python path runs the same source as plain Python, with laws and ``mj_step`` as
 objects; the dm_control task calls its parts from composer's hooks. Its order:
 
-1. :func:`begin`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
-   (``actual``), limited, and held; a shield of references may change it, :func:`shield_references`;
+1. :func:`start`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
+   (``actual``), limited, and held, :func:`begin`; a shield of references may change it, :func:`shield_references`;
 2. for every substep h, :func:`apply`: force from the current errors and weights, weights by explicit Euler, drag at the current
    (p, v), the robot's controls; MuJoCo's step; :func:`settle`: what was reached is measured, p_r += h v_r;
 3. :func:`finish`: obstacles that move are put where they are then; clearances, formation identifier and reward follow from the
    positions. So behaviors and supervisors see obstacles where they are at the start of a mission step.
 """
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
+from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.core.imperfections import sense, weaken
-from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_stopping, restrain_references, shield_team
@@ -27,108 +25,11 @@ from marlbc_mj.core.stopping import TINY, ShieldView
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
+from marlbc_mj.engine.references import call
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
 FORMATION_REWARD = 5.0  # (14), times G
 SWITCH_REWARD = -3.0  # (15), once per team (erratum 11)
-
-
-class MissionRules(NamedTuple):
-    """The mission's clocks and what it is judged by."""
-
-    mission_step: float  # between decisions [s]
-    substep: float  # h, of control and physics [s]
-    substeps: int  # per mission step
-    formations: np.ndarray  # (2, N, 2) slots around the centroid: of G = 2, then of G = 1 [m]
-    tolerance: float  # of a slot [m]
-    safe_distance: float  # d_OA [m]
-
-
-class Plant(NamedTuple):
-    """The numbers of robots, controllers and sensors that are the same for all worlds."""
-
-    qpos_index: np.ndarray  # (N, 2) where each agent's axes are in qpos
-    qvel_index: np.ndarray  # (N, 2) in qvel
-    ctrl_index: np.ndarray  # (N, 2) in ctrl; zeros for robots that are not direct
-    nq: int
-    nv: int
-    nu: int
-    spans: np.ndarray  # (3, N, 2) first and last + 1 of each robot in qpos, qvel, ctrl; (3, 0, 2) for a direct robot
-    robot_params: np.ndarray  # (N, P) of drive and reading
-    controller_params: np.ndarray  # (N, P)
-    unit_force: float  # in which controllers count [N]
-    position_noise: float  # of sensors, see Senses [m]
-    velocity_noise: float  # [m/s]
-    loss: float  # share of the force that is lost
-    loss_agent: float  # whose; negative: everybody's
-    loss_start: float  # from then on [s]
-    shield: np.ndarray  # (1,) records of ShieldNumbers: what a shield assumes and keeps, where the team has one
-
-
-class Native(NamedTuple):
-    """What is reached by address: addresses for compiled code, the objects themselves for the Python path."""
-
-    step: Any  # mj_step
-    model: Any  # MjModel
-    controller: Any  # law of the whole team
-    disturbance: Any  # law of the whole team
-    drive: Any  # law of the whole team; 0 for a direct robot
-    reading: Any  # law of the whole team; 0 for a direct robot
-    data: Any  # (B,) MjData
-    qpos: Any  # (B,) its arrays
-    qvel: Any
-    ctrl: Any
-    applied: Any  # qfrc_applied, which takes the drag
-    actuator_force: Any
-
-
-class Team(NamedTuple):
-    """All that changes while B teams of N agents run: one row per world, changed in place by the loop."""
-
-    steps: np.ndarray  # (B,) int64, mission steps made
-    position: np.ndarray  # (B, N, 2) [m]
-    velocity: np.ndarray  # (B, N, 2) [m/s]
-    reference: np.ndarray  # (B, N, 2) p_r [m]
-    reference_velocity: np.ndarray  # (B, N, 2) v_r [m/s]
-    controller: np.ndarray  # (B, N, S) the controllers' own state
-    command: np.ndarray  # (B, N) int64, index into scenario.orders.commands
-    since: np.ndarray  # (B, N) mission step at which each command came into force, or NEVER
-    clearance: np.ndarray  # (B, N) [m]
-    formation: np.ndarray  # (B,) int64, G
-    reward: np.ndarray  # (B,) r1 + r2 of the last mission step
-    obstacles: np.ndarray  # (B, K, 3) x, y, radius [m]; (B, K, 5) with their velocity [m/s] where they move
-    anchors: np.ndarray  # (B, K, 3) where moving obstacles come from; (B, 0, 3) where they are at rest
-    motions: np.ndarray  # (B, K, 6) how they move, or (B, 0, 6)
-    disturbance_params: np.ndarray  # (B, P)
-    robot: np.ndarray  # (B, N, S) the robots' own state
-    history: np.ndarray  # (B, D, 2, N, 2) p and v, for delayed sensors
-    sensed: np.ndarray  # (B, 2, N, 2) measured p and v; (B, 0, N, 2) where they are the true ones
-    noise_seed: np.ndarray  # (B,) int64
-    status: np.ndarray  # (B,) int64, 0, or 1 + agent + N * substep that diverged in the last mission step
-    drag: np.ndarray  # (B, N, 2) of the last substep [N]; before the first one, v_r of the last mission step
-    force: np.ndarray  # (B, N, 2) of the last substep: the law's, then what the actuators gave [N]
-    workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.plan.workspace_rows
-    grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 where none pays
-    interventions: np.ndarray  # (B, N) substeps of the episode in which the shield changed something; (B, 0) without a shield
-    force_change: np.ndarray  # (B, N) integral of what it changed [N s]
-    breaches: np.ndarray  # (B, N, A) substeps in which its assumptions did not hold, see ShieldCounts
-    last_substep: np.ndarray  # (B, N, 2, 2) v and u of the substep before [m/s], [N]
-    stopping: np.ndarray  # (B, N) scratch: stopping distances [m]
-    stamps: np.ndarray  # (B, N, N, 2) live stamps, see marlbc_mj.core.stamps; (B, 0, 0, 2) where all agents know all
-    planes: np.ndarray  # (B, N, N, 2, 3) their half-planes
-    memory: np.ndarray  # (B, R, N, 3) the past of a shield: p, stopping distance [m]
-    said: np.ndarray  # (B, R, N, N) stamps that agents named then
-    tracks: np.ndarray  # (B, K, 5) scratch of a shield: obstacles that move, where they are now; (B, 0, 5) where all are at rest
-
-
-class Record(NamedTuple):
-    """Every substep of one mission step: where the team was, and the planar force that its actuators gave."""
-
-    position: np.ndarray  # (B, substeps, N, 2) [m]
-    velocity: np.ndarray  # (B, substeps, N, 2) [m/s]
-    reference: np.ndarray  # (B, substeps, N, 2) p_r [m]
-    reference_velocity: np.ndarray  # (B, substeps, N, 2) v_r [m/s]
-    force: np.ndarray  # (B, substeps, N, 2) actuator_force of a direct robot, or as its reading has it [N]
 
 
 @allocation_free
@@ -211,7 +112,7 @@ def begin(b, orders, given, mission, behaviors, team):
     limit(behaviors, mission.mission_step, previous, v_r)
 
 
-@inlined
+@on_both_paths
 def set_forces(b, t, h, native, plant, team):
     """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
 
@@ -242,10 +143,8 @@ def set_forces(b, t, h, native, plant, team):
 
 @allocation_free
 def shield_references(b, mission, behaviors, plant, team):
-    """After :func:`begin`: change v_r of world ``b``, as little as braking in time needs, if its shield is one of references."""
+    """After :func:`begin`: change v_r of world ``b`` as little as braking in time needs. Returns 0."""
     numbers, v_r = plant.shield[0], team.reference_velocity[b]
-    if team.interventions.shape[1] == 0 or not numbers.tube > 0.0:
-        return
     wish, at, duration = team.force[b], team.reference[b], mission.mission_step
     for i in range(v_r.shape[0]):
         for axis in range(2):
@@ -264,6 +163,7 @@ def shield_references(b, mission, behaviors, plant, team):
             if x * x + y * y < kept * kept:
                 team.breaches[b, i, STATE_BROKEN] += mission.substeps
                 break
+    return 0
 
 
 @allocation_free
@@ -275,33 +175,34 @@ def exchange_messages(b, count, view, numbers, team):
     exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, said))
 
 
-@inlined
+@allocation_free
 def shield_forces(b, t, h, plant, team):
-    """Replace the forces of world ``b`` by the nearest that keep the team able to stop, if its shield is one of forces.
-
-    Where it is one of references, whether agents are within the tube around theirs is watched.
-    """
-    if team.last_substep.shape[1] > 0:
-        known = team.sensed.shape[1] > 0
-        p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
-        obstacles = team.obstacles[b]
-        if team.tracks.shape[1] > 0:
-            obstacles = team.tracks[b]
-            move(t, team.anchors[b], team.motions[b], obstacles)
-        view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b])
-        if team.stamps.shape[1] > 0:
-            exchange_messages(b, round(t / h), view, plant.shield[0], team)
-        counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
-        shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
-    elif team.interventions.shape[1] > 0:
-        tube = plant.shield[0].tube
-        for i in range(team.position.shape[1]):
-            x, y = team.position[b, i, 0] - team.reference[b, i, 0], team.position[b, i, 1] - team.reference[b, i, 1]
-            if x * x + y * y > tube * tube:
-                team.breaches[b, i, TUBE_BROKEN] += 1.0
+    """Replace the forces of world ``b`` by the nearest that keep the team able to stop. Returns 0."""
+    known = team.sensed.shape[1] > 0
+    p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
+    obstacles = team.obstacles[b]
+    if team.tracks.shape[1] > 0:
+        obstacles = team.tracks[b]
+        move(t, team.anchors[b], team.motions[b], obstacles)
+    view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b])
+    if team.stamps.shape[1] > 0:
+        exchange_messages(b, round(t / h), view, plant.shield[0], team)
+    counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])
+    shield_team(plant.shield[0], view, team.last_substep[b], team.force[b], counts)
+    return 0
 
 
-@inlined
+@on_both_paths
+def watch_tube(b, plant, team):
+    """Count the agents of world ``b`` that are farther from their references than a shield of references assumes."""
+    tube = plant.shield[0].tube
+    for i in range(team.position.shape[1]):
+        x, y = team.position[b, i, 0] - team.reference[b, i, 0], team.position[b, i, 1] - team.reference[b, i, 1]
+        if x * x + y * y > tube * tube:
+            team.breaches[b, i, TUBE_BROKEN] += 1.0
+
+
+@on_both_paths
 def apply(b, k, mission, native, plant, team):
     """Substep ``k`` of world ``b`` before MuJoCo's step: force law, shield, drag and robot of every agent, into ctrl and
     qfrc_applied.
@@ -313,7 +214,10 @@ def apply(b, k, mission, native, plant, team):
     failed = set_forces(b, t, h, native, plant, team)
     if not failed:
         force = team.force[b]
-        shield_forces(b, t, h, plant, team)
+        if team.last_substep.shape[1] > 0:
+            call(native.shield_forces, b, t, h, plant, team)
+        elif team.interventions.shape[1] > 0:
+            watch_tube(b, plant, team)
         if plant.loss > 0.0:
             weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
@@ -327,7 +231,7 @@ def apply(b, k, mission, native, plant, team):
     return 0
 
 
-@inlined
+@on_both_paths
 def settle(b, k, mission, native, plant, team, record):
     """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read_robot what was reached, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
@@ -370,11 +274,18 @@ def finish(b, mission, team):
     team.reward[b] += judge(b, mission, team)
 
 
+@on_both_paths
+def start(b, orders, given, mission, behaviors, native, plant, team):
+    """:func:`begin`, and what a shield of references, if the team has one, makes of it."""
+    begin(b, orders, given, mission, behaviors, team)
+    if team.interventions.shape[1] > 0 and plant.shield[0].tube > 0.0:
+        call(native.shield_references, b, mission, behaviors, plant, team)
+
+
 @allocation_free
 def mission_step(b, orders, given, mission, behaviors, native, plant, team, record):
     """One mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
-    begin(b, orders, given, mission, behaviors, team)
-    shield_references(b, mission, behaviors, plant, team)
+    start(b, orders, given, mission, behaviors, native, plant, team)
     team.status[b] = 0
     for k in range(mission.substeps):
         failed = apply(b, k, mission, native, plant, team)
@@ -387,6 +298,7 @@ def mission_step(b, orders, given, mission, behaviors, native, plant, team, reco
     return 1 if team.status[b] else 0
 
 
+start_compiled = allocation_free(start)
 apply_compiled = allocation_free(apply)
 settle_compiled = allocation_free(settle)
 """The parts that need MuJoCo between them, compiled for callers that step it themselves."""

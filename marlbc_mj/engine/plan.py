@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numba
@@ -16,10 +16,12 @@ from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.core.stopping import NO_SHIELD, ShieldNumbers, as_records
 from marlbc_mj.engine.assembly import agent_prefix, assemble, unfit
-from marlbc_mj.engine.composition import Behaviors
+from marlbc_mj.engine.composition import Behaviors, null_space_team, set_based_team
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
-from marlbc_mj.engine.loop import MissionRules, Native, Plant
+from marlbc_mj.engine.loop import shield_forces, shield_references
 from marlbc_mj.engine.native import step_address
+from marlbc_mj.engine.records import MissionRules, Native, Plant
+from marlbc_mj.engine.references import entry, refer
 from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
@@ -90,18 +92,18 @@ class Plan:
         team_laws = (0 if law is None else laws.address(law, kind) for law, kind in self._laws())
         arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
         columns = ([d._address for d in data], *arrays)
-        entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
+        entries = map(np.uint64, (0, 0, 0, step_address(), self.model._address, *team_laws))
         return Native._make((*entries, *(np.array(column, dtype=np.uint64) for column in columns)))
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
         team_laws = (None if law is None else laws.for_team(law, kind) for law, kind in self._laws())
         columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
-        return Native._make((mujoco.mj_step, self.model, *team_laws, *columns))
+        return Native._make((None, shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
 
 
 def _arrays(data: Any) -> tuple[np.ndarray, ...]:
-    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.loop.Native`."""
+    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.records.Native`."""
     return data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force
 
 
@@ -173,7 +175,8 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
     """
     addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
     set_based = scenario.composition == "set-based"
-    return Behaviors(
+    behaviors = Behaviors(
+        compose=np.uint64(0),
         laws=addresses,
         params=params,
         sees=sees_array(scenario.behaviors),
@@ -183,10 +186,12 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         virtual=scenario.reference == "virtual",
         speed_limit=float(scenario.speed_limit),
         acceleration_limit=float(scenario.acceleration_limit),
-        set_based=set_based,
         keeps=keeps_array(scenario.behaviors),
         **make_barrier(scenario)._asdict(),
     )
+    rows, team = np.zeros((1, 2)), set_based_team if set_based else null_space_team
+    compose = entry(team, 0.0, np.zeros(1, dtype=np.int64), refer(behaviors), rows, rows, np.zeros(1), rows, rows)
+    return cast(Behaviors, refer(behaviors._replace(compose=compose)))
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:

@@ -1,6 +1,6 @@
 """B teams between mission steps, apart from the physics: how their rows are made, reset, placed and observed.
 
-World and the dm_control task both keep a :class:`~marlbc_mj.engine.loop.Team`; this is what they do with it.
+World and the dm_control task both keep a :class:`~marlbc_mj.engine.records.Team`; this is what they do with it.
 """
 
 from typing import Any
@@ -13,9 +13,10 @@ from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.core.stamps import NEVER_STAMPED, REMEMBERED
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.loop import Record, Team, judge, valid_orders
+from marlbc_mj.engine.loop import judge, valid_orders
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
+from marlbc_mj.engine.records import Record, Team
 from marlbc_mj.engine.shielding import check_draw
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
@@ -122,7 +123,7 @@ def place(
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
     team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED
-    judge(b, plan.mission, team)
+    laws.plain(judge)(b, plan.mission, team)
 
 
 def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:

@@ -13,9 +13,10 @@ from marlbc_mj.core.compiling import threads_usable
 from marlbc_mj.core.shield import Shield, ShieldCounts
 from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.body import DIVERGED
-from marlbc_mj.engine.loop import Record
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.records import Arguments, Record
+from marlbc_mj.engine.references import refer
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.modules import blame
@@ -41,7 +42,7 @@ class World:
 
     Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled
     controller the whole mission step runs inside one compiled call. A plain Python one takes the Python path: slower, with the
-    same results. ``state`` is the :class:`~marlbc_mj.engine.loop.Team` of all worlds, ``data`` has one MjData per world.
+    same results. ``state`` is the :class:`~marlbc_mj.engine.records.Team` of all worlds, ``data`` has one MjData per world.
 
     Args:
         scenario: the problem instance.
@@ -86,6 +87,7 @@ class World:
         self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
         self._returns = np.zeros(worlds)
         self._arguments = self._make_arguments()
+        self._handed = refer(self._arguments) if self.native else None
         self.reset()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -99,12 +101,11 @@ class World:
         World.__init__(self, **state["settings"])
         self.restore(state["snapshot"])
 
-    def _make_arguments(self) -> Any:
-        """What the loop takes besides orders and velocities: bundled for the compiled one, a tuple for the Python path."""
+    def _make_arguments(self) -> Arguments:
+        """What the loop takes besides orders and velocities."""
         plan = self.plan
         self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
-        arguments = (plan.mission, plan.behaviors, self.side, plan.plant, self.state, self._record)
-        return drivers.bundle(*arguments) if self.native else arguments
+        return drivers.hand_over(plan, self.side, self.state, self._record, self.native)
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
         """Start episodes anew: all of them, or those where ``mask`` (B,) is true.
@@ -241,7 +242,7 @@ class World:
         """
         run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
         try:
-            return int(run(returns, sequence, given, self._arguments))
+            return int(run(returns, sequence, given, self._handed))
         except Exception as error:
             raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 

@@ -15,7 +15,7 @@ import numpy as np
 from marlbc_mj.controllers import Controller, make_controller
 from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.engine import team
-from marlbc_mj.engine.loop import Record, Team
+from marlbc_mj.engine.records import Record, Team
 from marlbc_mj.engine.world import Step, World
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.results.metrics import measure

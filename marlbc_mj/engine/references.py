@@ -1,0 +1,174 @@
+"""What compiled code is handed by address: NamedTuples of arrays, and its own parts.
+
+The loop takes some ninety arrays in six NamedTuples. numba passes a NamedTuple by value: every function that is handed one is
+compiled with hundreds of arguments, and every ``team.position`` reads all of it. A :class:`Reference` is one pointer, and reads
+the field alone. The source is the same for both: attributes have the same names.
+
+What a function calls is compiled into it once more. So the loop's large parts are called by address, :func:`call`: each is
+compiled once, and only by those who need it. :func:`entry` compiles one and tells where it is.
+"""
+
+from typing import Any
+
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.core.datamodel import models
+from numba.core.extending import _Intrinsic
+from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate
+from numba.experimental import structref
+from numba.extending import NativeValue, infer_getattr, intrinsic, register_model, unbox
+
+from marlbc_mj.core.compiling import Law, compiled, is_compiled
+
+
+@structref.register
+class _HolderType(types.StructRef):
+    """numba's type of :class:`_Holder`."""
+
+
+class _Holder(structref.StructRefProxy):
+    """A NamedTuple in memory that compiled code owns."""
+
+
+structref.define_proxy(_Holder, _HolderType, ["values"])
+
+
+class ReferenceType(types.Type):
+    """numba's type of :class:`Reference`: ``target`` is that of the NamedTuple."""
+
+    def __init__(self, target: types.BaseTuple) -> None:
+        self.target = target
+        super().__init__(name=f"Reference({target})")
+
+
+@register_model(ReferenceType)
+class _ReferenceModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: ReferenceType) -> None:
+        super().__init__(manager, kind, manager.lookup(kind.target).get_value_type().as_pointer())
+
+
+@infer_getattr
+class _Fields(AttributeTemplate):
+    key = ReferenceType
+
+    def generic_resolve(self, kind: ReferenceType, name: str) -> Any:
+        return kind.target.types[kind.target.fields.index(name)] if name in kind.target.fields else None
+
+
+@lower_getattr_generic(ReferenceType)
+def _read_field(context, builder, kind, value, name):
+    index = kind.target.fields.index(name)
+    field = kind.target.types[index]
+    found = builder.load(cgutils.gep_inbounds(builder, value, 0, index))
+    return impl_ret_borrowed(context, builder, field, found)
+
+
+@intrinsic
+def _address(typing_context, holder):
+    def codegen(context, builder, signature, args):
+        utils = structref._Utils(context, builder, signature.args[0])
+        return builder.ptrtoint(utils.get_data_pointer(args[0]), ir.IntType(64))
+
+    return types.uintp(holder), codegen
+
+
+@compiled
+def _hold(values):
+    """``values`` in memory, and where they are."""
+    holder = _Holder(values)
+    return holder, _address(holder)
+
+
+class Reference:
+    """A NamedTuple of arrays and numbers as compiled code takes it: one pointer. Made by :func:`refer`.
+
+    In Python it reads as the NamedTuple does. Compiled code that is handed it uses the very arrays; numbers are as they were.
+    """
+
+    def __init__(self, values: Any) -> None:
+        self.values = values
+        self.owner, self.address = _hold(values)
+        self._numba_type_ = ReferenceType(self.owner._numba_type_.field_dict["values"])
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "values":
+            raise AttributeError(name)
+        return getattr(self.values, name)
+
+    def _replace(self, **changes: Any) -> "Reference":
+        """As of a NamedTuple: another one with some fields changed."""
+        return Reference(self.values._replace(**changes))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy refers to a copy."""
+        return refer, (self.values,)
+
+
+def refer(values: Any) -> Any:
+    """What stands for a NamedTuple in the loop: a :class:`Reference`; the NamedTuple itself where numba is off."""
+    return values if numba.config.DISABLE_JIT else Reference(values)
+
+
+@unbox(ReferenceType)
+def _unbox_reference(kind, value, c):
+    number = c.pyapi.object_getattr_string(value, "address")
+    pointer = c.pyapi.long_as_voidptr(number)
+    c.pyapi.decref(number)
+    return NativeValue(c.builder.bitcast(pointer, c.context.get_value_type(kind)), is_error=c.pyapi.c_api_error())
+
+
+def _passed(kind: Any) -> Any:
+    """The type that an argument is passed as by :func:`call`: whole numbers as int64, arrays as C-contiguous ones.
+
+    Raises:
+        TypeError: an array of another layout.
+    """
+    if isinstance(kind, types.Array):
+        if kind.layout != "C":
+            raise TypeError(f"called by address, arrays must be contiguous, got {kind}")
+        return types.Array(kind.dtype, kind.ndim, "C")
+    if isinstance(kind, types.Integer):
+        return types.int64
+    return types.float64 if isinstance(kind, types.Float) else kind
+
+
+def _call_at(typing_context, address, *arguments):
+    given = arguments[0] if isinstance(arguments[0], types.BaseTuple) else types.BaseTuple.from_types(arguments)
+    kinds = [_passed(kind) for kind in given]
+
+    def codegen(context, builder, signature, args):
+        values = cgutils.unpack_tuple(builder, args[1])
+        values = [context.cast(builder, *each) for each in zip(values, signature.args[1], kinds, strict=True)]
+        function = context.call_conv.get_function_type(types.int64, kinds)
+        pointer = builder.inttoptr(args[0], function.as_pointer())
+        status, result = context.call_conv.call_function(builder, pointer, types.int64, kinds, values)
+        with cgutils.if_unlikely(builder, status.is_error):
+            context.call_conv.return_status_propagate(builder, status)
+        return result
+
+    return types.int64(types.uintp, given), codegen
+
+
+class _Call(_Intrinsic):  # type: ignore[misc]
+    """Call a function that returns a whole number: itself in Python, by its :func:`entry` in compiled code."""
+
+    def __call__(self, function, *arguments):
+        return function(*arguments)
+
+
+call = _Call("call", _call_at)
+call._register()
+
+
+def entry(function: Law, *arguments: Any) -> Any:
+    """What :func:`call` takes for a compiled ``function`` of such arguments: its address; itself where numba is off."""
+    if not is_compiled(function):
+        return function
+    kinds = tuple(_passed(numba.typeof(argument)) for argument in arguments)
+    function.compile(kinds)  # type: ignore[attr-defined]
+    found = function.overloads[kinds]  # type: ignore[attr-defined]
+    return np.uint64(found.library.get_pointer_to_function(found.fndesc.llvm_func_name))
