@@ -111,7 +111,7 @@ for line in json.loads(sys.argv[1]):
         main(line)
     except SystemExit as stop:
         print(stop.code)
-print({"numba", "mujoco", "torch"} & set(sys.modules))
+print({"numpy", "numba", "mujoco", "torch"} & set(sys.modules))
 """
 
 
@@ -122,7 +122,7 @@ def test_a_wrong_word_is_answered_with_the_nearest_right_one(line: str, capsys: 
 
 
 def test_nothing_heavy_is_imported_for_that() -> None:
-    """Nor for the help and for lists: each is answered by a process that has imported neither MuJoCo nor any law."""
+    """Nor for the help and for lists: each is answered by a process that has imported neither NumPy nor any law."""
     lines = [*(line.split() for line in WRONG_WORDS), ["--help"], ["bench", "--help"], ["list"], ["list", "robots"]]
     done = subprocess.run([sys.executable, "-c", HEAVY, json.dumps(lines)], capture_output=True, text=True, check=True)
     *_, loaded = done.stdout.splitlines()

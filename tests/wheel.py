@@ -38,7 +38,7 @@ def install(wheel: Path, folder: Path, extras: Sequence[str]) -> None:
     began = time.monotonic()
     venv.create(folder / "env", with_pip=True)
     python, wanted = folder / "env" / "bin" / "python", f"{wheel}[{','.join(extras)}]" if extras else str(wheel)
-    call([str(python), "-m", "pip", "install", "--quiet", "--no-compile", "-c", str(ROOT / "constraints.txt"), wanted], folder)
+    call([str(python), "-m", "pip", "install", "--quiet", "-c", str(ROOT / "constraints.txt"), wanted], folder)
     held = sum(path.lstat().st_size for path in (folder / "env").rglob("*") if path.is_file() and not path.is_symlink())
     print(f"installed {wheel.name} with {' '.join(extras) or 'no extras'}: {time.monotonic() - began:.0f} s, {held / 1e6:.0f} MB")
     marlbc = str(folder / "env" / "bin" / "marlbc")

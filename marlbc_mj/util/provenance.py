@@ -3,15 +3,15 @@
 import dataclasses
 import hashlib
 import json
+import math
 import platform
 import subprocess
+import sys
 from collections.abc import Callable
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gymnasium", "mcap", "matplotlib")
 
@@ -84,11 +84,12 @@ def plain_data(value: Any, *, not_finite: Callable[[float], Any] = str) -> Any:
         return {"type": type(value).__name__, **fields}
     if isinstance(value, dict):
         return {str(key): again(entry) for key, entry in value.items()}
-    if isinstance(value, np.ndarray):
+    numpy: Any = sys.modules.get("numpy")  # not imported for this: without it there are no arrays
+    if numpy is not None and isinstance(value, numpy.ndarray):
         return again(value.tolist())
     if isinstance(value, (list, tuple)):
         return [again(entry) for entry in value]
-    if isinstance(value, float) and not np.isfinite(value):
+    if isinstance(value, float) and not math.isfinite(value):
         return not_finite(value)
     if isinstance(value, (str, int, float, bool)) or value is None:
         return value
