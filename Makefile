@@ -1,9 +1,9 @@
-# make test | kills | slurm-test | fuzz | benchmark | lint | wheel | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
+# make test | kills | slurm-test | fuzz | benchmark | lint | wheel | wheel-test | docs | gallery | clean. Each makes .venv and installs what is missing; PYTHON=... chooses the interpreter.
 
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test test-all kills slurm-test fuzz lint wheel docs gallery clean
+.PHONY: help venv benchmark test test-all kills slurm-test fuzz lint wheel wheel-test docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -28,7 +28,8 @@ help:
 	@echo 'make test-all    run the slow tests, too'
 	@echo 'make benchmark   run every supervisor and controller on the case study, into out/paper'
 	@echo 'make lint        ruff and mypy'
-	@echo 'make wheel       sdist and wheel, into dist'
+	@echo 'make wheel       sdist and wheel, checked, into dist'
+	@echo 'make wheel-test  install the wheel into new environments and run it there'
 	@echo 'make docs        the documentation, into out/docs'
 	@echo 'make gallery     draw the pictures in docs/gallery anew'
 	@echo 'make clean       remove .venv, builds and caches; results in out and runs stay'
@@ -62,10 +63,18 @@ lint: venv
 	$(BIN)/python -m mypy || status=1; \
 	exit $$status
 
+# As with docs, the tool that checks is installed here and not with the rest.
 wheel: venv
 	@rm -rf build dist
 	@$(BIN)/python -m build --no-isolation --outdir dist . >/dev/null
-	@ls dist/*
+	@$(BIN)/python -c 'import twine' 2>/dev/null || $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[release]'
+	@$(BIN)/python -m twine check --strict dist/*
+	@$(BIN)/python tests/wheel.py dist
+
+# The wheel in two new environments: as it is, and with what users may add to it.
+wheel-test: wheel
+	@$(BIN)/python tests/wheel.py dist --install out/wheel
+	@$(BIN)/python tests/wheel.py dist --install out/wheel --extras onnx parquet robots
 
 # The tool is installed here and not with the rest: only this target needs it.
 docs: venv

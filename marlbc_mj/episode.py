@@ -32,13 +32,14 @@ class Frame(NamedTuple):
     reward: float  # r1 + r2 of this mission step
     controller_state: np.ndarray  # (N, S) at the start of the mission step
     decision_ms: float  # what the supervisor took [ms]
+    after: np.ndarray  # (N, 2) position at the end of the mission step [m]
     pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
     shield: ShieldCounts | None = None  # (N,) each, since the episode began, at the end of the mission step; with a shield only
     hearing: Hearing | None = None  # (N, N) each, when orders were given; where messages are not ideal, of a supervisor with any
 
     @property
     def first(self) -> Record:
-        """The first substep, (N, 2) each: where the team was when orders were given, and what it did first."""
+        """The first substep, (N, 2) each: the state in which orders were given, and the first forces."""
         return Record(*(rows[0] for rows in self.record))
 
 
@@ -69,11 +70,15 @@ class Trajectory:
 
     def clearances(self) -> np.ndarray:
         """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
-        after = self.position[1:]
-        if len(self.motions) == 0:
-            return clearances(after, self.obstacles)
-        ends = (1 + np.arange(len(after))) * self.scenario.substep
-        return clearances_among(after, moved(ends, self.obstacles, self.motions))
+        return clearances_after(self.position[1:], self.obstacles, self.motions, self.scenario.substep)
+
+
+def clearances_after(positions: np.ndarray, obstacles: np.ndarray, motions: np.ndarray, substep: float) -> np.ndarray:
+    """(T, N) clearance [m] at ``positions`` (T, N, 2) at the ends of T substeps, from obstacles where they are then."""
+    if len(motions) == 0:
+        return clearances(positions, obstacles)
+    ends = (1 + np.arange(len(positions))) * substep
+    return clearances_among(positions, moved(ends, obstacles, motions))
 
 
 def run_episode(
@@ -123,7 +128,9 @@ def _frame(seen: Observation, step: Step, before: tuple[np.ndarray, float, np.nd
     record = Record(*(rows[0] for rows in step.record))
     shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
     links = None if heard is None else heard.team(0)
-    return Frame(seen.team(0), record, step.observation.command[0], float(step.reward[0]), *before, shield, links)
+    after, (state, decision_ms, pose) = step.observation, before
+    verdicts = after.command[0], float(step.reward[0])
+    return Frame(seen.team(0), record, *verdicts, state, decision_ms, after.position[0], pose, shield, links)
 
 
 def _trajectory(world: World, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
@@ -166,7 +173,7 @@ def _shield(frames: list[Frame]) -> ShieldCounts | None:
 
 
 def _hearing(frames: list[Frame]) -> Hearing | None:
-    """Who heard whom at each mission step; None where nobody said anything, or all heard everything."""
+    """Who heard whom at each mission step; None without communication or with ideal communication."""
     moments = [f.hearing for f in frames if f.hearing is not None]
     return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True))) if moments else None
 

@@ -93,7 +93,7 @@ TARGETS = {
     ),
     "general": Target(("train", "marlms-general", "--budget", "2000", "--overwrite", "--out", "OUT", "--set", *SMALL)),
     "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
-    "video": Target(("video", "LOG", "--width", "160", "--height", "90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
+    "video": Target(("video", "LOG", "--size", "160x90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
 }
 """By name."""
 

@@ -86,7 +86,7 @@ def test_the_number_of_draws_together_is_bounded_by_memory() -> None:
 
 @dataclass(frozen=True)
 class Troubled:
-    """FM for ever; on the one draw whose first obstacle is at ``place``, trouble after a second."""
+    """Constant FM; on the one draw whose first obstacle is at ``place``, trouble after a second."""
 
     place: float
     trouble: str

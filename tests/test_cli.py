@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
+from marlbc_mj.cli.benchmark import ScenarioOptions
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.engine.world import World
 from marlbc_mj.recording import writer
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
-from marlbc_mj.scenarios import Scenario, paper
+from marlbc_mj.robots import make_robot
+from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario, paper
 from marlbc_mj.studies.bench import matrix
 from marlbc_mj.studies.episodes import Stopwatch
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
@@ -80,7 +82,11 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
     quick = ["--supervisors", "scripted", "--controllers", "pd", "--video", "none", "--no-figures", "--no-logs"]
     copy = results.parent / "copy"
     main(["bench", "paper", "--out", str(copy), *quick, *SHORT])
-    main(["bench", "paper", "--out", str(copy), *quick, *SHORT, "--overwrite"])
+    said = capsys.readouterr()
+    assert "1/1  Schedule + Saturated PD: return " in said.err and f"{copy}/.jobs/so_far/index.html grows" in said.err
+    assert "Saturated PD" in said.out and "scripted" not in said.out
+    main(["bench", "paper", "--out", str(copy), *quick, *SHORT, "--overwrite", "--quiet"])
+    assert capsys.readouterr() == ("", "")
     assert set(json.loads((copy / "summary.json").read_text())["methods"]) == {"scripted+pd"}
     assert not [p for p in results.parent.iterdir() if p.name.startswith("copy.")]
 
@@ -239,7 +245,7 @@ def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.Captur
     assert json.loads(capsys.readouterr().out)["metadata"]["marlbc"]["supervisor"] == "scripted"
     main(["log", "export", str(log), str(out / "episode.npz")])
     assert np.load(out / "episode.npz")["position"].shape == (20, 4, 2)
-    main(["video", str(log), "--width", "320", "--height", "180", "--fps", "5"])
+    main(["video", str(log), "--size", "320x180", "--fps", "5"])
     assert log.with_suffix(".mp4").stat().st_size > 1000
     torn = out / "torn.mcap"
     torn.write_bytes(log.read_bytes()[:-100])
@@ -248,6 +254,41 @@ def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.Captur
     main(["log", "recover", str(torn), str(out / "saved.mcap")])
     main(["log", "export", str(out / "saved.mcap"), str(out / "saved.csv")])
     assert "exists" in refused(["log", "export", str(log), str(out / "saved.csv")], capsys)
+
+
+def test_json_is_one_document_and_quiet_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On standard output; what the user should know goes to standard error, unless the command is quiet."""
+    line = ["run", "paper", "--controller", "pd", *SHORT, "--seed", "3", "--out", str(tmp_path / "run")]
+    main([*line, "--json"])
+    said = capsys.readouterr()
+    assert said.err == "marlbc: paper draws nothing: seed 3 gives the same episode as any other\n"
+    recorded = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    assert {key: json.loads(said.out)["methods"]["scripted+pd"][key] for key in recorded} == recorded
+    main([*line, "--overwrite", "--quiet"])
+    assert capsys.readouterr() == ("", "")
+    log = str(tmp_path / "run" / "logs" / "scripted+pd.mcap")
+    main(["log", "info", log, "--metrics", "--json"])
+    again = json.loads(capsys.readouterr().out)
+    assert again["agents"] == recorded["agents"]
+
+
+def test_a_team_and_a_robot_of_another_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Wherever a scenario is changed; a scenario with a team of its own says so."""
+    options = ScenarioOptions(agents=6, formation="circle", robot="omni")
+    scenario, scale = options.build("field"), make_robot("omni").scale()
+    assert scenario.agents == 6 and "circle" in scenario.description
+    assert all(getattr(scenario, name) == value for name, value in scale.items())
+    assert "has a team of 4 of its own" in refused(["run", "--agents", "6", "--out", str(tmp_path / "run")], capsys)
+    (tmp_path / "mine.toml").write_text('family = "open"\nrobot = "omni"\nagents = 3\n')
+    from_file = make_scenario(str(tmp_path / "mine.toml"))
+    assert all(getattr(from_file, name) == value for name, value in scale.items() if value != float("inf"))
+
+
+def test_what_a_scenario_draws() -> None:
+    """Starts, obstacles, drag, layouts, noise or lost messages; the published mission has none of these."""
+    assert not paper().draws and make_scenario("field").draws and paper(perturbation=Perturbation(start_spread=1.0)).draws
+    for setting in ("imperfections.position_noise=0.1", "communication.loss=0.2"):
+        assert ScenarioOptions(set=(setting,)).build("paper").draws
 
 
 def test_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

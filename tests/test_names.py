@@ -8,6 +8,10 @@ from pathlib import Path
 import pytest
 from test_layers import ROOT, sources
 
+from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.supervisors import SUPERVISORS
+from marlbc_mj.util.method_names import display_key, source_of
+
 PROTOCOL = {
     "load",  # dm_control's suites have a function of this name; robots have their own
 }
@@ -52,3 +56,17 @@ def test_a_planted_twin_is_found(tmp_path: Path, line: str) -> None:
         (tmp_path / "marlbc_mj" / folder).mkdir(parents=True)
         (tmp_path / "marlbc_mj" / folder / "laws.py").write_text(text)
     assert repeated(tmp_path) == {"judge": ["marlbc_mj/core/laws.py", "marlbc_mj/engine/laws.py"]}
+
+
+@pytest.mark.parametrize("name", [*SUPERVISORS, *CONTROLLERS])
+def test_every_method_has_a_name_for_people_and_a_source(name: str) -> None:
+    """Its own one; what is of a user's file is called by file and name, what is not known by its own name."""
+    shown = source_of(name)
+    others = {source_of(other).display for other in (*SUPERVISORS, *CONTROLLERS) if other != name}
+    assert shown.citation and shown.display not in {name, *others}
+    assert display_key(f"{name}+mine.Soft") == f"{shown.display} + mine.Soft"
+
+
+def test_names_of_users_methods_are_short() -> None:
+    assert source_of("some/mine.py:Careful").display == "mine.Careful" and source_of("runs/best.safetensors").display == "best"
+    assert display_key("video of MPCMS + SORLC") == "video of MPCMS + SORLC" and display_key("jobs") == "jobs"

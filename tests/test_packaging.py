@@ -92,6 +92,7 @@ def test_wheel_holds_every_file(tmp_path: Path) -> None:
         shutil.copytree(ROOT / name, tmp_path / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
     build = "from setuptools import build_meta; build_meta.build_wheel('.')"
     subprocess.run([sys.executable, "-c", build], cwd=tmp_path, check=True, capture_output=True)
+    assert next(tmp_path.glob("*.whl")).stat().st_size < 2_000_000
     with zipfile.ZipFile(next(tmp_path.glob("*.whl"))) as wheel:
         held = {name for name in wheel.namelist() if ".dist-info/" not in name}
     walk = os.walk(tmp_path / "marlbc_mj", followlinks=True)

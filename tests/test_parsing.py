@@ -1,12 +1,22 @@
 """What the command line says of arguments that it cannot parse: tyro's hook where there is one, tyro's own words elsewhere."""
 
+import json
 import re
+import subprocess
+import sys
+from typing import Any, NamedTuple
 
+import numpy as np
 import pytest
 import tyro
 
 import marlbc_mj
 from marlbc_mj.cli import Command, main, parsing
+from marlbc_mj.cli.choices import selectable
+from marlbc_mj.cli.names import registered
+from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.cli.parsing import Refusal
+from marlbc_mj.cli.terminal import seldom
 
 
 def said_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
@@ -40,12 +50,12 @@ def test_options_and_subcommands_are_those_of_the_help(capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["robot", "check"], r"Missing from marlbc robot check: STR file; see `marlbc robot check --help`"),
+        (["robot", "check"], r"Missing from marlbc robot check: ROBOT file; see `marlbc robot check --help`"),
         (["ship"], r"Missing from marlbc ship: PATH run-folder, STR name; see `marlbc ship --help`"),
         (["run", "--seed"], r"Missing value for argument '--seed'. Expected 1 values; see `marlbc run --help`"),
-        (["study", "--form", "x"], r"Unrecognized options: --form, x; perhaps --from; see `marlbc --help`"),
-        (["bench", "paper", "extra"], r"Unrecognized options: extra; see `marlbc --help`"),
-        (["bench", "--drag-range", "1", "a"], r"Error parsing --drag-range: .*FLOAT FLOAT.*; see `marlbc --help`"),
+        (["study", "--form", "x"], r"Unrecognized options: --form, x; perhaps --from; see `marlbc study --help`"),
+        (["bench", "paper", "extra"], r"Unrecognized options: extra; see `marlbc bench --help`"),
+        (["bench", "--drag-range", "1", "a"], r"Error parsing --drag-range: .*FLOAT FLOAT.*; see `marlbc bench --help`"),
     ],
 )
 def test_what_is_wrong_is_one_line(arguments: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,7 +78,117 @@ def test_an_event_that_is_new_is_left_to_tyro() -> None:
     class Unheard:
         prog = "marlbc"
 
-    assert parsing._refusal(Unheard(), Command, []) is None
+    assert parsing._refusal(Unheard(), Command) is None
+
+
+WRONG_WORDS = {
+    "benhc": "unknown command 'benhc'; perhaps 'bench'; choose from: bench, run",
+    "robot chek": "unknown command 'chek'; perhaps 'check'; choose from: check, gate; see `marlbc robot --help`",
+    "log": "Expected one of {info, recover, export}; see `marlbc log --help`",
+    "run --contrlr pd": "Unrecognized options: --contrlr, pd; perhaps --controller; see `marlbc run --help`",
+    "run papr": "unknown scenario 'papr'; perhaps 'paper'; choose from: paper",
+    "run --supervisor oracl": "unknown supervisor 'oracl'; perhaps 'oracle'; choose from: scripted",
+    "bench --controllers sorlc pid": "unknown controller 'pid'; perhaps 'pd'; choose from: sorlc",
+    "bench --engine rai": "perhaps 'ray'",
+    "evaluate --composition setbased": "unknown composition 'setbased'; perhaps 'set-based'; choose from: null-space, set-based",
+    "evaluate --formation wegde": "unknown formation 'wegde'; perhaps 'wedge'",
+    "run --robot omnni": "unknown robot 'omnni'; perhaps 'omni'",
+    "run --set comunication.range=3": "unknown setting 'comunication.range'; perhaps 'communication.range'",
+    "run --set range": "--set takes name=value, got 'range'",
+    "train --set gama=3": "unknown setting 'gama'; perhaps 'gamma'",
+    "train marlmss": "unknown method 'marlmss'; perhaps 'marlms'",
+    "suite --track familys": "unknown track 'familys'; perhaps 'families'",
+    "list robot": "unknown kind 'robot'; perhaps 'robots'",
+    "video nothing.mcap": "cannot read nothing.mcap: No such file or directory",
+    "run nothing.toml": "cannot read nothing.toml: No such file or directory",
+    "run --supervisor nothing.py:Mine": "cannot read nothing.py: No such file or directory",
+}
+HEAVY = """
+import json, sys
+from marlbc_mj.cli import main
+for line in json.loads(sys.argv[1]):
+    try:
+        main(line)
+    except SystemExit as stop:
+        print(stop.code)
+print({"numba", "mujoco", "torch"} & set(sys.modules))
+"""
+
+
+@pytest.mark.parametrize("line", WRONG_WORDS)
+def test_a_wrong_word_is_answered_with_the_nearest_right_one(line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    said = said_of(line.split(), capsys)
+    assert said.startswith("marlbc: ") and WRONG_WORDS[line] in said and said.count("\n") == 1
+
+
+def test_nothing_heavy_is_imported_for_that() -> None:
+    """Nor for the help and for lists: each is answered by a process that has imported neither MuJoCo nor any law."""
+    lines = [*(line.split() for line in WRONG_WORDS), ["--help"], ["bench", "--help"], ["list"], ["list", "robots"]]
+    done = subprocess.run([sys.executable, "-c", HEAVY, json.dumps(lines)], capture_output=True, text=True, check=True)
+    *_, loaded = done.stdout.splitlines()
+    assert done.stdout.count("2\n") >= len(WRONG_WORDS) and loaded == "set()"
+
+
+def test_names_are_those_of_the_registries() -> None:
+    """``python -m marlbc_mj.cli.names`` writes the file anew."""
+    assert registered() == selectable()
+
+
+def test_every_choice_is_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+    """And no title or default that tells nothing."""
+    for path in (["run"], ["bench"], ["evaluate"], ["suite"], ["train"]):
+        with pytest.raises(SystemExit):
+            main([*path, "--help"])
+        text = capsys.readouterr().out
+        words = re.sub(r"[\s│]+", " ", text)
+        assert "options options" not in text and "(default: None)" not in words, path
+        kinds = {"run": ("supervisors", "controllers", "robots", "disturbances", "settings of a scenario")}.get(path[0], ())
+        assert all(name in words for kind in kinds for name in selectable()[kind])
+
+
+def test_one_kind_can_be_listed(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["list", "robots"])
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()[1:]] == list(selectable()["robots"])
+    main(["list", "robots", "--json"])
+    assert json.loads(capsys.readouterr().out) == {"robots": selectable()["robots"]}
+    main(["list", "--quiet"])
+    assert capsys.readouterr().out == ""
+
+
+def test_a_line_per_method_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
+    """By its name for people, once, when it has ended; what takes minutes tells of itself now and then, too."""
+    tell = seldom()
+    for done in range(201):
+        tell("fsams+sorlc", done, 200)
+    tell("jobs", 3, 26)
+    assert re.fullmatch(r"FSAMS \+ SORLC: 200 of 200 in \d+\.\d s\n", capsys.readouterr().err)
+    often = seldom(every=0.0, ends=False)
+    for done in (0, 100, 200):
+        often("mpcms+pd", done, 200)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines and all(line.startswith("MPCMS + Saturated PD: ") and line.endswith(" s left") for line in lines)
+
+
+def test_a_document_holds_numbers_by_name(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of dataclasses, named tuples and arrays; NumPy's numbers are numbers, and what is not finite is null."""
+
+    class Row(NamedTuple):
+        passed: Any
+        values: Any
+
+    rows = {"rows": [Row(np.bool_(True), np.array([1.5, np.inf])), Row(np.int64(3), Refusal("a", "b"))]}
+    ReportOptions(json=True).report("text", rows)
+    first, second = {"passed": True, "values": [1.5, None]}, {"passed": 3, "values": {"said": "a", "command": "b"}}
+    assert json.loads(capsys.readouterr().out) == {"rows": [first, second]}
+    ReportOptions(quiet=True).report("text", rows)
+    assert capsys.readouterr().out == ""
+
+
+def test_every_command_can_be_quiet_and_those_that_report_give_json() -> None:
+    silent = {("ship",), ("export",), ("video",), ("view",), ("log", "recover"), ("log", "export")}
+    for path, command in leaves(Command):
+        options = set(parsing.options_of(command))
+        assert "--quiet" in options and ("--json" in options) == (path not in silent), path
 
 
 def test_the_version_is_one_line(capsys):

@@ -11,10 +11,12 @@ import sys
 import tempfile
 import time
 from contextlib import suppress
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
@@ -28,15 +30,19 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.recording import schemas
+from marlbc_mj.recording.exports import export_log
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
-from marlbc_mj.recording.reader import export_log, log_info, read_log, recover_log
+from marlbc_mj.recording.reader import log_info, read_log, recover_log
 from marlbc_mj.recording.writer import LogWriter, partial_name
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.summary import json_numbers
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.provenance import config_hash
 
 CONFIG = {"steps": 3, "nested": {"a": [1.5, None, "µ"]}}
+TOPICS_EACH = 9  # messages of a mission step
 JSON_TOPICS = [topic.name for topic in schemas.TOPICS]
 
 
@@ -54,12 +60,19 @@ def record(path: Path, scenario: Scenario, controller: str = "sorlc", seed: int 
 def assert_same(one: EpisodeLog, other: EpisodeLog) -> None:
     """Equal field by field, bit for bit."""
     for field in fields(EpisodeLog):
-        a, b = getattr(one, field.name), getattr(other, field.name)
-        if isinstance(a, np.ndarray):
-            assert a.dtype == b.dtype, field.name
-            np.testing.assert_array_equal(a, b, err_msg=field.name)
-        else:
-            assert a == b, field.name
+        assert_equal(getattr(one, field.name), getattr(other, field.name), field.name)
+
+
+def assert_equal(a: Any, b: Any, name: str) -> None:
+    """Arrays bit for bit, also those in named tuples."""
+    if hasattr(a, "_fields"):
+        for inner in a._fields:
+            assert_equal(getattr(a, inner), getattr(b, inner), f"{name}.{inner}")
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype, name
+        np.testing.assert_array_equal(a, b, err_msg=name)
+    else:
+        assert a == b, name
 
 
 def messages(path: Path) -> dict[str, list[bytes]]:
@@ -302,8 +315,9 @@ def test_torn_anywhere(chunked, share):
             return
         info, log = log_info(out), read_log(out)
         assert info["messages"] == saved > 0
-        assert saved % 8 == 0
-        np.testing.assert_array_equal(log.position, whole.position[: saved // 8])
+        assert saved % TOPICS_EACH == 0
+        np.testing.assert_array_equal(log.position, whole.position[: saved // TOPICS_EACH])
+        assert measure(log)["team"]["return"] == whole.reward[: saved // TOPICS_EACH].sum()
         assert log.mjcf == whole.mjcf
         assert len(info["attachments"]) == 3
 
@@ -365,7 +379,7 @@ def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["video", str(short[0]), "--speed", "0"])
     assert capsys.readouterr().err == "marlbc: speed must be positive, got 0.0\n"
-    small = ["--width", "128", "--height", "96", "--fps", "2", "--end", "1"]
+    small = ["--size", "128x96", "--fps", "2", "--end", "1"]
     main(["video", str(short[0]), "--out", str(tmp_path / "a.mp4"), *small])
     assert capsys.readouterr().err.startswith("marlbc: off-screen rendering with ")
 
@@ -373,10 +387,13 @@ def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["bnch"], r"Unrecognized options: bnch; Available subcommands: bench, run, .*; see `marlbc --help`"),
-        (["log", "rec"], r"Unrecognized options: rec; Available subcommands: info, recover, export; see `marlbc --help`"),
-        (["run", "--sed", "1"], r"Unrecognized options: --sed, 1; perhaps --seed, .*; see `marlbc --help`"),
-        (["run", "--seed", "x"], r"Error parsing --seed: invalid literal for int\(\) with base 10: 'x'; see `marlbc --help`"),
+        (["bnch"], r"unknown command 'bnch'; perhaps 'bench'; choose from: bench, run, .*; see `marlbc --help`"),
+        (
+            ["log", "rec"],
+            r"unknown command 'rec'; perhaps 'recover'; choose from: info, recover, export; see `marlbc log --help`",
+        ),
+        (["run", "--sed", "1"], r"Unrecognized options: --sed, 1; perhaps --seed; see `marlbc run --help`"),
+        (["run", "--seed", "x"], r"Error parsing --seed: invalid literal for int\(\) with base 10: 'x'; see `marlbc run --help`"),
         (["bench", "--video", "x"], r"invalid choice 'x' for argument '--video'.*'all', 'none'\); see `marlbc bench --help`"),
         (["log", "recover", "a"], r"Missing from marlbc log recover: PATH .*; see `marlbc log recover --help`"),
         ([], r"Expected one of \{bench, .*\}; see `marlbc --help`"),
@@ -397,7 +414,7 @@ def test_help_is_printed_as_it_is(capsys):
 
 
 def test_recovering_a_whole_log_changes_nothing(short, tmp_path):
-    assert recover_log(short[0], tmp_path / "out.mcap") == 8 * 40
+    assert recover_log(short[0], tmp_path / "out.mcap") == TOPICS_EACH * 40
     assert_same(read_log(tmp_path / "out.mcap"), read_log(short[0]))
     assert log_info(tmp_path / "out.mcap")["metadata"] == log_info(short[0])["metadata"]
 
@@ -491,13 +508,60 @@ def test_npz_is_the_log(empty_field, tmp_path):
     log = read_log(empty_field[0])
     export_log(empty_field[0], tmp_path / "a.npz")
     with np.load(tmp_path / "a.npz") as arrays:
-        assert set(arrays) == {field.name for field in fields(EpisodeLog)}
+        assert log.substeps is not None
+        rows = {f"substep_{name}": row for name, row in log.substeps._asdict().items() if name != "course"}
+        whole = {field.name: getattr(log, field.name) for field in fields(EpisodeLog) if field.name != "substeps"} | rows
+        assert set(arrays) == set(whole)
         for name in arrays:
-            np.testing.assert_array_equal(arrays[name], getattr(log, name))
+            np.testing.assert_array_equal(arrays[name], whole[name])
+
+
+def test_json_lines_and_parquet_hold_the_rows_of_the_csv(empty_field, tmp_path):
+    """Numbers bit for bit; a clearance without obstacles is null in JSON, and infinite in the others."""
+    for name in ("a.csv", "a.jsonl", "a.parquet"):
+        main(["export", str(empty_field[0]), str(tmp_path / name), "--quiet"])
+    with open(tmp_path / "a.csv", newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    lines = [json.loads(line) for line in (tmp_path / "a.jsonl").read_text().splitlines()]
+    table = pyarrow.parquet.read_table(tmp_path / "a.parquet")
+    assert table.schema.metadata[b"supervisor"] == b"scripted"
+    assert len(rows) == len(lines) == table.num_rows == 4 * len(read_log(empty_field[0]).time)
+    for row, line, other in zip(rows, lines, table.to_pylist(), strict=True):
+        assert list(row) == list(line) == list(other) and line["clearance"] is None and other["clearance"] == np.inf
+        for key in row:
+            assert row[key] == str(other[key]) and line[key] in (other[key], None)
+
+
+def test_parquet_needs_its_package(short, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ConfigurationError, match=r"Parquet needs pyarrow: pip install 'marlbc-mj\[parquet\]'"):
+        export_log(short[0], tmp_path / "a.parquet")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_metrics_of_a_log_are_those_of_its_episode(short, empty_field):
+    """Equal, not about equal: with obstacles and without, limited and unlimited, with a shield, and where obstacles move."""
+    for path, trajectory in (short, empty_field):
+        assert measure(read_log(path)) == measure(trajectory)
+
+
+@pytest.mark.parametrize(("scenario", "controller"), [("traffic", "pd"), ("paper", "lqr")])
+def test_metrics_of_other_logs(tmp_path, scenario, controller):
+    out = tmp_path / "run"
+    shield = ["--shield"] if scenario == "traffic" else []
+    line = ["run", scenario, "--supervisor", "fixed", "--controller", controller, "--duration", "1", "--seed", "3", *shield]
+    main([*line, "--out", str(out), "--quiet"])
+    recorded = json.loads((out / "metrics.json").read_text())
+    assert json_numbers(measure(read_log(out / "logs" / f"fixed+{controller}.mcap"))) == recorded
+
+
+def test_a_log_of_mission_steps_only_has_no_metrics(short):
+    with pytest.raises(ConfigurationError, match="metrics need every substep"):
+        measure(replace(read_log(short[0]), substeps=None))
 
 
 def test_outputs_are_not_overwritten_and_formats_are_checked(short, tmp_path):
-    with pytest.raises(ConfigurationError, match=r"unknown export format '\.xlsx'; choose from: \.csv, \.npz"):
+    with pytest.raises(ConfigurationError, match=r"unknown export format '\.xlsx'; choose from: \.csv, \.jsonl, \.parquet"):
         export_log(short[0], tmp_path / "a.xlsx")
     for name, write in (("a.csv", export_log), ("a.npz", export_log), ("a.mcap", recover_log)):
         out = tmp_path / name

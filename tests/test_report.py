@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib import resources
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from jinja2 import UndefinedError
 from PIL import Image
 
-from marlbc_mj.cli.terminal import print_results
+from marlbc_mj.cli.terminal import print_results, result_line
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -24,7 +25,7 @@ from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actu
 from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_benchmark_page
 from marlbc_mj.report.paper_values import order_mark
-from marlbc_mj.report.pareto import coincident, pareto
+from marlbc_mj.report.pareto import pareto
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
 from marlbc_mj.report.templates import render
@@ -32,8 +33,10 @@ from marlbc_mj.results.metrics import AgentMetrics, TeamMetrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.scenarios import paper
+from marlbc_mj.studies.bench import SoFar
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.method_names import display_name
 
 HEADINGS = {
     *("return, team", "switches, each agent", "violation, worst agent [s]"),
@@ -118,12 +121,12 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
     ran = [result.metrics for result in results if result.metrics is not None]
     head, *rows = tables["switches"]
     assert head == ["supervisor", "agent 1", "agent 2", "agent 3", "agent 4"]
-    assert [row[0] for row in rows] == ["scripted", "fsams", "FSAMS, published", "mpcms", "MPCMS, published"]
+    assert [row[0] for row in rows] == ["Schedule", "FSAMS", "FSAMS, published", "MPCMS", "MPCMS, published"]
     assert [int(cell) for cell in rows[1][1:]] == [agent["switches"] for agent in ran[2]["agents"]]
     assert [int(cell) for cell in rows[2][1:]] == list(paper_values.PUBLISHED_SWITCHES.values["fsams"])
     assert rows[3][1] == "failed"
     rows = tables["control-cost"][1:]
-    assert [row[0] for row in rows] == ["sorlc", "MARLBC, published", "pd"]
+    assert [row[0] for row in rows] == ["SORLC", "MARLBC, published", "Saturated PD"]
     ours = [agent["cost_max"] for agent in ran[0]["agents"]] + [agent["cost_sum"] for agent in ran[0]["agents"]]
     np.testing.assert_allclose([float(cell) for cell in rows[0][1:9]], np.array(ours) * 1e-4, atol=0.05)
     assert rows[1][5] == "382†" and rows[0][9] == "1.00"
@@ -131,15 +134,15 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
     assert [float(cell) for cell in rows[0][1:5]] == [round(agent["force_max_inf"]) for agent in ran[0]["agents"]]
     rows = tables["decision-time"][1:]
     assert float(rows[0][1]) == float(significant(ran[0]["team"]["decision_ms_median"]))
-    rows = tables["all-metrics"][1:]
-    assert [row[0] for row in rows] == [result.key for result in results]
-    assert rows[-1][1] == "failed"
+    assert [row[0] for row in tables["metrics-supervisors-sorlc"]] == ["supervisor", "Schedule", "FSAMS", "MPCMS"]
+    assert [row[0] for row in tables["metrics-controllers-scripted"]] == ["controller", "SORLC", "Saturated PD"]
+    assert tables["metrics-supervisors-sorlc"][-1][1] == "failed"
 
 
 def test_published_values_belong_to_the_paper_scenario_only(results: list[Result]) -> None:
     """Elsewhere there is one row a method and no mark."""
     switches = next(table for table in make_tables(results, "other") if table.name == "switches")
-    assert [row[0] for row in switches.rows] == ["scripted", "fsams", "mpcms"]
+    assert [row[0] for row in switches.rows] == ["Schedule", "FSAMS", "MPCMS"]
     assert not any("ublished" in note for note in switches.notes)
 
 
@@ -148,12 +151,14 @@ def test_one_word_means_one_aggregation(results: list[Result]) -> None:
     run = [*results, scaled("oracle+sorlc", results[0], 1.0), scaled("oracle+pd", results[1], 1.0)]
     said: dict[tuple[str, str], str] = {}
     for table in make_tables(run, "paper"):
+        law = table.name.removeprefix("metrics-supervisors-")
         for row in table.rows:
+            method = row[0] if law == table.name else f"{row[0]} + {display_name(law)}"
             for column, cell in zip(table.columns, row, strict=True):
                 if column.group in {score.quantity for score in SCORES.values()}:
                     assert column[1:3] in {score[1:3] for score in SCORES.values()}
-                    assert said.setdefault((row[0], column.text), cell) in (cell, "failed", "–")
-    assert ("scripted+sorlc", "violation, worst agent [s]") in said
+                    assert said.setdefault((method, column.text), cell) in (cell, "failed", "–")
+    assert ("Schedule + SORLC", "violation, worst agent [s]") in said
 
 
 def test_latex_units_have_a_line_of_their_own() -> None:
@@ -203,7 +208,7 @@ def test_latex_is_balanced_and_rectangular(results: list[Result]) -> None:
     assert text.isascii()
     bare = re.sub(r"\\[{}]", "", text)
     assert bare.count("{") == bare.count("}")
-    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 6
+    assert text.count(r"\begin{table*}") == text.count(r"\end{table*}") == 7
     for body in re.findall(r"\\begin{tabular}{@{}(l r*|lr*)@{}}(.*?)\\end{tabular}", text, re.DOTALL):
         rows = [line for line in body[1].splitlines() if line.endswith(r"\\")]
         for row in rows:
@@ -251,21 +256,43 @@ def test_the_terminal_says_what_the_tables_say(results: list[Result], capsys: py
     print_results(results)
     out = capsys.readouterr().out
     assert "worst agent [s]" in out and "worst agent [m]" in out and "sum [N s]" in out
-    table = make_tables(results, "paper")[0]
-    shown = [k for k, column in enumerate(table.columns) if column.text == "method" or column.text in HEADINGS]
-    assert len(shown) == 1 + len(HEADINGS)
-    for row in table.rows[:3]:
-        (line,) = [line for line in out.splitlines() if row[0] in line]
-        assert [cell.strip() for cell in line.split("│")[1:-1]] == [row[k] for k in shown]
-    assert f"mpcms+sorlc failed: {REASON}" in out
+    parts = out.split("┃ controller")
+    for table, kind, part in zip(make_tables(results, "paper")[:2], ("supervisor", "controller"), parts, strict=True):
+        shown = [k for k, column in enumerate(table.columns) if column.text == kind or column.text in HEADINGS]
+        assert len(shown) == 1 + len(HEADINGS)
+        for row in table.rows[:2]:
+            (line,) = [line for line in part.splitlines() if line.startswith(f"│ {row[0]} ")]
+            assert [cell.strip() for cell in line.split("│")[1:-1]] == [row[k] for k in shown]
+    assert "with SORLC" in out and "with supervisor Schedule" in out
+    assert f"MPCMS + SORLC failed: {REASON}" in out
+
+
+def test_a_line_per_method_says_what_came_of_it(results: list[Result]) -> None:
+    assert result_line(results[2], 3, 26).startswith("3/26  FSAMS + SORLC: return ")
+    assert result_line(results[3], 4, 26) == f"4/26  MPCMS + SORLC: failed: {' '.join(REASON.split())}"
+
+
+def test_the_page_grows_as_methods_end(results: list[Result], tmp_path: Path) -> None:
+    """Whole at any time, with how many there will be; the page that is written last does not load itself again."""
+    facts = {"scenario": paper(), "versions": {"numpy": "2"}, "git_revision": "abc", "seed": 0, "command": "marlbc bench"}
+    page = SoFar(tmp_path / "so_far", facts, [result.key for result in results])
+    shown = []
+    for result in (results[1], results[0], results[3], results[2]):
+        page.add(result)
+        page._written = -np.inf
+        text = (tmp_path / "so_far" / "index.html").read_text()
+        shown.append((re.findall(r"(\d) of 4 methods so far", text), "refresh" in text))
+        assert {path.name for path in (tmp_path / "so_far").iterdir()} == {"index.html", "tables.md"}
+    assert shown == [(["1"], True), (["2"], True), (["3"], True), (["4"], False)]
+    assert (tmp_path / "so_far" / "tables.md").read_text() == markdown(make_tables(results, "paper"))
 
 
 def test_failures_appear_in_every_form(results: list[Result]) -> None:
     """A failed method is a row with its reason, in Markdown and in LaTeX."""
     tables = make_tables(results, "paper")
-    assert "mpcms+sorlc failed: world 0, agent 3" in markdown(tables)
-    assert "mpcms+sorlc failed: world 0, agent 3" in latex_document(tables)
-    assert make_tables([results[3]], "paper")[0].rows[0][:2] == ("mpcms+sorlc", "failed")
+    assert "MPCMS + SORLC failed: world 0, agent 3" in markdown(tables)
+    assert "MPCMS + SORLC failed: world 0, agent 3" in latex_document(tables)
+    assert make_tables([results[3]], "paper")[0].rows[0][:2] == ("MPCMS", "failed")
 
 
 def scaled(name: str, result: Result, cost: float, violation: float = 0.0) -> Result:
@@ -300,16 +327,31 @@ def test_orders_hold_and_differ_by_the_numbers(results: list[Result]) -> None:
     assert "orderings" not in {t.name for t in make_tables([sorlc], "paper")}
 
 
+def test_no_count_of_reproduced_orders_depends_on_the_time_that_decisions_take(results: list[Result]) -> None:
+    """Table 4 stands beside the published one, and neither counts nor says whether its order is the same."""
+    run = [scaled(f"{name}+sorlc", results[0], 1.0) for name in ("marlms", "fsams", "mpcms")]
+
+    def said(slowest: int) -> tuple[object, ...]:
+        for k, result in enumerate(run):
+            assert result.metrics is not None
+            result.metrics["team"]["decision_ms_median"] = 1e3 if k == slowest else 1.0
+        tables = {table.name: table for table in make_tables(run, "paper")}
+        assert not any("same order" in row for row in tables["decision-time"].rows)
+        return claims(run), tables["orderings"]
+
+    assert said(0) == said(2)
+
+
 def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
     """With the same actuator a rival is cheaper or it is not, and LQR is safe or it is not."""
     sorlc = results[0]
     run = [sorlc, scaled("scripted+finite-time", sorlc, 2.0)]
     cheap = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 0.25), scaled("scripted+lqr", sorlc, 0.125, 1.7)])
-    assert "every rival is cheaper: finite-time" in cheap and "(0.25 times)" in cheap
+    assert "every rival is cheaper: Finite-time" in cheap and "(0.25 times)" in cheap
     assert "LQR is the floor" in cheap and "violates the safe distance for 1.70 s" in cheap
-    assert "is reversed for finite-time" in cheap
+    assert "is reversed for Finite-time" in cheap
     dear = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 1.5), scaled("scripted+lqr", sorlc, 3.0)])
-    assert "no rival is cheaper: finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
+    assert "no rival is cheaper: Finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
     assert "reversed" not in dear and "stands" in dear
     assert same_actuator(results) == ""
 
@@ -320,13 +362,13 @@ def test_limited_rivals_and_lqr_are_a_block_of_their_own(results: list[Result]) 
     table = make_tables([results[0], *(scaled(f"scripted+{name}", results[0], 0.5) for name in names)], "paper")[3]
     labels = [row[0] for row in table.rows]
     assert labels == [
-        "sorlc",
+        "SORLC",
         "MARLBC, published",
-        "finite-time",
+        "Finite-time",
         "finite-time, published",
         "same order",
-        "lqr",
-        "finite-time-limited",
+        "LQR",
+        "Finite-time, limited",
     ]
     assert table.rules == (4, 5) and table.rows[-1][-1] == "0.50"
 
@@ -339,19 +381,36 @@ def test_gap_to_the_oracle(results: list[Result]) -> None:
     best.metrics["team"]["return"] = 1e4
     table = oracle_gap([*results, best])
     assert table is not None
-    assert [row[0] for row in table.rows] == ["scripted+sorlc", "fsams+sorlc", "mpcms+sorlc"]
+    assert [row[0] for row in table.rows] == ["Schedule + SORLC", "FSAMS + SORLC", "MPCMS + SORLC"]
     assert table.rows[1][2] == f"{1e4 - results[2].metrics['team']['return']:.0f}" and table.rows[2][1] == "failed"
 
 
-def test_marks_that_coincide_are_named(results: list[Result]) -> None:
-    """Controllers whose cost, return, violation and formation error are the same; in a comparison of both, by method."""
+def test_no_mark_covers_another(results: list[Result]) -> None:
+    """Of methods with the same numbers one stands aside, and a line leads to its place; others stand where they belong."""
     sorlc = results[0]
     twin, other = scaled("scripted+sorlc-off", sorlc, 1.0), scaled("scripted+lqr", sorlc, 0.1)
-    assert coincident([sorlc, other, twin]) == [["sorlc", "sorlc-off"]]
-    both = [sorlc, other, *(scaled(f"fms+{name}", like, 1.0) for name, like in (("sorlc", sorlc), ("lqr", other)))]
-    assert coincident(both) == [["scripted+sorlc", "fms+sorlc"], ["scripted+lqr", "fms+lqr"]]
-    (plot,) = [p for p in figures.plots([sorlc, other, twin]) if p.stem == "pareto_all"]
-    assert plot.caption.endswith("Marks of sorlc and sorlc-off coincide.")
+    figure = pareto([sorlc, other, twin])
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        marks = [line for line in axes.lines if line.get_marker() in tuple("os^")]
+        places = [72.0 / figure.dpi * line.get_transform().transform(line.get_xydata())[0] for line in marks]
+        true = [72.0 / figure.dpi * axes.transData.transform(line.get_xydata())[0] for line in marks]
+        assert len(places) == 3 and min(np.hypot(*(a - b)) for a, b in combinations(places, 2)) > 6.0
+        aside = [not np.allclose(place, at) for place, at in zip(places, true, strict=True)]
+        assert aside == [False, False, True] and sum(text.arrow_patch is not None for text in axes.texts) == 1
+        assert np.hypot(*(places[2] - true[2])) < 7.0
+
+
+def test_other_missions_do_not_speak_of_the_paper() -> None:
+    """Neither captions of figures nor those of tables have its numbers."""
+    made = []
+    for names in (("scripted", "sorlc"), ("scripted", "rlc"), ("fsams", "sorlc")):
+        world = World(replace(paper(duration=1.0), name="mine"), make_controller(names[1]), record=True)
+        made.append(Result.of(run_episode(world, make_supervisor(names[0]), names=names)))
+    captions = [plot.caption for plot in figures.plots(made)]
+    tables = make_tables(made, "mine")
+    said = [*captions, *(table.caption for table in tables), *(note for table in tables for note in table.notes)]
+    assert len(captions) > 10 and not [text for text in said if re.search(r"[Pp]aper|Figure \d|[Pp]ublished", text)]
 
 
 def test_spans_of_numbers() -> None:
@@ -363,7 +422,7 @@ def test_predictions_and_solver_share(results: list[Result]) -> None:
     """Two kinds of MPCMS are compared; a supervisor that tells its solver's time has a share in Table 4 and the summary."""
     kinds = [scaled(f"{name}+sorlc", results[0], 1.0) for name in ("mpcms", "mpcms-mujoco")]
     table = predictions(kinds)
-    assert table is not None and [row[0] for row in table.rows] == ["mpcms+sorlc", "mpcms-mujoco+sorlc"]
+    assert table is not None and [row[0] for row in table.rows] == ["MPCMS + SORLC", "MPCMS, simulated + SORLC"]
     assert predictions(kinds[:1]) is None
     told = replace(kinds[0], solver_share=0.75)
     times = make_tables([results[0], told], "paper")[2]
@@ -382,14 +441,16 @@ def test_bands_hold_every_sample() -> None:
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
 def test_latex_compiles(results: list[Result], tmp_path: Path) -> None:
-    """tables.tex as it is, in a document that loads booktabs and nothing else."""
-    (tmp_path / "tables.tex").write_text(latex_document(make_tables(results, "paper"), "100 % of x_y."))
+    """tables.tex as it is, in a document that loads what it says; no table is wider than the text, whatever its names are."""
+    wide = Table("wide", "c", tuple(Column("g", f"column {k}", "m/s") for k in range(24)), (("123 456.78",) * 24,))
+    (tmp_path / "tables.tex").write_text(latex_document([*make_tables(results, "paper"), wide], "100 % of x_y."))
     (tmp_path / "all.tex").write_text(
-        r"\documentclass[twocolumn]{article}\usepackage{booktabs}\begin{document}\input{tables}\end{document}"
+        r"\documentclass[twocolumn]{article}\usepackage{booktabs,graphicx}\begin{document}\input{tables}\end{document}"
     )
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout[-1000:]
+    assert "Overfull" not in done.stdout
 
 
 def test_envelope_keeps_peaks_and_ends() -> None:
@@ -427,7 +488,7 @@ def test_comparison_figures(results: list[Result]) -> None:
     episodes = [result.trajectory for result in results if result.trajectory is not None]
     figure = trajectories(episodes)
     assert figure.get_figwidth() == plotting.DOUBLE
-    assert sum(axes.get_visible() for axes in figure.axes) == len(episodes)
+    assert sum(axes.axison for axes in figure.axes) == len(episodes) == 3 and figure.axes[3].get_legend() is not None
     assert len(pareto(results[:2]).axes) == 3 and len(pareto(results).axes) == 6  # supervisors above, controllers below
     assert curves.has_weights(episodes[0]) and not curves.has_weights(episodes[1])
     for draw in (curves.weight_norms, curves.weight_errors):
@@ -456,7 +517,14 @@ def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]]
     assert page.count('src="data:image/png;base64,') == 5 + 3
     assert 'src="data:video/mp4;base64,' in page
     assert not re.search(r"\$|{{|{%|{#", re.sub(r"base64,[^\"]*", "", page))
-    for text in ("mpcms+sorlc", "abc1234", "--out &lt;here&gt;", 'href="logs/a%20b.mcap"', "scripted+pd", "&lt;limit&gt;"):
+    for text in (
+        "MPCMS + SORLC",
+        "abc1234",
+        "--out &lt;here&gt;",
+        'href="logs/a%20b.mcap"',
+        "Schedule + Saturated PD",
+        "&lt;limit&gt;",
+    ):
         assert text in page
 
 

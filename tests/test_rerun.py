@@ -80,7 +80,7 @@ def test_without_the_package_it_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr("marlbc_mj.recording.rerun_file.import_module", missing)
     with pytest.raises(SystemExit):
         main(["log", "export", str(source), str(tmp_path / "a.rrd")])
-    from marlbc_mj.recording.reader import export_log
+    from marlbc_mj.recording.exports import export_log
 
     with pytest.raises(ConfigurationError, match="pip install rerun-sdk"):
         export_log(source, tmp_path / "a.rrd")

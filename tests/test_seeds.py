@@ -127,7 +127,7 @@ def test_progress_and_rows_grow_with_methods_times_seeds(results: SeedResults, t
 
 
 def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
-    """A drag a million times the printed one throws every episode out of the physical range; the rest is reported."""
+    """A drag a million times the published one throws every episode out of the physical range; the rest is reported."""
     wild: Scenario = paper(duration=2.0, disturbance=PaperDrag(1e6))
     results = run_seeds(wild, ("scripted",), ("pd", "sorlc"), seed_range(3))
     for method in results.methods:
@@ -139,8 +139,8 @@ def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
     assert set(content["methods"]["scripted+pd"]["failures"]) == {"0", "1", "2"}
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     return_table, *_, failures = make_seed_tables(results, methods)
-    assert return_table.rows[1][:2] == ("scripted+sorlc", "failed")
-    assert failures.rows[0] == ("scripted+pd", "3/3", "0 to 2")
+    assert return_table.rows[1][:2] == ("SORLC", "failed")
+    assert failures.rows[0] == ("Schedule + Saturated PD", "3/3", "0 to 2")
 
 
 def test_a_limited_law_that_never_leaves_its_limit_has_failed() -> None:
@@ -164,9 +164,9 @@ def test_failures_are_left_out_of_medians_and_count_as_violation_and_loss(failin
 
 def test_tables_name_who_failed_and_why(failing: SeedResults) -> None:
     tables = make_seed_tables(failing, analyse(failing))
-    assert tables[-1].rows == (("scripted+sorlc", "2/4", "3, 5"),)
-    assert "scripted+sorlc on seed 3: seed 3: | 100% of <limit> second line." in tables[-1].notes
-    assert tables[1].rows[1][:2] == ("scripted+sorlc", "2/4")
+    assert tables[-1].rows == (("Schedule + SORLC", "2/4", "3, 5"),)
+    assert "Schedule + SORLC on seed 3: seed 3: | 100% of <limit> second line." in tables[-1].notes
+    assert tables[1].rows[1][:2] == ("SORLC", "2/4")
     for table in tables:
         assert r"\toprule" in to_latex(table) and "?" not in to_latex(table)
         assert "<limit>" not in render("table.html", table=table) and "<limit>" not in to_markdown(table)
@@ -229,7 +229,10 @@ def test_a_method_that_cannot_start_is_a_row_on_every_seed(tmp_path: Path) -> No
     assert all("no schedule" in str(run.failure) for run in oracle.runs) and len(oracle.runs) == 2
     assert all("25 ms" in str(run.failure) and run.instance is None for run in unstable.runs)
     statistics = analyse(results)
-    assert [row[:2] for row in make_seed_tables(results, statistics)[-1].rows] == [("oracle+lqr", "2/2"), (unstable.key, "2/2")]
+    assert [row[:2] for row in make_seed_tables(results, statistics)[-1].rows] == [
+        ("Oracle + LQR", "2/2"),
+        (unstable.display, "2/2"),
+    ]
     write_seed_report(results, tmp_path, config=CONFIG, figures=False)
     assert "no schedule" in (tmp_path / "tables.md").read_text()
 

@@ -65,7 +65,7 @@ def test_a_table_fills_every_kind_of_field():
 @pytest.mark.parametrize(
     ("table", "message"),
     [
-        ({"coumt": 1, "flag": 3}, "unknown key 'coumt'; choose from: count, kind, flag"),
+        ({"coumt": 1, "flag": 3}, "unknown key 'coumt'; perhaps 'count'; choose from: count, kind, flag"),
         ({"inner": {"part": 1}, "count": 1}, "unknown key 'inner.part'; choose from: inner.share"),
         ({}, "missing: count"),
         ({"count": 1.0}, "count must be a whole number, got 1.0"),

@@ -16,7 +16,8 @@ from mcap.writer import CompressionType, Writer
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import digest, read_arrays, write_arrays
 from marlbc_mj.recording import reader
-from marlbc_mj.recording.reader import export_log, log_info, read_log, recover_log
+from marlbc_mj.recording.exports import export_log
+from marlbc_mj.recording.reader import log_info, read_log, recover_log
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import load_scenario, make_scenario

@@ -90,7 +90,7 @@ def test_rows_come_back_from_their_file(tmp_path: Path) -> None:
 
 
 SAID = {
-    "track": (["suite", "--track", "familys"], "unknown track 'familys'; choose from: paper, families"),
+    "track": (["suite", "--track", "familys"], "unknown track 'familys'; perhaps 'families'; choose from: paper, families"),
     "mission": (["suite", "--missions", "meadow"], "unknown mission 'meadow'"),
     "supervisor": (["suite", "--supervisors", "nobody"], "unknown supervisor 'nobody'"),
     "controller": (["suite", "--track", "control", "--controllers", "none"], "unknown controller 'none'"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import marlbc_mj.tasks
-from marlbc_mj import PD, World, paper, run_episode
+from marlbc_mj import PD, World, make_controller, make_scenario, measure, paper, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.core import laws
 from marlbc_mj.supervisors import Blend, make_supervisor
@@ -97,6 +97,43 @@ def test_a_wrong_part_of_a_controller_is_named(name):
         World(paper(duration=0.5), controller)
 
 
+def test_a_class_in_place_of_what_it_makes():
+    with pytest.raises(ConfigurationError, match=r"controller is the class PD; make one of it: PD\(\)"):
+        World(paper(duration=0.5), PD)
+    with pytest.raises(ConfigurationError, match=r"supervisor is the class Decider; make one of it: Decider\(\)"):
+        run_episode(World(paper(duration=0.5), PD(), record=True), Decider)
+
+
+SETTINGS = {
+    "a team": (
+        lambda: paper(agents=6),
+        "scenario 'paper' has a team of 4 of its own, and agents cannot be set; families such as",
+    ),
+    "a team by name": (lambda: make_scenario("cruise", agents=6), "scenario 'cruise' has a team of 4 of its own"),
+    "no field": (lambda: paper(durration=6), "unknown field of a scenario 'durration'; perhaps 'duration'; choose from: name"),
+    "a text": (lambda: paper(duration="6"), "scenario 'paper': duration must be a number, got '6'"),
+    "a word": (lambda: make_scenario("field", agents="four"), "scenario 'field': agents must be a whole number, got 'four'"),
+    "true": (lambda: paper(mass=True), "scenario 'paper': mass must be a number, got True"),
+    "starts": (lambda: paper(starts="x"), "scenario 'paper': starts must be numbers, got 'x'"),
+    "a name": (lambda: paper(disturbance="wind"), "scenario 'paper': disturbance must be a Disturbance, got 'wind'"),
+    "no name": (lambda: make_supervisor(None), "a name must be a text, got NoneType"),
+    "an object": (lambda: make_controller(PD()), "a name must be a text, got PD"),
+    "no episode": (lambda: measure(None), "measure takes a Trajectory or what read_log returns, got NoneType"),
+}
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_a_wrong_setting_is_named(name):
+    make, said = SETTINGS[name]
+    with pytest.raises(ConfigurationError) as error:
+        make()
+    assert str(error.value).startswith(said) and "\n" not in str(error.value)
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert paper(duration=np.float32(5.0), mass=np.int64(2)).mission_steps == 100
+
+
 def test_something_else_than_a_scenario():
     with pytest.raises(ConfigurationError, match="scenario must be a Scenario, got str"):
         World("paper")
@@ -156,6 +193,12 @@ ANSWERS = {
     "a blend alone": (Decider(Blend(ORDERS, np.zeros((4, 2)))), "got Blend"),
     "a list": (Decider(([0, 0, 0, 0], 0)), "array of integers"),
     "a name": (Decider(("FM", 0)), "array of integers"),
+    "names": (Decider((["FM", "FM", "OA>FM", "FR"], 0)), "got list of names; scenario.orders.index gives the number of a name"),
+    "names in an array": (
+        Decider((np.array(["FM"] * 4), 0)),
+        "got <U2 of names; scenario.orders.index gives the number of a name",
+    ),
+    "an attribute that is not there": (Decider(lambda: np.nothing), r"decide\(\) fails: AttributeError"),
     "too few": (Decider((ORDERS[:3], 0)), "shape"),
     "no order": (Decider((ORDERS + 99, 0)), "indices from 0 to"),
     "NaN": (Decider((Blend(ORDERS, np.full((4, 2), np.nan)), 0)), "velocity must be finite"),

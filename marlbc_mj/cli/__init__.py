@@ -1,11 +1,12 @@
 """The command line, ``marlbc``. Heavy imports wait until a command needs them, so that help is instant."""
 
 import sys
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import subcommand
 
 from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, SafetyCommand
+from marlbc_mj.cli.cache import suggest_cache
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
 from marlbc_mj.cli.learners import StudyCommand
@@ -23,8 +24,9 @@ from marlbc_mj.cli.recordings import LogCommand, VideoCommand, ViewCommand
 from marlbc_mj.cli.robot import RobotCommand
 from marlbc_mj.cli.ship import ShipCommand
 from marlbc_mj.cli.suite import SuiteCommand
-from marlbc_mj.cli.terminal import prepare_gl, suggest_cache
+from marlbc_mj.cli.terminal import prepare_gl
 from marlbc_mj.cli.training import TrainCommand
+from marlbc_mj.util.progress import hushed
 
 Command = (
     Annotated[BenchCommand, subcommand("bench")]
@@ -63,7 +65,8 @@ def main(arguments: list[str] | None = None) -> None:
 
             print(f"marlbc {version('marlbc-mj')}")
             return
-        command: Command = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
-        prepare_gl(strict=isinstance(command, VideoCommand))
-        command.run()
-        suggest_cache()
+        command: Any = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
+        with hushed(command.output.quiet):
+            prepare_gl(strict=isinstance(command, VideoCommand))
+            command.run()
+            suggest_cache()

@@ -1,83 +1,96 @@
 """``marlbc bench``, ``run``, ``evaluate`` and ``safety``, and the changes to a scenario that they share."""
 
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.terminal import print_results, progress_bars
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.cli.choices import (
+    Compositions,
+    ControllerName,
+    MissionNames,
+    ScenarioName,
+    ScenarioSettings,
+    SomeComposition,
+    SomeControllers,
+    SomeCount,
+    SomeDisturbance,
+    SomeFormation,
+    SomeNumber,
+    SomeRange,
+    SomeReference,
+    SomeRobot,
+    SomeSplit,
+    SomeSupervisors,
+    SupervisorName,
+)
+from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.cli.terminal import print_results, result_line
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.progress import note
 
 if TYPE_CHECKING:
+    from marlbc_mj.results.seeds import SeedResults
+    from marlbc_mj.results.summary import Result
     from marlbc_mj.scenarios import Scenario
     from marlbc_mj.studies.bench import BenchConfig
-
-SETTABLE = ("communication.", "imperfections.")
-"""Tables of a scenario whose fields ``--set`` reaches."""
 
 
 @dataclass(frozen=True)
 class ScenarioOptions:
     """Changes to the scenario."""
 
-    substep: float | None = None
+    substep: SomeNumber = None
     """Physics and control step [s]; must divide the mission step of 0.05 s."""
-    reference: str | None = None
-    """Where behaviors are evaluated: virtual (at the reference) or actual (at the measured position)."""
-    composition: str | None = None
-    """How an order becomes a reference: null-space (avoidance as an equality task) or set-based (as an inequality)."""
+    reference: SomeReference = None
+    """Where behaviors are evaluated: at the reference (virtual) or at the measured position (actual)."""
+    composition: SomeComposition = None
+    """How an order becomes a reference: avoidance as an equality task (null-space) or as an inequality (set-based)."""
     two_sided: bool = False
     """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
-    disturbance: str | None = None
-    """Unknown dynamics: paper, linear, quadratic, wind or gusts."""
-    drag_scale: float | None = None
+    disturbance: SomeDisturbance = None
+    """Unknown dynamics."""
+    drag_scale: SomeNumber = None
     """Multiplies the disturbance."""
-    force_limit: float | None = None
+    force_limit: SomeNumber = None
     """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
-    duration: float | None = None
+    duration: SomeNumber = None
     """Mission time [s]."""
-    robot: str | None = None
-    """Robot, by name, path of an .xml or .py file, or FILE.py:NAME; a scenario takes its mass, force and limits."""
-    split: str | None = None
-    """Layout split to draw from, for scenarios that draw layouts: train (default) or test, the held-out ones."""
-    set: tuple[str, ...] = ()
-    """Settings of communication and imperfections, name=value: communication.range=8 communication.loss=0.2."""
+    robot: SomeRobot = None
+    """Robot of every agent; the scenario takes its mass, force and limits."""
+    agents: SomeCount = None
+    """Size of the team, 2 to 256, for scenarios that are made for any."""
+    formation: SomeFormation = None
+    """Formation of the team, for the same scenarios."""
+    split: SomeSplit = None
+    """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
+    set: ScenarioSettings = ()
+    """Settings of communication and imperfections: communication.range=8 communication.loss=0.2."""
 
     allow_code: bool = False
     """Run the Python file that a scenario file names as its robot."""
 
-    def build(self, name: str, **others: Any) -> "Scenario":
-        """The named scenario with these changes, and with ``others`` that are not None."""
+    def build(self, name: str) -> "Scenario":
+        """The named scenario with these changes."""
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
         from marlbc_mj.util.changes import with_settings
 
-        keys = ("substep", "reference", "composition", "force_limit", "duration", "split")
+        keys = ("substep", "reference", "composition", "force_limit", "duration", "agents", "formation", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
-        changes.update({key: value for key, value in others.items() if value is not None})
         if self.two_sided:
             changes["two_sided"] = True
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
         scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
-        return with_settings(scenario, self._tables_set())
-
-    def _tables_set(self) -> tuple[str, ...]:
-        """The settings of --set; other fields of a scenario follow from each other, so that one alone cannot be set.
-
-        Raises:
-            ConfigurationError: a setting that is in neither table.
-        """
-        for setting in self.set:
-            if not setting.startswith(SETTABLE):
-                raise unknown("setting", setting.partition("=")[0], [f"{table}NAME=VALUE" for table in SETTABLE])
-        return self.set
+        return with_settings(scenario, self.set)
 
     def _robot_changes(self, name: str) -> dict[str, Any]:
-        """What another robot changes, but for what other options set."""
+        """Fields that another robot changes, without those that other options set."""
         from marlbc_mj.robots import make_robot
 
         if self.robot is None:
@@ -96,19 +109,19 @@ class BenchCommand:
     oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca, cbf-qp and marlms-general.
     """
 
-    scenario: Positional[str] = "paper"
-    """Scenario, see `marlbc list`, or a .toml file."""
-    supervisors: tuple[str, ...] | None = None
+    scenario: Positional[ScenarioName] = "paper"
+    """Scenario."""
+    supervisors: SomeSupervisors = None
     """Supervisors to run, each with every one of --controllers (scripted, if only those are named)."""
-    controllers: tuple[str, ...] | None = None
+    controllers: SomeControllers = None
     """Controllers to run each supervisor with (sorlc, if only supervisors are named)."""
     out: Path = Path("out/paper")
     """Folder of the results."""
     seed: int = 0
     """Draw of the scenario; every seed is the same where nothing is perturbed."""
-    seeds: int | None = None
+    seeds: SomeCount = None
     """Number of draws around the scenario, from --seed on: tables with intervals instead of logs and videos."""
-    drag_range: tuple[float, float] | None = None
+    drag_range: SomeRange = None
     """With --seeds, a draw from this range multiplies the disturbance: 0 2 by default, 5 5 for five times throughout."""
     workers: int = 1
     """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""
@@ -124,25 +137,38 @@ class BenchCommand:
     """Replace the results in the output folder."""
     shield: bool = False
     """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
-    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Run the matrix, then say where the results are and what they are."""
+        if self.seeds is None:
+            self._run_once()
+        else:
+            self._run_draws()
+        self.output.say(f"{self.out / 'index.html'} shows it all")
+
+    def _run_once(self) -> None:
+        """One episode of every method; the page grows and a line is printed as each ends."""
+        from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_bench
+        from marlbc_mj.util.provenance import versions
+
+        config, scenario = self.config(), self.scenario_drawn()
+        with self.output.progress(ends=False) as told:
+            counted = _Counted(len(config.methods), told.line)
+            results, problems = run_bench(scenario, config, self.out, progress=told.progress, ended=counted.tell)
+        self.output.report(lambda: print_results(results), summary(results, scenario.name, versions()))
+        for problem in problems:
+            print(f"marlbc: {problem}", file=sys.stderr)
+
+    def _run_draws(self) -> None:
+        """Every method on the same draws."""
         from marlbc_mj.studies.draws import run_bench_seeds
 
-        config = self.config()
-        scenario = self.scenario_drawn()
-        with progress_bars() as progress:
-            if self.seeds is not None:
-                run_bench_seeds(scenario, config, self.out, progress=progress)
-            else:
-                results, problems = run_bench(scenario, config, self.out, progress=progress)
-        if self.seeds is None:
-            print_results(results)
-            for problem in problems:
-                print(f"marlbc: {problem}", file=sys.stderr)
-        print(f"{self.out / 'index.html'} shows it all")
+        with self.output.progress() as told:
+            results = run_bench_seeds(self.scenario_drawn(), self.config(), self.out, progress=told.progress)
+        self.output.report("", seed_document(results))
 
     def config(self) -> "BenchConfig":
         """The options under the names that the benchmark gives them."""
@@ -151,7 +177,7 @@ class BenchCommand:
         return BenchConfig(**{each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)})
 
     def scenario_drawn(self) -> "Scenario":
-        """The scenario with the options' changes, and with the range that draws multiply its disturbance by.
+        """The scenario with the options' changes, and with the range of factors of its disturbance over draws.
 
         Raises:
             ConfigurationError: a range without draws.
@@ -159,22 +185,44 @@ class BenchCommand:
         from marlbc_mj.studies.draws import with_drag_range
 
         if self.drag_range is None:
-            return self.options.build(self.scenario)
+            return self.mission.build(self.scenario)
         if self.seeds is None:
             raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
-        return with_drag_range(self.options.build(self.scenario), self.drag_range)
+        return with_drag_range(self.mission.build(self.scenario), self.drag_range)
+
+
+@dataclass
+class _Counted:
+    """Says one line per method that has ended."""
+
+    total: int
+    line: Callable[[str], None]
+    ended: int = 0
+
+    def tell(self, result: "Result") -> None:
+        self.ended += 1
+        self.line(result_line(result, self.ended, self.total))
+
+
+def seed_document(results: "SeedResults") -> dict[str, Any]:
+    """What summary.json says of many draws."""
+    from marlbc_mj.report.seed_files import seed_summary
+    from marlbc_mj.results.seed_statistics import analyse
+    from marlbc_mj.util.provenance import versions
+
+    return seed_summary(results, analyse(results), versions())
 
 
 @dataclass(frozen=True)
 class RunCommand:
     """Run one episode of one method and log it."""
 
-    scenario: Positional[str] = "paper"
-    """Scenario, see `marlbc list`, or a .toml file."""
-    supervisor: str = "scripted"
-    """Mission supervisor, FILE.py:NAME, or the path of a checkpoint."""
-    controller: str = "sorlc"
-    """Controller, or FILE.py:NAME."""
+    scenario: Positional[ScenarioName] = "paper"
+    """Scenario."""
+    supervisor: SupervisorName = "scripted"
+    """Mission supervisor."""
+    controller: ControllerName = "sorlc"
+    """Controller."""
     out: Path = Path("out/run")
     """Folder of the log, the metrics and the configuration."""
     seed: int = 0
@@ -183,25 +231,31 @@ class RunCommand:
     """Replace what is in the output folder."""
     shield: bool = False
     """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
-    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """One episode, its log and its metrics."""
+        from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_single
+        from marlbc_mj.util.provenance import versions
 
-        with progress_bars() as progress:
+        scenario = self.mission.build(self.scenario)
+        if self.seed > 0 and not scenario.draws:
+            note(f"{self.scenario} draws nothing: seed {self.seed} gives the same episode as any other")
+        with self.output.progress(ends=False) as told:
             result = run_single(
-                self.options.build(self.scenario),
+                scenario,
                 self.supervisor,
                 self.controller,
                 self.out,
                 seed=self.seed,
                 overwrite=self.overwrite,
                 shield=self.shield,
-                progress=progress,
+                progress=told.progress,
             )
-        print_results([result])
-        print(f"{self.out} holds the log, the metrics and the configuration")
+        self.output.report(lambda: print_results([result]), summary([result], scenario.name, versions()))
+        self.output.say(f"{self.out} holds the log, the metrics and the configuration")
 
 
 @dataclass(frozen=True)
@@ -212,16 +266,12 @@ class EvaluateCommand:
     same for every seed; elsewhere they are reported as failed, with the reason.
     """
 
-    scenario: Positional[str] = "field"
-    """Scenario that draws layouts, see `marlbc list`, or a .toml file."""
-    supervisors: tuple[str, ...] | None = None
+    scenario: Positional[ScenarioName] = "field"
+    """Scenario that draws layouts."""
+    supervisors: SomeSupervisors = None
     """Supervisors to run."""
-    controller: str = "sorlc"
+    controller: ControllerName = "sorlc"
     """Controller they run with."""
-    agents: int | None = None
-    """Size of the team, 4 in most families."""
-    formation: str | None = None
-    """Formation of the team: line, wedge, circle or grid."""
     seeds: int = 200
     """Number of held-out layouts."""
     seed: int = 0
@@ -236,11 +286,12 @@ class EvaluateCommand:
     """Replace the results in the output folder."""
     shield: bool = False
     """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
-    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Evaluate, and print the table of outcomes."""
-        from marlbc_mj.report.seed_tables import outcome_table
+        from marlbc_mj.report.seed_tables import outcome_tables
         from marlbc_mj.report.table import to_markdown
         from marlbc_mj.studies.evaluate import evaluation, run_evaluation
 
@@ -254,14 +305,10 @@ class EvaluateCommand:
             overwrite=self.overwrite,
             shield=self.shield,
         )
-        with progress_bars() as progress:
-            results = run_evaluation(self.scenario_flown(), config, self.out, progress=progress)
-        print(to_markdown(outcome_table(results)))
-        print(f"{self.out / 'index.html'} shows it all")
-
-    def scenario_flown(self) -> "Scenario":
-        """The scenario with the team and the changes of the command line."""
-        return self.options.build(self.scenario, agents=self.agents, formation=self.formation)
+        with self.output.progress() as told:
+            results = run_evaluation(self.mission.build(self.scenario), config, self.out, progress=told.progress)
+        self.output.report("\n".join(map(to_markdown, outcome_tables(results))), seed_document(results))
+        self.output.say(f"{self.out / 'index.html'} shows it all")
 
 
 @dataclass(frozen=True)
@@ -272,11 +319,11 @@ class SafetyCommand:
     paper-drag-0, paper-drag-2 and paper-drag-5.
     """
 
-    missions: Positional[tuple[str, ...]] = ("field", "forest", "gates", "corridor", "traffic")
-    """Scenarios that draw layouts, see `marlbc list`, or draws around the case study."""
-    supervisors: tuple[str, ...] | None = None
-    """Supervisors to run; by default every one that needs neither learning nor a known map, and scripted."""
-    compositions: tuple[str, ...] = ("null-space", "set-based")
+    missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
+    """Scenarios that draw layouts, or draws around the case study."""
+    supervisors: SomeSupervisors = None
+    """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
+    compositions: Compositions = ("null-space", "set-based")
     """How orders become references."""
     shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
     """Whether agents have a shield."""
@@ -284,9 +331,9 @@ class SafetyCommand:
     """Layouts of every supervisor on every mission."""
     searched: int = 100
     """Layouts of mpcms and rollout, which take seconds each."""
-    seed: int = 70_000
+    seed: int = 80_000
     """First seed of the layouts."""
-    controller: str = "sorlc"
+    controller: ControllerName = "sorlc"
     """Controller that all run with."""
     workers: int = 1
     """Processes that share the layouts."""
@@ -294,6 +341,7 @@ class SafetyCommand:
     """Folder of the tables."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Run the study, and print its tables."""
@@ -305,7 +353,7 @@ class SafetyCommand:
         if self.supervisors is not None:
             settings["supervisors"] = self.supervisors
         study = SafetyStudy(**settings, shields=tuple(shield == "yes" for shield in self.shields))
-        with progress_bars() as progress:
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=progress)
-        print(done.report.text)
-        print(f"{self.out / 'safety.csv'} has all numbers")
+        with self.output.progress() as told:
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=told.progress)
+        self.output.report(done.report.text, done.report.document)
+        self.output.say(f"{self.out / 'safety.csv'} has all numbers")

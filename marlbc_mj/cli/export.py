@@ -1,24 +1,40 @@
-"""``marlbc export``: a trained policy for another computer."""
+"""``marlbc export``: a trained policy for another computer, or a log for other programs."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
+
+from marlbc_mj.cli.choices import ExistingPath
+from marlbc_mj.cli.output import OutputOptions
+
+LOG_SUFFIX = ".mcap"
 
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a checkpoint's policy as an ONNX file for a robot's computer; needs the onnx extra."""
+    """Write a checkpoint's policy as ONNX (extra onnx), or a log in another format.
 
-    checkpoint: Positional[Path]
-    """Checkpoint, checkpoint/best.safetensors of a run for example."""
+    The general policy becomes the graph of one agent: what it sensed and heard goes in, its action comes out. Formats of a log:
+    a table (.csv, .jsonl, or .parquet with the extra parquet), arrays (.npz), or for Rerun (.rrd).
+    """
+
+    source: Positional[ExistingPath]
+    """Checkpoint, checkpoint/best.safetensors of a run for example, or an MCAP log."""
     out: Positional[Path]
-    """File to write, policy.onnx for example."""
+    """File to write: policy.onnx, or episode.csv; of a log, its ending chooses the format."""
     overwrite: bool = False
     """Replace an existing file."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Export, and say what goes in and what comes out."""
+        if self.source.suffix == LOG_SUFFIX:
+            from marlbc_mj.recording.exports import export_log
+
+            export_log(self.source, self.out, overwrite=self.overwrite)
+            self.output.say(self.out)
+            return
         from marlbc_mj.training.export import export_policy
 
-        print(export_policy(self.checkpoint, self.out, overwrite=self.overwrite))
+        self.output.say(export_policy(self.source, self.out, overwrite=self.overwrite))

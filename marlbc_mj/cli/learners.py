@@ -1,15 +1,17 @@
 """``marlbc study``: train every variant of the learner on several seeds, in worker processes, and compare them."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import tyro
+from tyro.conf import OmitArgPrefixes, arg
 
-from marlbc_mj.cli.terminal import progress_lines
+from marlbc_mj.cli.choices import SomeCount, SomePath, TrainingSettings, VariantNames
+from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import SimulationError
+from marlbc_mj.util.progress import note
 
 DEFAULT_OUT = Path("runs/study")
 
@@ -18,20 +20,21 @@ DEFAULT_OUT = Path("runs/study")
 class StudyCommand:
     """Compare learners: MARLMS, its ablations and rivals, each on several seeds; the same command goes on where it stopped."""
 
-    variants: tuple[str, ...] = ()
+    variants: VariantNames = ()
     """Variants to train; all of them by default."""
     seeds: int = 5
     """Runs per variant, with seeds from 0 on."""
-    budget: int | None = None
+    budget: SomeCount = None
     """Mission steps per run; by default those of the preset `fast`."""
     workers: int = 2
     """Processes that share the runs, one thread each."""
-    out: Path | None = None
+    out: SomePath = None
     """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
-    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None
+    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
     """Only make table and figure again, from study.csv and curves.csv in this folder, there or in --out."""
-    set: tuple[str, ...] = ()
-    """Any setting of all runs, name=value, as for `marlbc train`."""
+    set: TrainingSettings = ()
+    """Any setting of all runs, as for `marlbc train`."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Train what is missing, then write and print the comparison; a stopped study compares what there is.
@@ -43,18 +46,18 @@ class StudyCommand:
         from marlbc_mj.studies.learners.trainings import LearnerStudy, compare_learners, failed_runs, train_learners
 
         if self.source is not None:
-            print(compare_learners(*read_study(self.source), self.out or self.source).text)
+            report = compare_learners(*read_study(self.source), self.out or self.source)
+            self.output.report(report.text, report.document)
             return
         from marlbc_mj.util.changes import with_settings
 
         adjust = partial(with_settings, settings=self.set)
         study = LearnerStudy(self.out or DEFAULT_OUT, self.variants, self.seeds, self.budget, adjust)
-        stopped = train_learners(study, self.workers, progress_lines())
-        text = study.report((), study.out).text
-        if text:
-            print(text)
+        stopped = train_learners(study, self.workers, self.output.lines())
+        report = study.report((), study.out)
+        self.output.report(report.text, report.document)
         if stopped:
-            print("marlbc: stopped, and every run saved; the same command goes on", file=sys.stderr)
+            note("stopped, and every run saved; the same command goes on")
             sys.exit(128 + stopped)
         failed = failed_runs(study)
         if failed:

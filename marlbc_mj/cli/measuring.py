@@ -1,4 +1,6 @@
-"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and what is behind it."""
+"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and where numbers come
+from.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -7,19 +9,29 @@ from typing import Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.benchmark import ScenarioOptions
-from marlbc_mj.cli.terminal import progress_bars, progress_lines
+from marlbc_mj.cli.choices import (
+    CalibratedNames,
+    ControllerName,
+    QuestionNames,
+    ScenarioName,
+    ScenarioNames,
+    SomePath,
+    SupervisorName,
+)
+from marlbc_mj.cli.output import ReportOptions
 
 
 @dataclass(frozen=True)
 class PerfCommand:
     """Measure this machine: bare mj_step, the closed loop, the Python loop, batches, an episode, a log."""
 
-    json: Path | None = None
-    """File for the figures."""
+    out: SomePath = None
+    """JSON file for the measurements."""
     rounds: int = 9
     """Rounds, each running every variant once; medians are reported."""
     overwrite: bool = False
     """Replace an existing file."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Measure, print, and write if asked."""
@@ -27,45 +39,45 @@ class PerfCommand:
         from marlbc_mj.studies.runner import run_jobs
         from marlbc_mj.util.files import check_target
 
-        if self.json is not None:
-            check_target(self.json, overwrite=self.overwrite)
-
+        if self.out is not None:
+            check_target(self.out, overwrite=self.overwrite)
         study = PerfStudy(self.rounds)
-        results = run_jobs(study, progress=progress_lines("measuring "))
-        print(study.report(results, None).text)
-        if self.json is not None:
-            study.report(results, self.json)
-            print(self.json)
+        results = run_jobs(study, progress=self.output.lines("measuring "))
+        self.output.report(study.report(results, None).text, study.gather(results))
+        if self.out is not None:
+            study.report(results, self.out)
+            self.output.say(self.out)
 
 
 @dataclass(frozen=True)
 class ScaleCommand:
     """Measure what a mission step costs per agent, and the memory of a world, for teams from 4 to 256 agents."""
 
-    out: Path | None = None
+    out: SomePath = None
     """Folder for scale.md, scale.json and figures/scale.{pdf,png}."""
     rounds: int = 7
     """Rounds, each running every size once; medians are reported."""
     overwrite: bool = False
     """Replace what is in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Measure, print the table, and write table and figure if asked."""
         from marlbc_mj.studies.scale import run_scale
 
-        done = run_scale(self.rounds, self.out, overwrite=self.overwrite, progress=progress_lines("measuring "))
-        print(done.report.text)
+        done = run_scale(self.rounds, self.out, overwrite=self.overwrite, progress=self.output.lines("measuring "))
+        self.output.report(done.report.text, done.report.document)
         if self.out is not None:
-            print(f"{self.out} holds table, figures and numbers")
+            self.output.say(f"{self.out} holds table, figures and numbers")
 
 
 @dataclass(frozen=True)
 class AblationCommand:
     """Measure what SORLC's basis, its gains and compensator, the reference mode, the avoidance and the substep are worth."""
 
-    study: tuple[str, ...] = ()
-    """Studies to run: basis, sweep, sorlc, reference, avoidance, substep; all of them by default."""
-    out: Path | None = None
+    study: QuestionNames = ()
+    """Studies to run; all of them by default."""
+    out: SomePath = None
     """Folder for ablation.md, ablation.csv and index.html."""
     workers: int = 1
     """Processes that share the jobs, or tasks of a SLURM array."""
@@ -73,19 +85,20 @@ class AblationCommand:
     """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     overwrite: bool = False
     """Replace what is in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Run the studies, print their tables, and write the page if asked."""
         from marlbc_mj.studies.ablation import run_ablation, select_questions
 
         questions = select_questions(self.study)
-        with progress_bars() as progress:
+        with self.output.progress() as told:
             done = run_ablation(
-                questions, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, progress=progress
+                questions, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, progress=told.progress
             )
-        print(done.report.text)
+        self.output.report(done.report.text, done.report.document)
         if self.out is not None:
-            print(f"{self.out / 'index.html'} shows it all")
+            self.output.say(f"{self.out / 'index.html'} shows it all")
 
 
 @dataclass(frozen=True)
@@ -95,11 +108,11 @@ class CommunicationCommand:
     Ranges are full, 2 and 1.2 distances between neighbors, delays 0, 0.1 and 0.3 s, losses 0, 20 and 50 %.
     """
 
-    missions: Positional[tuple[str, ...]] = ("gates", "corridor")
-    """Scenarios that draw layouts, see `marlbc list`, or .toml files."""
-    supervisor: str = "lookahead-distributed"
+    missions: Positional[ScenarioNames] = ("gates", "corridor")
+    """Scenarios that draw layouts."""
+    supervisor: SupervisorName = "lookahead-distributed"
     """Supervisor that is distributed."""
-    controller: str = "sorlc"
+    controller: ControllerName = "sorlc"
     """Controller it runs with."""
     seeds: int = 40
     """Number of held-out layouts."""
@@ -115,53 +128,56 @@ class CommunicationCommand:
     """Replace the results in the output folder."""
     shield: bool = False
     """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
-    options: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Fly all cases, write their numbers, and print the table."""
-        from marlbc_mj.report.table import to_markdown
+        from marlbc_mj.report.table import table_document, to_markdown
         from marlbc_mj.results.seeds import seed_range
         from marlbc_mj.scenarios import held_out
         from marlbc_mj.studies.communication import CommunicationStudy, agreement_table
         from marlbc_mj.studies.runner import counting, run_study
 
         if self.agreement:
-            print(to_markdown(agreement_table()))
+            table = agreement_table()
+            self.output.report(to_markdown(table), table_document(table))
             return
-        missions = tuple(held_out(self.options.build(name)) for name in self.missions)
+        missions = tuple(held_out(self.mission.build(name)) for name in self.missions)
         seeds = seed_range(self.seeds, self.seed)
         study = CommunicationStudy(missions, self.supervisor, seeds, self.controller, self.shield)
-        with progress_bars() as progress:
-            told = counting(study.jobs(), lambda job: job.scenario.name, progress)
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=told)
-        print(done.report.text)
-        print(f"{self.out / 'communication.csv'} holds the numbers")
+        with self.output.progress() as told:
+            ended = counting(study.jobs(), lambda job: job.scenario.name, told.progress)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=ended)
+        self.output.report(done.report.text, done.report.document)
+        self.output.say(f"{self.out / 'communication.csv'} holds the numbers")
 
 
 @dataclass(frozen=True)
 class CalibrateCommand:
     """Find the velocity gains that give Table 6's published maxima, and compare them with the shipped ones."""
 
-    controllers: tuple[str, ...] = ("finite-time", "fixed-time")
+    controllers: CalibratedNames = ("finite-time", "fixed-time")
     """Controllers to calibrate."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Search and print the table."""
         from marlbc_mj.studies.calibration import CalibrationStudy
         from marlbc_mj.studies.runner import run_study
 
-        with progress_bars() as progress:
-            done = run_study(CalibrationStudy(self.controllers), None, progress=progress)
-        print(done.report.text)
+        with self.output.progress() as told:
+            done = run_study(CalibrationStudy(self.controllers), None, progress=told.progress)
+        self.output.report(done.report.text, done.report.document)
 
 
 @dataclass(frozen=True)
 class OracleCommand:
     """Search the best safe switch times on the simulator, for the oracle supervisor; takes minutes."""
 
-    scenario: str = "paper"
+    scenario: ScenarioName = "paper"
     """Scenario."""
-    controller: str = "sorlc"
+    controller: ControllerName = "sorlc"
     """Controller that tracks the references."""
     seed: int = 0
     """Random seed of the schedule search."""
@@ -169,8 +185,9 @@ class OracleCommand:
     """Episodes that may be simulated."""
     threads: int = 2
     """Threads that share the worlds."""
-    out: Path | None = None
+    out: SomePath = None
     """Cache to add the schedule to; the one that comes with the package by default."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Search, save, and say what was found."""
@@ -178,14 +195,15 @@ class OracleCommand:
         from marlbc_mj.supervisors.oracle import save_schedule, search
 
         scenario = make_scenario(self.scenario)
-        with progress_bars() as progress:
+        with self.output.progress() as told:
             found = search(
                 scenario,
                 self.controller,
                 seed=self.seed,
                 budget=self.budget,
                 threads=self.threads,
-                progress=lambda done, total: progress("search", done, self.budget),
+                progress=lambda done, total: told.progress("search", done, self.budget),
             )
         save_schedule(found, scenario, self.controller, self.out)
-        print(f"return {found.total:.0f} after {found.episodes} episodes (scripted: {found.scripted})")
+        text = f"return {found.total:.0f} after {found.episodes} episodes (schedule of the scenario: {found.scripted})"
+        self.output.report(text, {"return": found.total, "episodes": found.episodes, "scripted": found.scripted})

@@ -1,19 +1,19 @@
-"""From arguments to a command: tyro parses, and what it refuses is said in one line."""
+"""From arguments to a command: tyro parses, and what it refuses is said in one line.
+
+Words that choose a command are looked up here, so that only the parser of that command is made.
+"""
 
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import is_dataclass
-from difflib import SequenceMatcher
+from dataclasses import fields, is_dataclass
 from typing import Any, NamedTuple, get_args, get_type_hints
 
 import tyro
-from tyro.conf import Positional
+from tyro.conf import FlagCreatePairsOff, Positional
 
-from marlbc_mj.util.text import one_line
-
-ALIKE = 0.8  # likeness from which an option is suggested
-MOST_SUGGESTED = 3
+from marlbc_mj.cli.choices import WrongWord
+from marlbc_mj.util.text import nearest_word, one_line
 
 
 class Refusal(NamedTuple):
@@ -21,6 +21,14 @@ class Refusal(NamedTuple):
 
     said: str
     command: str
+
+
+class Chosen(NamedTuple):
+    """A command, or a union of them, and what is left of the arguments."""
+
+    kind: Any
+    prog: str
+    rest: list[str]
 
 
 def parse(commands: Any, arguments: Sequence[str] | None, *, prog: str, description: str) -> Any:
@@ -34,22 +42,62 @@ def parse(commands: Any, arguments: Sequence[str] | None, *, prog: str, descript
         arguments: of the command line; None: those of this process.
         prog: name of the program.
         description: first line of the help.
+
+    Raises:
+        ConfigurationError: a word that means nothing here.
     """
-    given = sys.argv[1:] if arguments is None else list(arguments)
+    chosen = choose_command(commands, sys.argv[1:] if arguments is None else list(arguments), prog)
+    refusal = _refused_word(chosen)
+    if refusal is not None:
+        _exit(prog, refusal)
 
     def refuse(event: Any) -> None:
-        refusal = _refusal(event, commands, given)
+        refusal = _refusal(event, chosen.kind)
         if refusal is not None:
-            print(f"{prog}: {one_line(refusal.said)}; see `{refusal.command} --help`", file=sys.stderr)
-            sys.exit(2)
+            _exit(prog, refusal)
 
     hook = getattr(getattr(tyro, "_errors", None), "on_parse_error", None)
-    with nullcontext() if hook is None else hook(refuse):
-        return tyro.cli(commands, prog=prog, description=description, args=given)
+    about = description if chosen.kind is commands else None
+    try:
+        with nullcontext() if hook is None else hook(refuse):
+            return _of_tyro(chosen, about)
+    except WrongWord as wrong:
+        raise wrong.error from None
 
 
-def _refusal(event: Any, commands: Any, given: Sequence[str]) -> Refusal | None:
-    """The event in words; None for a kind that is not known here."""
+def _of_tyro(chosen: Chosen, description: str | None) -> Any:
+    return tyro.cli(chosen.kind, prog=chosen.prog, description=description, args=chosen.rest, config=(FlagCreatePairsOff,))
+
+
+def choose_command(commands: Any, given: list[str], prog: str) -> Chosen:
+    """The command that the first words name."""
+    chosen = Chosen(commands, prog, given)
+    while chosen.rest and (known := subcommands_of(chosen.kind)) and chosen.rest[0] in known:
+        word, *rest = chosen.rest
+        chosen = Chosen(known[word], f"{chosen.prog} {word}", rest)
+    return chosen
+
+
+def _refused_word(chosen: Chosen) -> Refusal | None:
+    """What is wrong where a command is still to be named; None where nothing is, or where tyro is to say it."""
+    known = subcommands_of(chosen.kind)
+    if not known or (chosen.rest and chosen.rest[0].startswith("-")):
+        return None
+    listed = ", ".join(known)
+    if not chosen.rest:
+        return Refusal(f"Expected one of {{{listed}}}", chosen.prog)
+    like = nearest_word(chosen.rest[0], known)
+    perhaps = f" perhaps {like!r};" if like else ""
+    return Refusal(f"unknown command {chosen.rest[0]!r};{perhaps} choose from: {listed}", chosen.prog)
+
+
+def _exit(prog: str, refusal: Refusal) -> None:
+    print(f"{prog}: {one_line(refusal.said)}; see `{refusal.command} --help`", file=sys.stderr)
+    sys.exit(2)
+
+
+def _refusal(event: Any, kind: Any) -> Refusal | None:
+    """The event in words; None for a kind of event that is not known here."""
     match type(event).__name__:
         case "MissingSubcommand":
             said = f"Expected one of {{{', '.join(event.subcommand_spec.parser_from_name)}}}"
@@ -60,11 +108,15 @@ def _refusal(event: Any, commands: Any, given: Sequence[str]) -> Refusal | None:
         case "BadValue" if event.reason == "too_few_values":
             said = f"Missing value for argument {_name(event.argument)!r}. Expected {event.argument.lowered.nargs} values"
         case "InvalidChoice":
-            said = f"invalid choice {event.value!r} for argument {_name(event.argument)!r}. Expected one of {event.choices}"
+            like = nearest_word(str(event.value), map(str, event.choices))
+            perhaps = f"; perhaps {like!r}" if like else ""
+            said = (
+                f"invalid choice {event.value!r} for argument {_name(event.argument)!r}{perhaps}. Expected one of {event.choices}"
+            )
         case "InstantiationFailure" if event.argument is not None:
             said = f"Error parsing {_name(event.argument)}: {event.message}"
         case "UnrecognizedArgs":
-            said = f"Unrecognized options: {', '.join(event.tokens)}{_suggestion(event.tokens, commands, given)}"
+            said = f"Unrecognized options: {', '.join(event.tokens)}{_suggestion(event.tokens, kind)}"
         case _:
             return None
     return Refusal(said, event.prog)
@@ -75,20 +127,12 @@ def _name(argument: Any) -> str:
     return str(argument.display_name()).rpartition(".")[2]
 
 
-def _suggestion(tokens: Sequence[str], commands: Any, given: Sequence[str]) -> str:
-    """The subcommands where none has been chosen, and options that are spelled like an unknown one."""
-    level = subcommands_of(commands)
-    for word in given:
-        if word not in level:
-            break
-        level = subcommands_of(level[word])
-    listed = f"; Available subcommands: {', '.join(level)}" if level else ""
-    unknown = [token for token in tokens if token.startswith("--")]
-    scores = {
-        name: max(SequenceMatcher(a=token, b=name).ratio() for token in unknown) for name in options_of(commands) if unknown
-    }
-    close = sorted((name for name in scores if scores[name] >= ALIKE), key=lambda name: (-scores[name], name))
-    return listed + (f"; perhaps {', '.join(close[:MOST_SUGGESTED])}" if close else "")
+def _suggestion(tokens: Sequence[str], kind: Any) -> str:
+    """Options of the command that are spelled like unknown ones."""
+    known = list(dict.fromkeys(options_of(kind)))
+    like = [nearest_word(token.partition("=")[0], known) for token in tokens if token.startswith("--")]
+    found = list(dict.fromkeys(name for name in like if name is not None))
+    return f"; perhaps {', '.join(found)}" if found else ""
 
 
 def subcommands_of(kind: Any) -> dict[str, Any]:
@@ -106,6 +150,7 @@ def options_of(kind: Any) -> Iterator[str]:
         yield from options_of(command)
     if not is_dataclass(kind):
         return
+    defaults = {each.name: each.default for each in fields(kind)}
     for name, hint in get_type_hints(kind, include_extras=True).items():  # Annotated[kind, mark, ...] or a kind
         inner, *marks = get_args(hint) or (hint,)
         if is_dataclass(inner):
@@ -113,7 +158,7 @@ def options_of(kind: Any) -> Iterator[str]:
         elif name != "action" and _POSITIONAL not in marks:
             renamed = [mark.name for mark in marks if isinstance(getattr(mark, "name", None), str)]
             spelled = (renamed or [name])[0].replace("_", "-")
-            yield from (f"--{spelled}", f"--no-{spelled}") if inner is bool else (f"--{spelled}",)
+            yield f"--no-{spelled}" if inner is bool and defaults[name] is True else f"--{spelled}"
 
 
 _POSITIONAL = get_args(Positional[int])[1]

@@ -1,69 +1,71 @@
 """``marlbc video``, ``view`` and ``log``: what is made from an MCAP log."""
 
-import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.cli.choices import ExistingPath, SomeNumber, SomePath
+from marlbc_mj.cli.output import OutputOptions, ReportOptions
+from marlbc_mj.util.progress import note
 
 
 @dataclass(frozen=True)
 class VideoCommand:
-    """Render a video from a log, off-screen."""
+    """Render a video from a log, off-screen: .mp4, .webp or .gif."""
 
-    log: Positional[Path]
+    log: Positional[ExistingPath]
     """MCAP log."""
-    out: Path | None = None
-    """Video file; the log's name with .mp4 by default."""
+    out: SomePath = None
+    """Video file, whose ending chooses the format; the log's name with .mp4 by default."""
     speed: float = 4.0
     """Mission seconds per video second."""
     fps: int = 30
     """Frames per second."""
     camera: str = "track"
-    """Camera: track or top."""
-    start: float | None = None
+    """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one of the model."""
+    start: SomeNumber = None
     """First mission time shown [s]."""
-    end: float | None = None
+    end: SomeNumber = None
     """Last mission time shown [s]."""
-    width: int = 1280
-    """Picture width [pixel]."""
-    height: int = 720
-    """Picture height [pixel]."""
+    size: str = "1280x720"
+    """Width and height [pixel]."""
     samples: int = 0
     """Multisampling of edges: 0 is fast, 4 is smoother and takes about twice as long."""
     overwrite: bool = False
     """Replace an existing file."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Render, with progress; the backend is named once there is a first frame."""
         from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
-        from marlbc_mj.recording.video import VideoStyle, render_video
+        from marlbc_mj.recording.video import VideoStyle, parse_size, render_video
 
         out = self.out or self.log.with_suffix(".mp4")
-        with progress_bars() as progress:
+        given = {each.name: getattr(self, each.name) for each in fields(VideoStyle)}
+        style = VideoStyle(**{**given, "size": parse_size(self.size)})
+        with self.output.progress(ends=False) as told:
 
             def show(done: int, total: int) -> None:
                 if done == 1:
-                    print(f"marlbc: off-screen rendering with {choose_gl()}", file=sys.stderr)
-                progress("video", done, total)
+                    note(f"off-screen rendering with {choose_gl()}")
+                told.progress("video", done, total)
 
-            style = VideoStyle(**{field.name: getattr(self, field.name) for field in fields(VideoStyle)})
             render_video(read_log(self.log), out, style, overwrite=self.overwrite, progress=show)
-        print(out)
+        self.output.say(out)
 
 
 @dataclass(frozen=True)
 class ViewCommand:
     """Play a log in MuJoCo's interactive viewer."""
 
-    log: Positional[Path]
+    log: Positional[ExistingPath]
     """MCAP log."""
     speed: float = 4.0
     """Mission seconds per second."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Open the viewer; needs a display."""
@@ -75,61 +77,68 @@ class ViewCommand:
 
 @dataclass(frozen=True)
 class LogInfoCommand:
-    """Say what a log holds."""
+    """Say what a log holds, as JSON."""
 
-    log: Positional[Path]
+    log: Positional[ExistingPath]
     """MCAP log."""
+    metrics: bool = False
+    """Its metrics, computed again from every substep, instead."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Metadata, topics, attachments."""
+        """Metadata, topics, attachments; or metrics."""
         import json
 
-        from marlbc_mj.recording.reader import log_info
+        from marlbc_mj.recording.reader import log_info, read_log
+        from marlbc_mj.results.metrics import measure
 
-        print(json.dumps(log_info(self.log), indent=2))
+        found = measure(read_log(self.log)) if self.metrics else log_info(self.log)
+        self.output.report(json.dumps(found, indent=2), found)
 
 
 @dataclass(frozen=True)
 class LogRecoverCommand:
     """Salvage a log that was torn: all whole chunks of it."""
 
-    log: Positional[Path]
+    log: Positional[ExistingPath]
     """The torn file, *.mcap.partial for example."""
     out: Positional[Path]
     """Where the salvaged log goes."""
     overwrite: bool = False
     """Replace an existing file."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Recover and count."""
         from marlbc_mj.recording.reader import recover_log
 
         saved = recover_log(self.log, self.out, overwrite=self.overwrite)
-        print(f"{self.out}: {saved} messages")
+        self.output.say(f"{self.out}: {saved} messages")
 
 
 @dataclass(frozen=True)
 class LogExportCommand:
-    """Write a log as .csv (a row per mission step and agent), .npz (arrays) or .rrd (for Rerun)."""
+    """Write a log as a table, a row per mission step and agent (.csv, .jsonl, .parquet), as arrays (.npz) or for Rerun (.rrd)."""
 
-    log: Positional[Path]
+    log: Positional[ExistingPath]
     """MCAP log."""
     out: Positional[Path]
     """File to write; its ending chooses the format."""
     overwrite: bool = False
     """Replace an existing file."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Export."""
-        from marlbc_mj.recording.reader import export_log
+        from marlbc_mj.recording.exports import export_log
 
         export_log(self.log, self.out, overwrite=self.overwrite)
-        print(self.out)
+        self.output.say(self.out)
 
 
 @dataclass(frozen=True)
 class LogCommand:
-    """Look into, salvage or convert MCAP logs."""
+    """Inspect, salvage or convert MCAP logs."""
 
     action: OmitSubcommandPrefixes[
         Annotated[LogInfoCommand, subcommand("info")]
@@ -138,5 +147,5 @@ class LogCommand:
     ]
 
     def run(self) -> None:
-        """Hand over to the action."""
+        """Run the chosen subcommand."""
         self.action.run()

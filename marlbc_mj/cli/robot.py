@@ -1,31 +1,34 @@
-"""``marlbc robot check`` and ``gate``: a robot tried out, and every robot on its mission."""
+"""``marlbc robot check`` and ``gate``: check one robot, or fly robots through their gate mission."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import OmitSubcommandPrefixes, Positional, subcommand
+from tyro.conf import OmitArgPrefixes, OmitSubcommandPrefixes, Positional, subcommand
 
-from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.cli.choices import GateControllerName, GateSupervisorNames, RobotName, RobotNames
+from marlbc_mj.cli.output import ReportOptions
 
 
 @dataclass(frozen=True)
 class RobotCheckCommand:
     """Go through the checklist of a robot; exit status 1 if something fails."""
 
-    file: Positional[str]
-    """A robot's MJCF (.xml), Python file (.py, or .py:NAME), menagerie:FOLDER/FILE.xml, or a name from `marlbc list`."""
+    file: Positional[RobotName]
+    """A robot's MJCF, Python file, or name."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Print one line per check."""
         from marlbc_mj.studies.robot_check import checklist
 
-        failed = 0
+        items = []
         for item in checklist(self.file):
-            print(f"{'ok  ' if item.passed else 'FAIL'}  {item.name:<10}  {item.said}")
-            failed += not item.passed
-        if failed:
+            self.output.say(f"{'ok  ' if item.passed else 'FAIL'}  {item.name:<10}  {item.said}")
+            items.append(item)
+        self.output.report("", items)
+        if not all(item.passed for item in items):
             sys.exit(1)
 
 
@@ -33,12 +36,12 @@ class RobotCheckCommand:
 class RobotGateCommand:
     """Fly the gate mission, scaled to each robot, under scripted, FSAMS with hysteresis and MPCMS: a table, stills and clips."""
 
-    robots: tuple[str, ...] = ()
-    """Robots, by name or path; all of them but the point mass by default."""
-    supervisors: tuple[str, ...] = ("scripted", "fsams-hysteresis", "mpcms")
+    robots: RobotNames = ()
+    """Robots; all but the point mass by default."""
+    supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms")
     """Supervisors; the first one's episodes are shown."""
-    controller: str = "pd"
-    """Controller with the robot's gains: pd or sorlc-scaled."""
+    controller: GateControllerName = "pd"
+    """Controller, with the robot's gains."""
     out: Path = Path("out/robots")
     """Folder of gate.md, gate.json, PNG and MP4."""
     clips: bool = True
@@ -49,6 +52,7 @@ class RobotGateCommand:
     """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
     overwrite: bool = False
     """Replace what is in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Fly, write, and print the table.
@@ -58,7 +62,7 @@ class RobotGateCommand:
         """
         from marlbc_mj.studies.robot_gate import SHOWN, run_gates
 
-        with progress_bars() as progress:
+        with self.output.progress() as told:
             done = run_gates(
                 self.robots or SHOWN,
                 self.supervisors,
@@ -68,9 +72,9 @@ class RobotGateCommand:
                 overwrite=self.overwrite,
                 workers=self.workers,
                 engine=self.engine,
-                progress=progress,
+                progress=told.progress,
             )
-        print(done.report.text)
+        self.output.report(done.report.text, done.report.document)
         if any(row.failure for row in done.results):
             sys.exit(3)
 
@@ -84,5 +88,5 @@ class RobotCommand:
     ]
 
     def run(self) -> None:
-        """Hand over to the action."""
+        """Run the chosen subcommand."""
         self.action.run()

@@ -1,9 +1,11 @@
-"""``marlbc ship``: make a training run's best checkpoint one that comes with the package."""
+"""``marlbc ship``: copy a training run's best checkpoint into the package."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
+
+from marlbc_mj.cli.output import OutputOptions
 
 
 @dataclass(frozen=True)
@@ -15,7 +17,8 @@ class ShipCommand:
     name: Positional[str]
     """Name that the supervisor gets: marlms, rlms, marlms-general."""
     overwrite: bool = False
-    """Replace the one that is there."""
+    """Replace an existing checkpoint."""
+    output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
         """Copy, write the card, say where."""
@@ -25,4 +28,4 @@ class ShipCommand:
 
         best = self.run_folder / "checkpoint" / "best.safetensors"
         put = ship_general if is_general(best) else ship
-        print(put(self.run_folder, self.name, overwrite=self.overwrite))
+        self.output.say(put(self.run_folder, self.name, overwrite=self.overwrite))

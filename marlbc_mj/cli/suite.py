@@ -1,13 +1,14 @@
 """``marlbc suite``: supervisors and controllers on a fixed set of missions, and the leaderboard."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from tyro.conf import arg
+from tyro.conf import OmitArgPrefixes, arg
 
-from marlbc_mj.cli.terminal import progress_bars
+from marlbc_mj.cli.choices import SomeCompositions, SomeControllers, SomeCount, SomeSupervisors, SuiteMissionNames, TrackNames
+from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -22,23 +23,23 @@ class SuiteCommand:
     control compares controllers under one schedule. The whole suite takes days of one core: begin with --quick.
     """
 
-    track: tuple[str, ...] = ()
+    track: TrackNames = ()
     """Tracks to fly; all by default, paper, families and control with --quick."""
-    missions: tuple[str, ...] = ()
+    missions: SuiteMissionNames = ()
     """Missions of these tracks to fly; all by default."""
-    supervisors: tuple[str, ...] | None = None
-    """Supervisors to fly, FILE.py:NAME, or paths of checkpoints; all but mpcms-mujoco by default, and no search with --quick."""
-    controllers: tuple[str, ...] | None = None
-    """Controllers of the track control, or FILE.py:NAME; all by default."""
-    compositions: tuple[str, ...] | None = None
-    """Compositions for every supervisor: null-space, set-based; by default those that each is meant for."""
+    supervisors: SomeSupervisors = None
+    """Supervisors to fly; all but mpcms-mujoco by default, and no search with --quick."""
+    controllers: SomeControllers = None
+    """Controllers of the track control; all by default."""
+    compositions: SomeCompositions = None
+    """Compositions for every supervisor; by default those that each is meant for."""
     shield: bool = False
     """Fly every method with a shield as well."""
     quick: bool = False
     """The first 50 layouts of every mission, without supervisors that search."""
-    layouts: int | None = None
+    layouts: SomeCount = None
     """The first so many layouts of every mission."""
-    source: Annotated[Path | None, arg(name="from")] = None
+    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
     """Folder of results of the suite whose rows stand beside those that are flown."""
     page: bool = False
     """Fly nothing: write the page of the results in --from."""
@@ -52,6 +53,7 @@ class SuiteCommand:
     """Folder of suite.json, a CSV file per track, leaderboard.html and leaderboard.tex."""
     overwrite: bool = False
     """Replace the results in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Fly, then print the first tables and say where the page is."""
@@ -59,21 +61,21 @@ class SuiteCommand:
         from marlbc_mj.studies.runner import counting, run_study
 
         study = self.study()
-        with progress_bars() as progress:
-            ended = counting(study.jobs(), lambda job: job.track, progress)
+        with self.output.progress() as told:
+            ended = counting(study.jobs(), lambda job: job.track, told.progress)
             done = run_study(
                 study,
                 self.out,
                 overwrite=self.overwrite,
                 workers=self.workers,
                 engine=self.engine,
-                progress=progress,
+                progress=told.progress,
                 ended=ended,
             )
-        print(done.report.text)
+        self.output.report(done.report.text, done.report.document)
         for problem in done.report.problems:
             print(f"marlbc: {problem}", file=sys.stderr)
-        print(f"{self.out / LEADERBOARD_PAGE} shows it all")
+        self.output.say(f"{self.out / LEADERBOARD_PAGE} shows it all")
 
     def study(self) -> "SuiteStudy":
         """What is to be flown.

@@ -5,10 +5,12 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.progress import Progress
+from marlbc_mj.util.method_names import display_key
+from marlbc_mj.util.progress import Progress, note
+from marlbc_mj.util.text import one_line
 
 SELDOM = 60.0  # where there is no terminal [s]
 LEAST_WIDTH = 112  # least width of the table of results [characters]
@@ -33,21 +35,25 @@ def prepare_gl(strict: bool) -> None:
         if strict:
             raise
         if not switched_off():
-            print(f"marlbc: {error}; going on without it", file=sys.stderr)
+            note(f"{error}; going on without it")
         os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with another, MuJoCo itself could not be imported
 
 
-def suggest_cache() -> None:
-    """Say where compiled code could be kept, if this command has compiled some that it could not keep."""
-    compiling = sys.modules.get("marlbc_mj.core.compiling")  # not imported for this: most commands compile nothing
-    if compiling is not None and compiling.compiled_in_vain():
-        said = "compiled code cannot be kept here and is compiled by every command; set NUMBA_CACHE_DIR to a folder to write into"
-        print(f"marlbc: {said}", file=sys.stderr)
+class Told(NamedTuple):
+    """Callbacks by which a command reports its progress."""
+
+    progress: Progress
+    line: Callable[[str], None]
+    """Says one line, above the bars where there are any."""
 
 
 @contextmanager
-def progress_bars() -> Iterator[Progress]:
-    """A bar per stage, with rate and time left, on a terminal; elsewhere a line now and then of work that takes minutes."""
+def progress_bars(*, ends: bool = True) -> Iterator[Told]:
+    """A bar per stage, with rate and time left, on a terminal; elsewhere lines.
+
+    Args:
+        ends: whether a line says that a stage has ended, where there is no terminal.
+    """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -61,35 +67,51 @@ def progress_bars() -> Iterator[Progress]:
     )
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield seldom()
+        yield Told(seldom(ends=ends), lambda line: print(line, file=sys.stderr, flush=True))
         return
     with Progress(*columns, console=console) as bars:
         tasks: dict[str, Any] = {}
 
         def update(what: str, done: float, total: float) -> None:
             if what not in tasks:
-                tasks[what] = bars.add_task(what, total=total, completed=int(done), rate="")  # what was done before has no rate
+                tasks[what] = bars.add_task(
+                    display_key(what), total=total, completed=int(done), rate=""
+                )  # what was done before has no rate
             task = bars.tasks[tasks[what]]
             rate = f"{task.finished_speed or task.speed or 0.0:.3g} /s"
             bars.update(tasks[what], completed=done, total=total, rate=rate)
 
-        yield update
+        yield Told(update, lambda line: console.print(line, highlight=False, markup=False))
 
 
-def seldom(every: float = SELDOM) -> Progress:
-    """A line on the stage that is told of, with its rate and the time left, at most every so many seconds."""
+def seldom(every: float = SELDOM, *, ends: bool = True) -> Progress:
+    """A line when a stage has ended, and on the stage that is told of, with its rate and the time left, now and then.
+
+    Args:
+        every: least time between two lines on stages that have not ended [s].
+        ends: whether ends are told.
+    """
     began: dict[str, tuple[float, float]] = {}
+    ended: set[str] = set()
     last = monotonic()
 
     def tell(what: str, done: float, total: float) -> None:
         nonlocal last
         now = monotonic()
         start, before = began.setdefault(what, (now, done))
-        if now < last + every or done <= before:
+        if ends and total > 1 and done >= total and what not in ended:
+            ended.add(what)
+            print(f"{display_key(what)}: {done:g} of {total:g} in {now - start:.1f} s", file=sys.stderr, flush=True)
+            return
+        if now < last + every or done <= before or what in ended:
             return
         last = now
         rate = (done - before) / (now - start)
-        print(f"{what}: {done:g} of {total:g}, {rate:.3g} /s, {(total - done) / rate:.0f} s left", file=sys.stderr, flush=True)
+        print(
+            f"{display_key(what)}: {done:g} of {total:g}, {rate:.3g} /s, {(total - done) / rate:.0f} s left",
+            file=sys.stderr,
+            flush=True,
+        )
 
     return tell
 
@@ -103,8 +125,31 @@ def progress_lines(before: str = "") -> Progress:
     return tell
 
 
+def result_line(result: Any, ended: int, total: int) -> str:
+    """One method of ``total`` that has ended (:class:`~marlbc_mj.results.summary.Result`), in one line."""
+    from marlbc_mj.report.formats import score_cell
+    from marlbc_mj.results.scores import switches_text
+
+    if result.metrics is None:
+        return f"{ended}/{total}  {result.display}: failed: {one_line(result.failure)}"
+    said = f"return {score_cell('return', result.metrics)}, switches {switches_text(result.metrics)}"
+    violation = f"violation of the worst agent {score_cell('violation_time_worst', result.metrics)} s"
+    return f"{ended}/{total}  {result.display}: {said}, {violation}"
+
+
 def print_results(results: list[Any]) -> None:
-    """A table with one line per method (:class:`~marlbc_mj.results.summary.Result`), and why a method failed."""
+    """Supervisors, then controllers (:class:`~marlbc_mj.results.summary.Result`), one line each, and why a method failed."""
+    from marlbc_mj.report.method_groups import method_groups
+
+    for group in method_groups(results, lambda result: (result.supervisor, result.controller)):
+        _print_group(group)
+    for result in results:
+        if result.failure is not None:
+            print(f"{result.display} failed: {result.failure}")
+
+
+def _print_group(group: Any) -> None:
+    """A table of methods that differ in one part (:class:`~marlbc_mj.report.method_groups.MethodGroup`)."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
@@ -116,18 +161,16 @@ def print_results(results: list[Any]) -> None:
     columns = [score_column(name) for name in shown]
     heads = [f"{column.group}\n{column.second}" for column in columns]
     heads.insert(1, "switches\neach agent")
-    table = Table(*(Column(Text(head), no_wrap=True) for head in ("method", *heads)))  # Text: [m] is no markup
-    for result in results:
+    first_head = Text(f"{group.kind}\n{group.words}")  # Text: [m] is no markup
+    table = Table(*(Column(head, no_wrap=True) for head in (first_head, *map(Text, heads))))
+    for name, result in group.rows:
         if result.metrics is None:
-            table.add_row(result.key, "failed")
+            table.add_row(Text(name), "failed")
             continue
-        first, *others = (score_cell(name, result.metrics) for name in shown)
-        table.add_row(result.key, first, switches_text(result.metrics), *others)
+        first, *others = (score_cell(score, result.metrics) for score in shown)
+        table.add_row(Text(name), first, switches_text(result.metrics), *others)
     console = Console()
     Console(width=max(console.width, LEAST_WIDTH)).print(table)
-    for result in results:
-        if result.failure is not None:
-            print(f"{result.key} failed: {result.failure}")
 
 
 @contextmanager
@@ -160,6 +203,10 @@ def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
             bars.update(task, completed=trainer.steps, total=trainer.config.budget, rate=rate, last=last)
 
         yield update
+
+
+def no_display(trainer: Any, row: dict[str, float]) -> None:
+    """The display of a training run that shows nothing."""
 
 
 @contextmanager

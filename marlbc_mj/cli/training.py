@@ -1,54 +1,59 @@
-"""``marlbc train``: learn a mission supervisor, or go on learning."""
+"""``marlbc train``: train a mission supervisor, or resume a training."""
 
 import sys
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
-from tyro.conf import Positional
+from tyro.conf import OmitArgPrefixes, Positional
 
+from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings
+from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
     from marlbc_mj.training.config import TrainConfig
     from marlbc_mj.training.general.config import GeneralConfig
+    from marlbc_mj.training.run import Interrupted
 
 
 @dataclass(frozen=True)
 class TrainCommand:
     """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
 
-    method: Positional[str] = "marlms"
-    """What is learned, see `marlbc list`."""
-    preset: str = "fast"
-    """Hyper-parameters: fast, or paper for the published ones."""
+    method: Positional[MethodName] = "marlms"
+    """Training method."""
+    preset: PresetName = "fast"
+    """Hyper-parameters; those of paper are published."""
     seed: int = 0
     """Random seed of networks, exploration and starts."""
-    out: Path | None = None
+    out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
-    resume: Path | None = None
-    """Folder of a run that was interrupted: it goes on, bit for bit, with its own settings."""
-    budget: int | None = None
+    resume: SomePath = None
+    """Folder of an interrupted run, which continues bit for bit with its own settings."""
+    budget: SomeCount = None
     """Mission steps, over all worlds."""
-    threads: int | None = None
+    threads: SomeCount = None
     """Threads of simulation and networks."""
-    device: str | None = None
-    """Device of the networks: cpu or cuda."""
-    set: tuple[str, ...] = ()
-    """Any other setting of the preset, name=value: gamma=0.98 copies=1 shaping.margin=0.1."""
+    device: SomeDevice = None
+    """Device of the networks."""
+    set: TrainingSettings = ()
+    """Any other setting of the preset: gamma=0.98 copies=1 shaping.margin=0.1."""
     overwrite: bool = False
     """Write into a folder that is not empty."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
         """Train with a progress display; an interrupted run says how to continue it."""
         from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
         from marlbc_mj.training.general.config import GENERAL
+        from marlbc_mj.training.general.run import is_general_run
 
-        if self.method == GENERAL and self.resume is None:
+        if is_general_run(self.resume) if self.resume is not None else self.method == GENERAL:
             self.run_general()
             return
-        with training_display() as progress:
+        with self.output.display(training_display) as progress:
             if self.resume is not None:
                 self.refuse_others()
                 folder, ended = self.resume, run.resume(self.resume, progress=progress)
@@ -57,36 +62,40 @@ class TrainCommand:
                 folder = self.out or Path("runs") / f"{config.method}-{config.preset}-{config.seed}"
                 ended = run.train(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, run.Interrupted):
-            print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
-            sys.exit(128 + ended.signal)
+            say_how_to_go_on(folder, ended)
         best = max(ended, key=run.rank)
         switches = "/".join(f"{value:.0f}" for name, value in best.items() if name.startswith("switches_"))
-        print(
+        text = (
             f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps and {best['wall_s']:.0f} s: "
             f"return {best['return']:.0f}, switches {switches}, violation of the worst agent {best['violation_time']:.3f} s"
         )
-        print(f"{folder / 'checkpoint'} holds the best and the last policy")
+        self.output.report(text, best)
+        self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def run_general(self) -> None:
-        """Train the policy for every team; an interrupted run leaves the policy that it had."""
+        """Train the policy for every team; an interrupted run says how to continue it."""
         from marlbc_mj.cli.terminal import general_display
-        from marlbc_mj.training.general.run import judged_rank, train_general
+        from marlbc_mj.training.general.run import judged_rank, resume_general, train_general
         from marlbc_mj.training.run import Interrupted
 
-        config = self.general_config()
-        folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
-        with general_display() as progress:
-            ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
+        with self.output.display(general_display) as progress:
+            if self.resume is not None:
+                self.refuse_others()
+                folder, ended = self.resume, resume_general(self.resume, progress=progress)
+            else:
+                config = self.general_config()
+                folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
+                ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, Interrupted):
-            print(f"marlbc: stopped; {folder / 'checkpoint'} holds the best and the last policy so far", file=sys.stderr)
-            sys.exit(128 + ended.signal)
+            say_how_to_go_on(folder, ended)
         best = max(ended, key=judged_rank)
         rates = ", ".join(f"{k.removeprefix('success_')} {100 * v:.4g} %" for k, v in best.items() if k.startswith("success_"))
-        print(f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps: success {rates}")
-        print(f"{folder / 'checkpoint'} holds the best and the last policy")
+        text = f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps: success {rates}"
+        self.output.report(text, best)
+        self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def general_config(self) -> "GeneralConfig":
-        """The settings of the policy for every team, with the command line's changes.
+        """The settings of the general policy, with the command line's changes.
 
         Raises:
             ConfigurationError: an option that this method does not have.
@@ -105,7 +114,8 @@ class TrainCommand:
         Raises:
             ConfigurationError: anything else was given with --resume.
         """
-        given = [f.name for f in fields(self) if f.name != "resume" and getattr(self, f.name) != f.default]
+        settings = [f for f in fields(self) if f.name not in ("resume", "output")]
+        given = [f.name for f in settings if getattr(self, f.name) != f.default]
         if given:
             names = ", ".join(name if name == "method" else f"--{name}" for name in given)
             raise ConfigurationError(f"--resume continues a run in its folder with its own settings; leave out {names}")
@@ -123,3 +133,9 @@ class TrainCommand:
         changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **given}
         config = make_config(self.preset, **changes)
         return with_settings(config, self.set)
+
+
+def say_how_to_go_on(folder: Path, ended: "Interrupted") -> NoReturn:
+    """Leave with the status of the signal that interrupted a run."""
+    print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
+    sys.exit(128 + ended.signal)

@@ -1,6 +1,7 @@
 """An episode at mission rate, as it is written to and read back from a log."""
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,13 +13,37 @@ from marlbc_mj.engine.plan import make_mission, make_plan
 from marlbc_mj.engine.team import shield_counts
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import NO_POSE, Trajectory, body_poses
+from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Hearing
 
 NO_HEARING = Hearing(np.zeros((1, 0, 0), dtype=np.bool_), np.zeros((1, 0, 0)))
-"""Of one mission step in which agents did not talk, or all heard everything at once."""
+"""Hearing of one mission step without communication, or with ideal communication."""
 
 NO_SHIELD_ROWS = np.zeros((0, 2 + len(ASSUMPTIONS)))
-"""What a shield did in a team that has none."""
+"""Shield rows of a team without a shield."""
+
+
+class Course(NamedTuple):
+    """The fields of a scenario that metrics need, under the scenario's names."""
+
+    substep: float  # [s]
+    mission_step: float  # [s]
+    safe_distance: float  # [m]
+    force_limit: float  # of the scenario, finite also where the law is unlimited [N]
+    path_origin: tuple[float, float]  # [m]
+    path_velocity: tuple[float, float]  # [m/s]
+    formations: np.ndarray  # (2, N, 2) [m]
+
+
+class Substeps(NamedTuple):
+    """T substeps of an episode: the data that metrics need beyond the mission rate."""
+
+    course: Course
+    position: np.ndarray  # (T + 1, N, 2) [m]
+    velocity: np.ndarray  # (T, N, 2) [m/s]
+    reference: np.ndarray  # (T, N, 2) [m]
+    reference_velocity: np.ndarray  # (T, N, 2) [m/s]
+    force: np.ndarray  # (T, N, 2) [N]
 
 
 @dataclass(frozen=True)
@@ -56,6 +81,7 @@ class EpisodeLog:
     age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) of what agents know of each other [s]
     shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) by the end of each mission step, columns
     # as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
+    substeps: Substeps | None = None  # for metrics; None in a log that has none
 
     def intervened(self, step: int) -> np.ndarray:
         """(N,) bool: whose force or reference the shield changed in a mission step; (0,) without a shield."""
@@ -145,8 +171,24 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         decision_ms=trajectory.decision_ms,
         pose=trajectory.pose,
         shield=shield_rows(trajectory.shield, len(position)),
+        substeps=_substeps_of(trajectory),
         **hearing_columns(trajectory.hearing, len(position)),
     )
+
+
+def course_of(scenario: Scenario) -> Course:
+    """What metrics read of a scenario."""
+    return Course(*(getattr(scenario, name) for name in Course._fields))
+
+
+def _substeps_of(trajectory: Trajectory) -> Substeps:
+    rows = (trajectory.reference, trajectory.reference_velocity, trajectory.force)
+    return Substeps(course_of(trajectory.scenario), trajectory.position, trajectory.velocity[:-1], *rows)
+
+
+def shield_counts_of(rows: np.ndarray) -> ShieldCounts | None:
+    """Counts of M rows (M, N, 7); None of a team without a shield. The inverse of :func:`shield_rows`."""
+    return None if rows.shape[1] == 0 else ShieldCounts(rows[..., 0], rows[..., 1], rows[..., 2:])
 
 
 def shield_rows(counts: ShieldCounts | None, steps: int) -> np.ndarray:

@@ -1,13 +1,10 @@
-"""Reading MCAP logs: whole ones back into arrays, torn ones into whole ones, and both into other formats."""
+"""Reading MCAP logs: whole ones back into arrays, torn ones into whole ones."""
 
-import csv
-import io
 import json
 import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from os import SEEK_CUR
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -26,11 +23,10 @@ from mcap.writer import MCAP0_MAGIC, Writer
 
 from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.recording import schemas
-from marlbc_mj.recording.log import EpisodeLog, hearing_columns, shield_rows
-from marlbc_mj.recording.rerun_file import write_rerun
+from marlbc_mj.recording.log import Course, EpisodeLog, Substeps, hearing_columns, shield_rows
 from marlbc_mj.recording.writer import METADATA, MODEL
 from marlbc_mj.supervisors.communication import Hearing
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import staged_file
 
 _END = struct.Struct("<BQQQI8s")
@@ -41,7 +37,7 @@ _DAMAGE = (
     *(TypeError, AttributeError, IndexError, RecursionError, RuntimeError, EOFError),  # lz4 raises a bare RuntimeError
 )
 """What the mcap package, decompression and decoding raise on bytes that are not what they should be."""
-MOST_UNPACKED, MOST_CHUNK = 2**30, 2**26
+MOST_UNPACKED, MOST_CHUNK = 2**31, 2**26
 """Largest size of a log's decompressed chunks together, and of one [bytes]: twice what 256 agents leave in 100 s, and 60 times
 what the writer puts into one.
 """
@@ -58,7 +54,8 @@ def read_log(path: str | Path) -> EpisodeLog:
         model = next((a.data.decode() for a in reader.iter_attachments() if a.name == MODEL), None)
         if model is None:
             raise ConfigurationError(f"{path} has no attachment {MODEL}; it was damaged, or not written by marlbc")
-        columns = _columns(_messages(path, reader))
+        found = _messages(path, reader)
+        columns = _columns(found)
         log = EpisodeLog(
             scenario=metadata["scenario"],
             supervisor=metadata["supervisor"],
@@ -71,6 +68,7 @@ def read_log(path: str | Path) -> EpisodeLog:
             obstacles=np.array(json.loads(metadata["obstacles"]), dtype=np.float64).reshape(-1, 3),
             motions=np.array(json.loads(metadata.get("motions", "[]")), dtype=np.float64).reshape(-1, NUMBERS),
             mjcf=model,
+            substeps=_substeps(found, metadata, columns["position"].shape[1]),
             **columns,
         )
         _check_log(log)
@@ -185,22 +183,6 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
     return saved
 
 
-def export_log(path: str | Path, out: str | Path, overwrite: bool = False) -> None:
-    """Write a log as a table (``.csv``: one row a mission step and agent), as arrays (``.npz``: the fields of EpisodeLog), or for
-    Rerun (``.rrd``).
-
-    Raises:
-        ConfigurationError: an unknown suffix, a log that cannot be read, or an output that cannot or must not be written.
-    """
-    writers = {".csv": _write_csv, ".npz": _write_npz, ".rrd": write_rerun}
-    suffix = Path(out).suffix
-    if suffix not in writers:
-        raise unknown("export format", suffix or str(out), writers)
-    log = read_log(path)
-    with staged_file(Path(out), overwrite=overwrite) as staging, open(staging, "wb") as stream:
-        writers[suffix](log, stream)
-
-
 @contextmanager
 def _open_file(path: str | Path) -> Iterator[BinaryIO]:
     """A file that is an MCAP, whole or torn."""
@@ -282,7 +264,11 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
     """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
-    some = [topic for topic in (schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD) if topic.name in _topics_used(reader)]
+    some = [
+        topic
+        for topic in (schemas.SUBSTEP_ROWS, schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD)
+        if topic.name in _topics_used(reader)
+    ]
     found: dict[str, list[dict[str, Any]]] = {topic.name: [] for topic in (*schemas.REQUIRED, *some)}
     for _, channel, message in reader.iter_messages(topics=list(found), log_time_order=False):
         found[channel.topic].append(json.loads(message.data))
@@ -331,6 +317,31 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
         "shield": _shield_rows(found[shield.name]) if shield.name in found else shield_rows(None, steps),
         **hearing_columns(_hearing(found), steps),
     }
+
+
+def _substeps(found: dict[str, list[dict[str, Any]]], metadata: dict[str, str], agents: int) -> Substeps | None:
+    """All substeps; None in a log without."""
+    if schemas.SUBSTEP_ROWS.name not in found:
+        return None
+    moments = [schemas.decode_substeps(row, agents) for row in found[schemas.SUBSTEP_ROWS.name]]
+    positions, *others = (list(rows) for rows in zip(*moments, strict=True))
+    position = np.concatenate([*(rows[:-1] for rows in positions), positions[-1][-1:]])
+    return Substeps(_course(metadata, agents), position, *(np.concatenate(rows) for rows in others))
+
+
+def _course(metadata: dict[str, str], agents: int) -> Course:
+    """What metrics read of the scenario.
+
+    Raises:
+        ValueError: numbers that no scenario has.
+    """
+    numbers = {name: float(metadata[name]) for name in ("substep", "mission_step", "safe_distance", "scenario_force_limit")}
+    (x, y), (vx, vy) = np.array(json.loads(metadata["path"]), dtype=np.float64).reshape(2, 2).tolist()
+    formations = np.array(json.loads(metadata["slots"]), dtype=np.float64).reshape(2, agents, 2)
+    limit, given = numbers.pop("scenario_force_limit"), [*numbers.values(), x, y, vx, vy, *formations.ravel()]
+    if not min(*numbers.values(), limit) > 0 or not np.isfinite([*given, limit]).all():
+        raise ValueError("substep, safe_distance, force_limit, path or slots are no numbers of a scenario")
+    return Course(**numbers, force_limit=limit, path_origin=(x, y), path_velocity=(vx, vy), formations=formations)
 
 
 def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:
@@ -394,23 +405,3 @@ def _copy(records: Iterator[McapRecord], writer: Writer) -> int:
         elif isinstance(record, Attachment):
             writer.add_attachment(record.create_time, record.log_time, record.name, record.media_type, record.data)
     return saved
-
-
-def _write_csv(log: EpisodeLog, stream: BinaryIO) -> None:
-    text = io.TextIOWrapper(stream, encoding="utf-8", newline="")
-    table = csv.writer(text, lineterminator="\n")
-    pairs = ("position", "velocity", "reference", "reference_velocity", "force")
-    plane = [f"{name}_{axis}" for name in pairs for axis in ("x", "y")]
-    table.writerow(["time", "agent", *plane, "clearance", "command", "formation", "reward", "decision_ms"])
-    motion = np.concatenate([getattr(log, name) for name in pairs], axis=-1).tolist()
-    scalars = zip(log.formation.tolist(), log.reward.tolist(), log.decision_ms.tolist(), strict=True)
-    for k, (time, shared) in enumerate(zip(log.time.tolist(), scalars, strict=True)):
-        for i, numbers in enumerate(motion[k]):
-            command = log.commands[log.command[k, i]]
-            table.writerow([time, i + 1, *numbers, float(log.clearance[k, i]), command, *shared])
-    text.detach()
-
-
-def _write_npz(log: EpisodeLog, stream: BinaryIO) -> None:
-    arrays: dict[str, Any] = {field.name: np.asarray(getattr(log, field.name)) for field in fields(log)}
-    np.savez_compressed(stream, **arrays)

@@ -1,13 +1,14 @@
 """The JSON topics of a log: their fields, their JSON Schemas, and the compact encoding that is written at mission rate.
 
-Only what viewers understand is used: Foxglove's schema parser takes one plain type a field (no ``["number", "null"]``) and no
+Only what viewers understand is used: Foxglove's schema parser takes one plain type per field (no ``["number", "null"]``) and no
 arrays of arrays, PlotJuggler refuses a channel without a schema. Hence every topic is one object with scalars and a list
 ``agents`` of flat objects, and a number that is not finite is left out: JSON has neither NaN nor Infinity.
 """
 
+import base64
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ class MessageField(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """One JSON topic: scalars, and one row an agent."""
+    """One JSON topic: scalars, and one row per agent."""
 
     name: str
     schema_name: str
@@ -134,12 +135,22 @@ COMMUNICATION = Topic(
         "oldest": MessageField("number", "greatest of the ages [s]"),
     },
 )
-TOPICS = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, WEIGHTS, METRICS)
+SUBSTEP_ROWS = Topic(
+    "/substeps",
+    "marlbc.Substeps",
+    "position, velocity, reference, reference velocity and force of every substep of a mission step, for metrics",
+    {},
+    {
+        "substeps": MessageField("integer", "how many there are"),
+        "data": MessageField("string", "packed numbers, see encode_substeps"),
+    },
+)
+TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEP_ROWS, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
 """Topics without which a log cannot be read back; the weights are there for SORLC only.
 
-Robots with a free joint have ``POSE`` too, teams with a shield ``SHIELD``, and those whose communication is not ideal
-``COMMUNICATION``.
+Logs have ``SUBSTEP_ROWS``, robots with a free joint ``POSE``, teams with a shield ``SHIELD``, and those whose communication is
+not ideal ``COMMUNICATION``.
 """
 
 
@@ -210,6 +221,41 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
     return Hearing(link, age)
 
 
+def encode_substeps(rows: Sequence[np.ndarray], after: np.ndarray) -> bytes:
+    """A message on ``SUBSTEP_ROWS``.
+
+    Its data are little-endian doubles: positions, with those at the end of the mission step behind them, velocities, references,
+    reference velocities and forces; of each, agent by agent and axis by axis, all substeps. They are sorted by their bytes, first
+    bytes first, since neighbors have most of them in common, and written in base64.
+
+    Args:
+        rows: the five, (substeps, N, 2) each.
+        after: position at the end of the mission step (N, 2) [m].
+    """
+    position, *others = rows
+    tracks = [np.concatenate([position, after[None]]), *others]
+    numbers = np.concatenate([track.transpose(1, 2, 0).ravel() for track in tracks]).astype("<f8")
+    packed = np.ascontiguousarray(numbers.view(np.uint8).reshape(-1, 8).T)
+    scalars = [f'"substeps":{len(position)}', f'"data":"{base64.b64encode(packed.data).decode()}"']
+    return message(scalars, "")
+
+
+def decode_substeps(row: Mapping[str, Any], agents: int) -> list[np.ndarray]:
+    """What :func:`encode_substeps` packed of ``agents``: positions (substeps + 1, N, 2), then the others (substeps, N, 2).
+
+    Raises:
+        ValueError: data that it does not write.
+    """
+    packed = np.frombuffer(base64.b64decode(row["data"], validate=True), np.uint8).reshape(8, -1)
+    numbers = np.ascontiguousarray(packed.T).view("<f8").ravel()
+    steps = int(row["substeps"])
+    ends = np.cumsum([2 * agents * (steps + 1), *[2 * agents * steps] * 4])
+    if len(numbers) != ends[-1] or not np.isfinite(numbers).all():
+        raise ValueError(f"{len(numbers)} numbers of {steps} substeps of {agents} agents, or not finite ones")
+    tracks = np.split(numbers, ends[:-1])
+    return [np.ascontiguousarray(track.reshape(agents, 2, -1).transpose(2, 0, 1)) for track in tracks]
+
+
 def message(scalars: list[str], rows: str) -> bytes:
     """A whole message from encoded scalars and encoded rows."""
     return ("{" + ",".join([*scalars, f'"agents":[{rows}]']) + "}").encode()
@@ -217,6 +263,6 @@ def message(scalars: list[str], rows: str) -> bytes:
 
 @cache
 def _template(columns: tuple[str, ...], agents: int) -> str:
-    """A %-template is several times faster than ``json.dumps``, which matters at eight messages a mission step."""
+    """A %-template is several times faster than ``json.dumps``, which matters at eight messages per mission step."""
     row = "{" + ",".join(f'"{name}":%r' for name in columns) + "}"
     return ",".join([row] * agents)

@@ -201,6 +201,7 @@ class LogWriter:
         reference = np.concatenate([first.reference, first.reference_velocity], axis=1)
         yield "/reference", schemas.encode(schemas.REFERENCE, reference)
         yield "/force", schemas.encode(schemas.FORCE, first.force)
+        yield schemas.SUBSTEP_ROWS.name, schemas.encode_substeps(frame.record, frame.after)
         yield "/priorities", schemas.message([], ",".join([self._rows[k] for k in frame.command.tolist()]))
         if self._posed:
             yield schemas.POSE.name, schemas.encode(schemas.POSE, frame.pose)
@@ -249,13 +250,17 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
 
 
 def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[str, str]:
-    """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
+    """The scenario's fields of an :class:`EpisodeLog`, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
         "composition": scenario.composition,
         "mission_step": repr(float(scenario.mission_step)),
+        "substep": repr(float(scenario.substep)),
         "safe_distance": repr(float(scenario.safe_distance)),
         "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",
+        "scenario_force_limit": repr(float(scenario.force_limit)),
+        "path": json.dumps((scenario.path_origin, scenario.path_velocity)),
+        "slots": json.dumps(scenario.formations.tolist()),
         "commands": json.dumps(scenario.orders.commands),
         "obstacles": json.dumps(draw.obstacles.tolist()),
         "motions": json.dumps(draw.motions.tolist()),
@@ -274,7 +279,7 @@ def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list
 
 
 def _draw(scenario: Scenario, seed: int) -> Draw:
-    """The episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
+    """The draw with which ``World.reset(seed)`` starts its world 0, from the same stream."""
     return scenario.draw(stream(seed))
 
 

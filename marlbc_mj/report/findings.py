@@ -1,4 +1,4 @@
-"""What a run says about the paper's comparisons: which published orders hold, and what the same actuator changes."""
+"""Findings of a run: which published orders hold, and what an equal actuator changes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -11,11 +11,11 @@ from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.metrics import convergence_time
 from marlbc_mj.results.scores import SCORES, switches_text
 from marlbc_mj.results.summary import Result
+from marlbc_mj.util.method_names import display_name
 
 WHY = {
     3: "the supervisors are reconstructed and learned ones depend on their training; in the gate the clearance equals the "
     "automaton's upper threshold, so that its count depends on rounding (erratum 8).",
-    4: "another machine and other code; the published times of supervisors without a solver differ by less than 0.5 ms.",
     5: "a maximum is set by the jump of the reference at a switch, and the actuator's limit caps it. A total also depends "
     "on how long a law presses, and on offsets whose sign had to be chosen (erratum 4); the published totals contradict "
     "those of Table 6 if they share a unit, so that only their order is compared (erratum 16).",
@@ -26,7 +26,7 @@ WHY = {
 
 
 class Claim(NamedTuple):
-    """A published order of two methods, and the agents for which it holds here; agent 0 stands for the whole team."""
+    """A published order of two methods, and the agents for which it holds here."""
 
     table: int
     quantity: str
@@ -37,12 +37,13 @@ class Claim(NamedTuple):
 
 
 def claims(results: Sequence[Result]) -> list[Claim]:
-    """Every published order among methods of this run that have a number."""
+    """Every published order among methods of this run that have a number.
+
+    Those of Table 4 are left out: decision times depend on the machine and on the hour, and a count of reproduced orders must
+    not. That table stands beside the published one, see :func:`~marlbc_mj.report.paper_tables.decision_time`.
+    """
     supervisors, (controllers, _) = paper_tables.one_per_supervisor(results), paper_tables.one_per_controller(results)
     found = _claims(supervisors, paper_tables.SWITCHES)
-    medians = {n: [r.metrics["team"]["decision_ms_median"]] for n, r in supervisors.items() if r.metrics}
-    sums = {name: [sum(values)] for name, values in paper_values.PUBLISHED_DECISION_MS.values.items()}
-    found += _pairs(4, "decision time", medians, sums, first=0)
     for quantity in (paper_tables.COST_MAX, paper_tables.COST_TOTAL, paper_tables.INPUT_MAX, paper_tables.INPUT_TOTAL):
         found += _claims(controllers, quantity)
     return found
@@ -56,16 +57,14 @@ def _claims(chosen: Mapping[str, Result], quantity: Quantity) -> list[Claim]:
     return _pairs(quantity.table, f"{quantity.label.split()[0]}{label}", ours, quantity.source.values)
 
 
-def _pairs(
-    table: int, label: str, ours: Mapping[str, Sequence[float]], source: Mapping[str, Sequence[float]], first: int = 1
-) -> list[Claim]:
+def _pairs(table: int, label: str, ours: Mapping[str, Sequence[float]], source: Mapping[str, Sequence[float]]) -> list[Claim]:
     """Both orders of a pair where the published one differs between agents; published ties make none."""
     found = []
     for a, b in combinations([name for name in source if name in ours], 2):
         for low, high in ((a, b), (b, a)):
             agents = [i for i in range(len(ours[a])) if source[low][i] < source[high][i]]
-            holds = tuple(i + first for i in agents if ours[low][i] < ours[high][i])
-            differs = tuple(i + first for i in agents if ours[low][i] >= ours[high][i])
+            holds = tuple(i + 1 for i in agents if ours[low][i] < ours[high][i])
+            differs = tuple(i + 1 for i in agents if ours[low][i] >= ours[high][i])
             if agents:
                 found.append(Claim(table, label, low, high, holds, differs))
     return found
@@ -88,15 +87,14 @@ def orderings(results: Sequence[Result]) -> Table | None:
     )
     rules = tuple(k for k in range(1, len(found)) if found[k].table != found[k - 1].table)
     whole = sum(not c.differs for c in found)
-    notes = [f"{whole} of {len(found)} published orders hold for every agent. Published ties are not counted."]
+    uncounted = "Published ties are not counted, nor is Table 4, whose times depend on the machine."
+    notes = [f"{whole} of {len(found)} published orders hold for every agent. {uncounted}"]
     notes += [f"Why they may differ in Table {table}: {WHY[table]}" for table in sorted({c.table for c in found if c.differs})]
     columns = (Column("", "published order"), Column("", "holds"), Column("", "holds for"), Column("", "differs for"))
     return Table("orderings", "Which of the published orders hold here", columns, rows, tuple(notes), rules)
 
 
 def _agents(agents: tuple[int, ...]) -> str:
-    if agents == (0,):
-        return "the team"
     return f"agent{'s' * (len(agents) > 1)} {listed(spans(agents).split(', '))}" if agents else DASH
 
 
@@ -108,15 +106,17 @@ def same_actuator(results: Sequence[Result]) -> str:
     if "sorlc" not in costs or not limited:
         return ""
     ours = costs["sorlc"]
-    first = f"Under the {supervisor} supervisor the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
-    return first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours) + _conclusion(costs, limited, ours)
+    first = f"With supervisor {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
+    found = first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours)
+    of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in chosen.values())
+    return found + _conclusion(costs, limited, ours) if of_paper else found.rstrip()
 
 
 def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
     """Which rivals are cheaper than SORLC with the same actuator, and which are not."""
     limit = next(iter(chosen.values())).trajectory
     force = "same actuator" if limit is None else f"same actuator of {limit.scenario.force_limit:g} N"
-    said = {name: f"{name} {grouped(cost)} ({cost / ours:.2f} times)" for name, cost in limited.items()}
+    said = {name: f"{display_name(name)} {grouped(cost)} ({cost / ours:.2f} times)" for name, cost in limited.items()}
     cheaper = [said[name] for name, cost in limited.items() if cost < ours]
     costlier = [said[name] for name, cost in limited.items() if cost >= ours]
     if not cheaper:
@@ -127,7 +127,7 @@ def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: fl
 
 
 def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float) -> str:
-    """What LQR costs, and how safe it is."""
+    """Cost and safety of LQR."""
     metrics = chosen["lqr"].metrics if "lqr" in chosen else None
     if metrics is None:
         return ""
@@ -138,16 +138,17 @@ def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float
 
 
 def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: float) -> str:
-    """What that does to the published conclusion, for the published rivals."""
+    """Whether the published conclusion still holds for the published rivals."""
     rivals = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
     reversed_for = [name for name in rivals if limited[name] < ours < costs[name]]
     before = [name for name in rivals if limited[name] < ours and costs[name] <= ours]
     text = ""
     if reversed_for:
-        text = f"The published conclusion that SORLC costs less is reversed for {listed(reversed_for)}: "
+        text = f"The published conclusion that SORLC costs less is reversed for {listed(list(map(display_name, reversed_for)))}: "
         text += "summed over agents, it holds only without a limit. "
     if before:
-        text += f"{listed(before)}, summed over agents, {'costs' if len(before) == 1 else 'cost'} less even without one. "
+        cheaper = listed(list(map(display_name, before)))
+        text += f"{cheaper}, summed over agents, {'costs' if len(before) == 1 else 'cost'} less even without one. "
     if not text and rivals:
         text = "The published conclusion that SORLC costs less stands. "
     return text.strip()
@@ -164,7 +165,7 @@ def oracle_gap(results: Sequence[Result]) -> Table | None:
     rows = [_gap_row(r, best[r.controller]) for r in results if r.controller in best and r.supervisor != "oracle"]
     if not rows:
         return None
-    tops = listed([f"{fixed(value, 0)} with {name}" for name, value in best.items()])
+    tops = listed([f"{fixed(value, 0)} with {display_name(name)}" for name, value in best.items()])
     columns = (
         Column("", "method"),
         score_column("return"),
@@ -184,10 +185,10 @@ def _gap_row(result: Result, top: float) -> tuple[str, ...]:
     """A method beside the oracle's return ``top``."""
     metrics = result.metrics
     if metrics is None:
-        return (result.key, FAILED, DASH, DASH, DASH)
+        return (result.display, FAILED, DASH, DASH, DASH)
     gap = top - metrics["team"]["return"]
     share = fixed(100 * gap / abs(top), 1) if top else DASH
-    return (result.key, score_cell("return", metrics), fixed(gap, 0), share, score_cell("violation_time_worst", metrics))
+    return (result.display, score_cell("return", metrics), fixed(gap, 0), share, score_cell("violation_time_worst", metrics))
 
 
 def convergence(results: Sequence[Result]) -> Table | None:
@@ -203,14 +204,14 @@ def convergence(results: Sequence[Result]) -> Table | None:
     columns = [Column("", "controller"), *(Column("", f"agent {i + 1}") for i in range(agents))]
     columns += [Column("", "published")] if of_paper else []
     rows = tuple(
-        (name, *(fixed(t, 2) for t in each), *([significant(published[name], 2)] if of_paper else []))
+        (display_name(name), *(fixed(t, 2) for t in each), *([significant(published[name], 2)] if of_paper else []))
         for name, each in times.items()
     )
     notes = (
-        "Time after which the norm of the velocity error stays below 2 % of its largest value in the first 15 s, "
-        f"{supervisor} supervisor.",
+        "Time after which the norm of the velocity error stays below 2 % of its largest value in the first 15 s; "
+        f"supervisor: {display_name(supervisor)}.",
     )
-    caption = "Convergence of the velocity error at the start [s] (Figures 6c and 7c of the paper)"
+    caption = f"Convergence of the velocity error at the start [s]{' (Figures 6c and 7c of the paper)' if of_paper else ''}"
     return Table("convergence", caption, tuple(columns), rows, notes)
 
 
@@ -225,7 +226,7 @@ def predictions(results: Sequence[Result]) -> Table | None:
     )
     rows = tuple(
         (
-            r.key,
+            r.display,
             score_cell("return", r.metrics),
             switches_text(r.metrics),
             score_cell("violation_time_worst", r.metrics),

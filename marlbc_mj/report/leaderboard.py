@@ -10,12 +10,13 @@ from marlbc_mj.report import paper_values
 from marlbc_mj.report.formats import percent, spans
 from marlbc_mj.report.leaderboard_cells import WIDTH, BoardCell, BoardColumn, BoardRow, Name, board_rows, shown_name
 from marlbc_mj.report.page import origin_facts
-from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.report.table import Column, Table
 from marlbc_mj.report.tables import latex_document
 from marlbc_mj.report.templates import render
 from marlbc_mj.results.layout_runs import Method, MissionRuns
 from marlbc_mj.results.standings import Notable, Standing, by_cost, finished, notable_layouts, rank_methods, share_of
 from marlbc_mj.results.statistics import Estimate
+from marlbc_mj.util.method_names import display_name
 
 LEADERBOARD_PAGE, LEADERBOARD_TEX = "leaderboard.html", "leaderboard.tex"
 SUPERVISOR_REFERENCE = "fsams-hysteresis"
@@ -24,11 +25,11 @@ CONTROL_REFERENCE = "sorlc"
 """The controller that the chance of improvement is measured against."""
 CONTROL = "control"
 """The track that compares controllers."""
-_REFERENCE_NOTE = f"Reference: {SUPERVISOR_REFERENCE} under the null-space composition."
+_REFERENCE_NOTE = f"Reference: {display_name(SUPERVISOR_REFERENCE)} under the null-space composition."
 LEADING = 3
 """Columns that every table begins with; in text they have their intervals."""
 MOST_COLUMNS = 12
-"""That a table on paper has."""
+"""Columns of a table that still fits a printed page."""
 
 
 class Board(NamedTuple):
@@ -59,7 +60,7 @@ class Failure(NamedTuple):
 
 
 class Look(NamedTuple):
-    """A layout worth a look."""
+    """A layout worth watching."""
 
     track: str
     kind: str  # ``worst`` or ``median``
@@ -70,7 +71,7 @@ class Look(NamedTuple):
 
 
 class Detail(NamedTuple):
-    """What is one click away of a method."""
+    """Details of one method, shown after a click."""
 
     name: Name
     facts: str
@@ -78,8 +79,10 @@ class Detail(NamedTuple):
     looks: tuple[Look, ...]
 
 
-def write_leaderboard(groups: Sequence[MissionRuns], facts: Mapping[str, Any], tracks: Mapping[str, str], folder: Path) -> str:
-    """Write the page and the LaTeX tables; returns the first tables as Markdown.
+def write_leaderboard(
+    groups: Sequence[MissionRuns], facts: Mapping[str, Any], tracks: Mapping[str, str], folder: Path
+) -> list[Table]:
+    """Write the page and the LaTeX tables; returns the tables.
 
     Args:
         groups: every method on every mission that it flew.
@@ -103,8 +106,13 @@ def write_leaderboard(groups: Sequence[MissionRuns], facts: Mapping[str, Any], t
     (folder / LEADERBOARD_PAGE).write_text(text, encoding="utf-8")
     tables = [board.table() for board in boards]
     (folder / LEADERBOARD_TEX).write_text(latex_document(tables), encoding="utf-8")
+    return tables
+
+
+def leading_tables(tables: Sequence[Table]) -> list[Table]:
+    """What a terminal shows: supervisors over all tracks, and controllers; all where there is neither."""
     shown = [table for table in tables if table.name in ("board-supervisors", "board-controllers")]
-    return "\n".join(map(to_markdown, shown or tables))
+    return shown or list(tables)
 
 
 def make_boards(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[Board]:
@@ -181,7 +189,7 @@ def _track_board(name: str, summary: str, own: Sequence[MissionRuns]) -> Board:
     missions = dict.fromkeys(each.mission for each in own)
     several = (BoardColumn(mission, _on_mission(mission), 0, 1, (0.0, 100.0), mission, "%") for mission in missions)
     columns = (*_leading(len(standings)), *(several if len(missions) > 1 else ()), *_SAFETY_AND_COST)
-    note = f"Under {' and '.join(laws)}: {summary}. {_REFERENCE_NOTE}"
+    note = f"With {' and '.join(map(display_name, laws))}: {summary}. {_REFERENCE_NOTE}"
     return Board(name, f"Supervisors: track {name}", note, columns, board_rows(standings, columns))
 
 
@@ -202,7 +210,7 @@ def _control_board(summary: str, own: Sequence[MissionRuns]) -> Board:
         BoardColumn("return", _median("return"), 0, 1),
     )
     ranked = "Ranked by success, then by the control cost ∫ (‖e_p‖² + ‖e_v‖² + ‖u‖²) dt of all agents"
-    note = f"{summary.capitalize()}. {ranked}. Reference: {CONTROL_REFERENCE}."
+    note = f"{summary.capitalize()}. {ranked}. Reference: {display_name(CONTROL_REFERENCE)}."
     return Board("controllers", "Controllers", note, columns, board_rows(standings, columns, by_controller=True))
 
 
@@ -243,7 +251,7 @@ def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[
 
 
 def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
-    """Failures and layouts worth a look, method by method."""
+    """Failures and layouts worth watching, method by method."""
     notable = notable_layouts(groups)
     details = []
     for method in dict.fromkeys(each.method for each in groups):
@@ -254,7 +262,7 @@ def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
         failed, total = sum(failure.runs for failure in failures), sum(len(each.runs) for each in own)
         looks = tuple(_look(one, folder) for one in notable if one.method == method)
         name = shown_name(method)
-        with_law = name._replace(facts=", ".join(part for part in (method.controller, name.facts) if part))
+        with_law = name._replace(facts=", ".join(part for part in (display_name(method.controller), name.facts) if part))
         words = f"{failed} of {total} runs could not be finished" if failed else f"all {total} runs were finished"
         details.append(Detail(with_law, words, failures, looks))
     return details

@@ -5,10 +5,10 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from marlbc_mj.report.formats import DASH, fixed, significant
-from marlbc_mj.report.method_names import source_of
 from marlbc_mj.results.layout_runs import Method
 from marlbc_mj.results.standings import Standing
 from marlbc_mj.results.statistics import Estimate
+from marlbc_mj.util.method_names import source_of
 
 WIDTH = 64
 """Of the drawing of an interval [CSS pixels]."""

@@ -11,6 +11,7 @@ from marlbc_mj.report.paper_values import Published, order_mark
 from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.metrics import AgentMetrics
 from marlbc_mj.results.summary import Result
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.text import one_line
 
 SAME_ORDER = "same order"
@@ -67,10 +68,10 @@ def switches(chosen: Mapping[str, Result], published: bool) -> Table:
     """Table 3: how often every agent's behavior priority changes."""
     return _table(
         "switches",
-        "Number of behavior priority switches of each mission supervisor (Table 3 of the paper)",
+        f"Number of behavior priority switches of each mission supervisor{_table_number(3, published)}",
         "supervisor",
         _Comparison(chosen, (SWITCHES,), paper_values.PAPER_SUPERVISORS if published else {}),
-        ("Orders that command the same motion count as equal.", "Controller: sorlc, or the one in brackets."),
+        ("Orders that command the same motion count as equal.", "Controller: SORLC, or the one in brackets."),
     )
 
 
@@ -78,11 +79,11 @@ def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool)
     """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
     return _table(
         "control-cost",
-        f"Maximum and total control cost of each controller under the {supervisor} supervisor (Table 5 of the paper)",
+        _controller_caption("cost", supervisor, 5, published),
         "controller",
         _Comparison(chosen, (COST_MAX, COST_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
-            "Cost: ‖e_p‖² + ‖e_v‖² + ‖u‖². Total: its integral over the mission step, a sum over samples as in Table 6.",
+            "Cost: ‖e_p‖² + ‖e_v‖² + ‖u‖². Total: its integral over the mission step, a sum over samples.",
             *((f"† Erratum 16: {paper_values.ERRATA[16]}",) if published else ()),
         ),
     )
@@ -92,7 +93,7 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
     """Table 6: maximum and total control input; blocks as in Table 5."""
     return _table(
         "control-input",
-        f"Maximum and total control input of each controller under the {supervisor} supervisor (Table 6 of the paper)",
+        _controller_caption("input", supervisor, 6, published),
         "controller",
         _Comparison(chosen, (INPUT_MAX, INPUT_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -100,6 +101,17 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
             "Total: integral of the Euclidean norm over the mission step, a sum over samples.",
         ),
     )
+
+
+def _controller_caption(quantity: str, supervisor: str, number: int, published: bool) -> str:
+    """The caption of Table 5 or 6."""
+    given = f"with supervisor {display_name(supervisor)}"
+    return f"Maximum and total control {quantity} of each controller {given}{_table_number(number, published)}"
+
+
+def _table_number(number: int, published: bool) -> str:
+    """The number of the corresponding table of the paper, for a caption."""
+    return f" (Table {number} of the paper)" if published else ""
 
 
 @dataclass(frozen=True)
@@ -134,7 +146,7 @@ class _Comparison:
         """One per quantity and agent, and the one relative to SORLC."""
         groups = [q.label if self.of_controllers else "" for q in self.quantities]
         columns = [Column(group, f"agent {i + 1}") for group in groups for i in range(self.agents)]
-        return columns + ([Column("total", "over sorlc's")] if self.relative else [])
+        return columns + ([Column("total", "over SORLC's")] if self.relative else [])
 
     def block(self, keys: Sequence[str]) -> list[tuple[str, ...]]:
         """Rows of these methods, each with the published numbers below it where there are some."""
@@ -157,15 +169,20 @@ class _Comparison:
         return (SAME_ORDER, *marks, *([""] if self.relative else []))
 
     def notes(self) -> list[str]:
-        """What the columns are, what is published but did not run here, and what failed."""
+        """Notes on columns, on published methods that did not run here, and on failures."""
         told = [n for n in TOLD if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
-        notes = [f"Told the true drag, which the others have to identify or ignore: {', '.join(told)}."] if told else []
-        notes += ["Last column: sum of the totals over agents, relative to sorlc."] if self.relative else []
+        notes = (
+            [f"Told the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
+            if told
+            else []
+        )
+        notes += ["Last column: sum of the totals over agents, relative to SORLC."] if self.relative else []
         return [*notes, *_missing(self.chosen, self.quantities, self.names), *map(failure_note, failures(self.chosen.values()))]
 
     def _row(self, key: str) -> tuple[str, ...]:
         result, metrics = self.chosen[key], self.chosen[key].metrics
-        title = key if self.of_controllers or result.controller == "sorlc" else f"{key} ({result.controller})"
+        usual = self.of_controllers or result.controller == "sorlc"
+        title = display_name(key) + ("" if usual else f" ({display_name(result.controller)})")
         if metrics is None:
             cells = [FAILED, *[DASH] * (self.agents * len(self.quantities) - 1)]
         else:
@@ -213,22 +230,19 @@ def decision_time(chosen: Mapping[str, Result], published: bool) -> Table:
     shares = any(r.solver_share is not None for r in chosen.values())
     columns = _decision_columns(shares, bool(sums))
     rows = [
-        (name, *_measured(r, shares), *(_beside(source.get(name), medians.get(name)) if sums else []))
+        (display_name(name), *_measured(r, shares), *(_beside(source.get(name), medians.get(name)) if sums else []))
         for name, r in chosen.items()
     ]
-    mark, rules = order_mark(medians, sums), []
-    notes = ["Here: one call that decides for all agents, every method in the same process. Published: on another machine."]
-    if mark != DASH:
-        rules.append(len(rows))
-        rows.append((SAME_ORDER, mark, *[""] * (len(columns) - 2)))
-        notes.append(_ORDER_NOTE)
+    notes = ["Here: one call that decides for all agents, every method in the same process."]
+    notes += ["Published: on another machine."] if sums else []
+    notes += ["Orders are not compared: they would depend on the machine and on the hour."] if sums else []
     if shares:
         notes.append("Network or solver: its share of the decision time, where the supervisor measures it.")
     quantity = Quantity(4, "", paper_values.PUBLISHED_DECISION_MS, lambda agent: 0.0, 1)
     notes += _missing(chosen, (quantity,), paper_values.PAPER_SUPERVISORS if published else {})
     notes += map(failure_note, failures(chosen.values()))
-    caption = "Time for one decision of each mission supervisor (Table 4 of the paper)"
-    return Table("decision-time", caption, tuple(columns), tuple(rows), tuple(notes), tuple(rules))
+    caption = f"Time for one decision of each mission supervisor{_table_number(4, published)}"
+    return Table("decision-time", caption, tuple(columns), tuple(rows), tuple(notes))
 
 
 def _decision_columns(shares: bool, published: bool) -> list[Column]:
@@ -242,14 +256,14 @@ def _decision_columns(shares: bool, published: bool) -> list[Column]:
 
 
 def _measured(result: Result, shares: bool) -> list[str]:
-    """What this run took: median, 99th percentile and, with ``shares``, the share of the network or solver."""
+    """Times of this run: median, 99th percentile and, with ``shares``, the share of the network or solver."""
     team, share = (result.metrics["team"] if result.metrics else None), result.solver_share
     cells = [significant(team["decision_ms_median"]), significant(team["decision_ms_p99"])] if team else [FAILED, DASH]
     return cells + ([DASH if share is None else fixed(100 * share, 0)] if shares else [])
 
 
 def _beside(values: Sequence[float] | None, median: float | None) -> list[str]:
-    """What the paper's four agents took, and their sum over our median."""
+    """Published times of the four agents, and their sum over our median."""
     if values is None:
         return [DASH] * 5
     return [*(f"{value:.1f}" for value in values), significant(sum(values) / median, 2) if median else DASH]
@@ -272,4 +286,4 @@ def failures(results: Iterable[Result]) -> list[Result]:
 
 def failure_note(result: Result) -> str:
     """Which method failed and why, in one line."""
-    return f"{result.key} failed: {one_line(result.failure).rstrip('.')}."
+    return f"{result.display} failed: {one_line(result.failure).rstrip('.')}."

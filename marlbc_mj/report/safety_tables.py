@@ -11,6 +11,7 @@ from marlbc_mj.report.formats import DASH, fixed, interval, percent, significant
 from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.layouts import CellScores, MissionCell
 from marlbc_mj.results.statistics import Estimate
+from marlbc_mj.util.method_names import display_name
 
 
 def write_cells(rows: Sequence[CellScores], path: Path) -> None:
@@ -50,12 +51,14 @@ def _overview(rows: Sequence[CellScores], name: str, shield: bool) -> Table:
     """One rate of every supervisor on every mission, in per cent; a dash where nothing was flown."""
     missions = list(dict.fromkeys(row.cell.mission for row in rows))
     shown = {
-        (row.cell.supervisor, row.cell.composition, row.cell.mission): interval(percent(getattr(row, name)), 0)
+        (row.cell.supervisor, row.cell.composition, row.cell.mission): interval(percent(getattr(row, name)), 1)
         for row in rows
         if row.cell.shield == shield and not row.refused
     }
     methods = dict.fromkeys(key[:2] for key in shown)
-    cells = tuple((*method, *(shown.get((*method, mission), DASH) for mission in missions)) for method in methods)
+    cells = tuple(
+        (display_name(method[0]), method[1], *(shown.get((*method, mission), DASH) for mission in missions)) for method in methods
+    )
     columns = (Column("", "supervisor"), Column("", "composition"), *(Column("", mission) for mission in missions))
     caption = f"{name.capitalize()}, % of layouts, {'with' if shield else 'without'} a shield"
     return Table(f"safety-{name}-{'shield' if shield else 'free'}", caption, columns, cells)
@@ -76,13 +79,13 @@ def _mission_table(mission: str, rows: Sequence[CellScores]) -> Table:
         Column("decision", "median", "ms"),
     )
     flown = [row for row in rows if not row.refused]
-    reasons = {row.reason: row.cell.supervisor for row in rows if row.refused}
+    reasons = {row.reason: display_name(row.cell.supervisor) for row in rows if row.refused}
     notes = tuple(f"Not flown: {supervisor}: {reason}." for reason, supervisor in reasons.items())
     return Table(f"safety-{mission}", mission, columns, tuple(map(_cells, flown)), notes)
 
 
 def _cells(row: CellScores) -> tuple[str, ...]:
     rates = (interval(percent(one), 1) for one in (row.success, row.violation, row.collided))
-    names = row.cell.supervisor, row.cell.composition, "yes" if row.cell.shield else "no"
+    names = display_name(row.cell.supervisor), row.cell.composition, "yes" if row.cell.shield else "no"
     numbers = (interval(row.total, 0), fixed(row.switches, 0), fixed(row.effort, 0), significant(row.decision_ms, 2))
     return (*names, str(row.layouts), *rates, *numbers)

@@ -12,6 +12,7 @@ from marlbc_mj.results.seeds import SeedResults, SeedRun
 from marlbc_mj.results.statistics import Estimate
 from marlbc_mj.results.summary import AGENT_KEYS, SCHEMA, TEAM_KEYS, json_numbers
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.text import one_line
 
 
@@ -81,14 +82,16 @@ def write_seed_csv(results: SeedResults, path: Path) -> Path:
     A failed run has its reason in each of its rows. Where nothing was drawn, it has one row without an agent.
     """
     drawn = ("disturbance_scale", "start_x", "start_y")
-    columns = ("supervisor", "controller", "seed", "agent", "failure", *drawn, *AGENT_KEYS, *(f"team_{k}" for k in TEAM_KEYS))
+    names = ("supervisor", "controller", "supervisor_name", "controller_name")
+    columns = (*names, "seed", "agent", "failure", *drawn, *AGENT_KEYS, *(f"team_{k}" for k in TEAM_KEYS))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         for method in results.methods:
             for run in method.runs:
-                names = {"supervisor": method.supervisor, "controller": method.controller, "seed": run.seed}
-                writer.writerows({**names, **row} for row in _csv_rows(run))
+                shown = display_name(method.supervisor), display_name(method.controller)
+                about = dict(zip(names, (method.supervisor, method.controller, *shown), strict=True))
+                writer.writerows({**about, "seed": run.seed, **row} for row in _csv_rows(run))
     return path
 
 

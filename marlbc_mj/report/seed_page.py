@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from marlbc_mj.report import paper_values
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.figures import save_figure
 from marlbc_mj.report.formats import loose_interval, score_interval, spans
@@ -19,8 +20,9 @@ from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seed_statistics import MethodStatistics, analyse
 from marlbc_mj.results.seeds import SeedResults
 from marlbc_mj.results.summary import AGENT_KEYS
+from marlbc_mj.scenarios.titles import mission_title
 from marlbc_mj.util.files import write_json
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.palette import METHOD_COLORS
 from marlbc_mj.util.progress import Progress
 
 FIGURE = "intervals"
@@ -29,12 +31,14 @@ FIGURE = "intervals"
 def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     """Median and 95 % interval of return, violation time and effort: one line per method, with a word where all runs failed."""
     names = ("return", "violation_time_worst", "effort_integral_sum")
-    margins = pl.Margins(left=0.2 + 0.054 * max(len(s.runs.key) for s in methods), top=0.12, across=0.22)  # room for the names
+    margins = pl.Margins(
+        left=0.2 + 0.054 * max(len(s.runs.display) for s in methods), top=0.12, across=0.22
+    )  # room for the names
     figure, panels = pl.panels(pl.DOUBLE, 0.65 + 0.16 * len(methods), 1, len(names), margins, sharey=True)
     supervisors = list(dict.fromkeys(s.runs.supervisor for s in methods))
     for axes, name in zip(panels[0], names, strict=True):
         for k, s in enumerate(methods):
-            color = AGENT_COLORS[supervisors.index(s.runs.supervisor) % len(AGENT_COLORS)]
+            color = METHOD_COLORS[supervisors.index(s.runs.supervisor) % len(METHOD_COLORS)]
             estimate = s.medians[name]
             axes.plot([estimate.low, estimate.high], [k, k], color=color, linewidth=2.0, alpha=0.45)
             axes.plot(estimate.value, k, "o", color=color, markersize=3.5)
@@ -51,7 +55,7 @@ def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     ours = [s.medians[names[-1]].value for s in methods if s.medians[names[-1]].value > 0]
     if ours and max(ours) > 30 * min(ours):
         panels[0, -1].set_xscale("log")
-    panels[0, 0].set_yticks(range(len(methods)), [s.runs.key for s in methods])
+    panels[0, 0].set_yticks(range(len(methods)), [s.runs.display for s in methods])
     panels[0, 0].set_ylim(len(methods) - 0.4, -0.6)
     return figure
 
@@ -93,6 +97,7 @@ def _write_page(
     path: Path, results: SeedResults, methods: Sequence[MethodStatistics], tables: Sequence[Table], config: Mapping[str, Any]
 ) -> Path:
     scenario, draws = results.scenario, len(results.seeds)
+    of_paper = scenario.name == paper_values.SCENARIO
     failed = sum(len(s.runs.failed) for s in methods)
     caption = f"Median and 95 % interval of each method over draws{caution(draws)}."
     figure = picture(path.parent / "figures" / f"{FIGURE}.png", caption)
@@ -100,7 +105,7 @@ def _write_page(
         path,
         "seed_page.html",
         files_beside(path.parent),
-        title=f"Behavioral control benchmark: {scenario.name}, {draws} draws",
+        title=f"Behavioral control benchmark: {mission_title(scenario.name)}, {draws} draws",
         lead=f"{len(methods)} methods on the same {draws} draws around {scenario.description or scenario.name}.",
         facts=[
             *scenario_facts(scenario),
@@ -110,7 +115,8 @@ def _write_page(
         ],
         command=str(config["command"]),
         tables=tables,
-        of_paper=scenario.layout is None,
+        of_paper=of_paper,
+        has_details=of_paper,
         pictures=[figure] if figure else [],
         video=None,
         methods=list(map(_method_section, methods)),
@@ -120,7 +126,7 @@ def _write_page(
 class _MethodTable(NamedTuple):
     """A folding section with every metric of every agent."""
 
-    key: str
+    name: str
     facts: str
     table: Table
 
@@ -133,4 +139,6 @@ def _method_section(statistics: MethodStatistics) -> _MethodTable:
         facts = f"return {score_interval('return', statistics.medians['return'])}"
     columns = (Column("", "median"), *(Column("", f"agent {i + 1}") for i in range(len(statistics.agents))))
     rows = tuple((name, *(loose_interval(agent[name]) for agent in statistics.agents)) for name in AGENT_KEYS)
-    return _MethodTable(key, facts, Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows))
+    return _MethodTable(
+        statistics.runs.display, facts, Table(f"agents-{key}", "Every metric of every agent, median and interval", columns, rows)
+    )

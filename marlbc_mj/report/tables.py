@@ -4,10 +4,14 @@ from collections.abc import Sequence
 
 from marlbc_mj.report import findings, paper_tables, paper_values
 from marlbc_mj.report.formats import DASH, FAILED, score_cell, score_column
+from marlbc_mj.report.method_groups import MethodGroup, method_groups
 from marlbc_mj.report.paper_tables import failure_note, failures
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
+
+METRICS_TABLES = "metrics-"
+"""What names of the tables of all metrics begin with."""
 
 
 def make_tables(results: Sequence[Result], scenario_name: str) -> list[Table]:
@@ -16,7 +20,7 @@ def make_tables(results: Sequence[Result], scenario_name: str) -> list[Table]:
     supervisors = paper_tables.one_per_supervisor(results)
     controllers, supervisor = paper_tables.one_per_controller(results)
     tables = [
-        all_metrics(results),
+        *metrics_tables(results),
         paper_tables.switches(supervisors, of_paper),
         paper_tables.decision_time(supervisors, of_paper),
         paper_tables.control_cost(controllers, supervisor, of_paper),
@@ -35,8 +39,8 @@ def markdown(tables: Sequence[Table], paragraph: str = "") -> str:
 
 
 def latex_document(tables: Sequence[Table], paragraph: str = "") -> str:
-    r"""The content of tables.tex, for ``\input`` in a document that loads booktabs."""
-    parts = ["% needs \\usepackage{booktabs}", *([latex(paragraph)] if paragraph else []), *map(to_latex, tables)]
+    r"""The content of tables.tex, for ``\input`` in a document that loads booktabs and graphicx."""
+    parts = ["% needs \\usepackage{booktabs,graphicx}", *([latex(paragraph)] if paragraph else []), *map(to_latex, tables)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -46,19 +50,19 @@ _COLUMNS = (
 )
 
 
-def all_metrics(results: Sequence[Result]) -> Table:
-    """Every method in one row; the second line of the header says how agents are aggregated."""
-    columns = (
-        Column("", "method"),
-        score_column("return"),
-        Column("switches", "each agent"),
-        *map(score_column, _COLUMNS),
-    )
+def metrics_tables(results: Sequence[Result]) -> list[Table]:
+    """All metrics, one row per supervisor or controller; the second line of the header says how agents are aggregated."""
+    groups = method_groups(results, lambda result: (result.supervisor, result.controller))
+    return [_metrics_table(group) for group in groups]
+
+
+def _metrics_table(group: MethodGroup[Result]) -> Table:
+    columns = (Column("", group.kind), score_column("return"), Column("switches", "each agent"), *map(score_column, _COLUMNS))
     return Table(
-        "all-metrics",
-        "All metrics of each method (supervisor + controller)",
+        f"{METRICS_TABLES}{group.suffix}",
+        f"All metrics of each {group.kind}, {group.words}",
         columns,
-        tuple(_metrics_row(result, len(columns)) for result in results),
+        tuple(_metrics_row(name, result, len(columns)) for name, result in group.rows),
         (
             "Worst agent: the one with the longest violation, the least clearance, the most time at the limit. Sum, mean and RMS "
             "are over all agents.",
@@ -67,14 +71,14 @@ def all_metrics(results: Sequence[Result]) -> Table:
             "Distance: between two agents, which no behavior guards. Formation error: distance from the slot relative to the "
             "centroid.",
             "At limit: share of time with an axis of the force at its limit.",
-            *map(failure_note, failures(results)),
+            *map(failure_note, failures([result for _, result in group.rows])),
         ),
     )
 
 
-def _metrics_row(result: Result, width: int) -> tuple[str, ...]:
+def _metrics_row(name: str, result: Result, width: int) -> tuple[str, ...]:
     metrics = result.metrics
     if metrics is None:
-        return (result.key, FAILED, *[DASH] * (width - 2))
-    cells = (score_cell(name, metrics) for name in _COLUMNS)
-    return (result.key, score_cell("return", metrics), switches_text(metrics), *cells)
+        return (name, FAILED, *[DASH] * (width - 2))
+    cells = (score_cell(column, metrics) for column in _COLUMNS)
+    return (name, score_cell("return", metrics), switches_text(metrics), *cells)

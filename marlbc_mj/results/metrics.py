@@ -1,13 +1,16 @@
 """The metrics of an episode: named scalars of its trajectory. Changing a definition changes every published number."""
 
+from dataclasses import dataclass
 from typing import TypedDict
 
 import numpy as np
 
 from marlbc_mj.core.cells import spacing
 from marlbc_mj.core.safety import violates
-from marlbc_mj.episode import Trajectory
-from marlbc_mj.scenarios import Scenario
+from marlbc_mj.core.shield import ShieldCounts
+from marlbc_mj.episode import Trajectory, clearances_after
+from marlbc_mj.recording.log import Course, EpisodeLog, course_of, shield_counts_of
+from marlbc_mj.util.errors import ConfigurationError
 
 
 class AgentMetrics(TypedDict):
@@ -51,31 +54,89 @@ class Metrics(TypedDict):
     team: TeamMetrics
 
 
-def measure(trajectory: Trajectory) -> Metrics:
-    """All metrics of one episode.
+@dataclass(frozen=True)
+class _Flown:
+    """The data of an episode that metrics need: T substeps, M mission steps, N agents; fields as in :class:`Trajectory`."""
+
+    course: Course
+    position: np.ndarray  # (T + 1, N, 2)
+    velocity: np.ndarray  # (T, N, 2)
+    reference: np.ndarray  # (T, N, 2)
+    reference_velocity: np.ndarray  # (T, N, 2)
+    force: np.ndarray  # (T, N, 2)
+    command: np.ndarray  # (M, N)
+    reward: np.ndarray  # (M,)
+    decision_ms: np.ndarray  # (M,)
+    shield: ShieldCounts | None  # (M, N) each
+    clearance: np.ndarray  # (T, N) at the end of every substep
+
+
+def measure(episode: Trajectory | EpisodeLog) -> Metrics:
+    """All metrics of one episode, from its trajectory or, equal to the last bit, from its log.
 
     Errors and force are those at the start of each substep, weighted by its length; clearance is that at its end.
+
+    Raises:
+        ConfigurationError: something else than an episode, or a log that holds mission steps only.
     """
-    return {
-        "agents": [_agent(trajectory, i, clearance) for i, clearance in enumerate(trajectory.clearances().T)],
-        "team": _team(trajectory),
-    }
+    if isinstance(episode, Trajectory):
+        flown = _of_trajectory(episode)
+    elif isinstance(episode, EpisodeLog):
+        flown = _of_log(episode)
+    else:
+        raise ConfigurationError(f"measure takes a Trajectory or what read_log returns, got {type(episode).__name__}")
+    return {"agents": [_agent(flown, i) for i in range(flown.force.shape[1])], "team": _team(flown)}
 
 
-def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMetrics:
-    scenario = trajectory.scenario
-    h, dt = scenario.substep, scenario.mission_step
-    force = trajectory.force[:, agent]
-    position_error = trajectory.position[:-1, agent] - trajectory.reference[:, agent]
-    velocity_error = trajectory.velocity[:-1, agent] - trajectory.reference_velocity[:, agent]
+def _of_trajectory(episode: Trajectory) -> _Flown:
+    return _Flown(
+        course_of(episode.scenario),
+        episode.position,
+        episode.velocity[:-1],
+        episode.reference,
+        episode.reference_velocity,
+        episode.force,
+        episode.command,
+        episode.reward,
+        episode.decision_ms,
+        episode.shield,
+        episode.clearances(),
+    )
+
+
+def _of_log(log: EpisodeLog) -> _Flown:
+    if log.substeps is None:
+        raise ConfigurationError("the log holds mission steps only, and metrics need every substep; fly the episode again")
+    every = log.substeps
+    return _Flown(
+        every.course,
+        every.position,
+        every.velocity,
+        every.reference,
+        every.reference_velocity,
+        every.force,
+        log.command,
+        log.reward,
+        log.decision_ms,
+        shield_counts_of(log.shield),
+        clearances_after(every.position[1:], log.obstacles, log.motions, every.course.substep),
+    )
+
+
+def _agent(flown: _Flown, agent: int) -> AgentMetrics:
+    course, clearance = flown.course, flown.clearance[:, agent]
+    h, dt = course.substep, course.mission_step
+    force = flown.force[:, agent]
+    position_error = flown.position[:-1, agent] - flown.reference[:, agent]
+    velocity_error = flown.velocity[:, agent] - flown.reference_velocity[:, agent]
     square_p, square_v = (position_error**2).sum(-1), (velocity_error**2).sum(-1)
     size = np.linalg.norm(force, axis=-1)
     cost = square_p + square_v + size**2
-    interventions, change, breaches = _shield_totals(trajectory, agent)
+    interventions, change, breaches = _shield_totals(flown, agent)
     return {
-        "switches": int((np.diff(trajectory.command[:, agent]) != 0).sum()),
+        "switches": int((np.diff(flown.command[:, agent]) != 0).sum()),
         "clearance_min": float(clearance.min()),
-        "violation_time": float(violates(clearance, scenario.safe_distance).sum() * h),
+        "violation_time": float(violates(clearance, course.safe_distance).sum() * h),
         "force_max_inf": float(np.abs(force).max()),
         "force_max_2": float(size.max()),
         "effort_integral": float(size.sum() * h),
@@ -83,7 +144,7 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
         "cost_max": float(cost.max()),
         "cost_integral": float(cost.sum() * h),
         "cost_sum": float(cost.sum() * h / dt),
-        "saturation_duty": float((np.abs(force) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).mean()),
+        "saturation_duty": float((np.abs(force) >= course.force_limit * (1 - 1e-12)).any(axis=-1).mean()),
         "rms_position_error": float(np.sqrt(square_p.mean())),
         "rms_velocity_error": float(np.sqrt(square_v.mean())),
         "intervention_share": interventions / len(force),
@@ -92,24 +153,24 @@ def _agent(trajectory: Trajectory, agent: int, clearance: np.ndarray) -> AgentMe
     }
 
 
-def _shield_totals(trajectory: Trajectory, agent: int) -> tuple[float, float, int]:
+def _shield_totals(flown: _Flown, agent: int) -> tuple[float, float, int]:
     """Interventions [substeps], change of the force [N s] and breaches [substeps] over the episode; nothing without a shield."""
-    counts = trajectory.shield
+    counts = flown.shield
     if counts is None:
         return 0.0, 0.0, 0
     last = -1, agent
     return float(counts.interventions[last]), float(counts.change[last]), int(counts.breaches[last].sum())
 
 
-def _team(trajectory: Trajectory) -> TeamMetrics:
-    positions = trajectory.position[1:]
+def _team(flown: _Flown) -> TeamMetrics:
+    positions = flown.position[1:]
     return {
-        "return": float(trajectory.reward.sum()),
-        "decision_ms_median": float(np.median(trajectory.decision_ms)),
-        "decision_ms_p99": float(np.percentile(trajectory.decision_ms, 99)),
+        "return": float(flown.reward.sum()),
+        "decision_ms_median": float(np.median(flown.decision_ms)),
+        "decision_ms_p99": float(np.percentile(flown.decision_ms, 99)),
         "agent_distance_min": float(spacing(positions).min()),
-        "end_error": _end_error(trajectory),
-        "formation_error": float(_slot_distance(positions, trajectory.scenario).mean()),
+        "end_error": _end_error(flown),
+        "formation_error": float(_slot_distance(positions, flown.course).mean()),
     }
 
 
@@ -128,15 +189,17 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
     return np.where(after < len(above), after * trajectory.scenario.substep, np.nan)
 
 
-def _end_error(trajectory: Trajectory) -> float:
-    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: was the mission accomplished?"""
-    scenario = trajectory.scenario
-    end = len(trajectory.time) * scenario.substep
-    centroid = np.array(scenario.path_origin) + end * np.array(scenario.path_velocity)
-    return float(np.linalg.norm(trajectory.position[-1] - centroid - scenario.formations[0], axis=-1).max())
+def _end_error(flown: _Flown) -> float:
+    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: whether the mission was
+    accomplished.
+    """
+    course = flown.course
+    end = len(flown.force) * course.substep
+    centroid = np.array(course.path_origin) + end * np.array(course.path_velocity)
+    return float(np.linalg.norm(flown.position[-1] - centroid - course.formations[0], axis=-1).max())
 
 
-def _slot_distance(positions: np.ndarray, scenario: Scenario) -> np.ndarray:
+def _slot_distance(positions: np.ndarray, course: Course) -> np.ndarray:
     """(T, N) distance of every agent from its first formation's slot, relative to the centroid [m]."""
     centred = positions - positions.mean(axis=1, keepdims=True)
-    return np.asarray(np.linalg.norm(centred - scenario.formations[0], axis=-1))
+    return np.asarray(np.linalg.norm(centred - course.formations[0], axis=-1))

@@ -1,4 +1,4 @@
-"""Every method on the same draws around a scenario, as results: scalars only, so memory stays flat."""
+"""Every method on the same draws around a scenario, as scalars only, so that memory stays small."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,6 +10,7 @@ from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.method_names import display_method
 
 
 class Instance(NamedTuple):
@@ -47,6 +48,11 @@ class MethodRuns:
     def key(self) -> str:
         """The method's name in every file."""
         return method_key(self.supervisor, self.controller)
+
+    @property
+    def display(self) -> str:
+        """The method's name for people."""
+        return display_method(self.supervisor, self.controller)
 
     @property
     def failed(self) -> tuple[SeedRun, ...]:

@@ -10,6 +10,7 @@ from marlbc_mj.episode import Trajectory
 from marlbc_mj.results.metrics import AgentMetrics, Metrics, TeamMetrics, measure
 from marlbc_mj.results.scores import team_scores
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.method_names import display_method, display_name, short_name
 from marlbc_mj.util.provenance import plain_data
 from marlbc_mj.util.text import one_line
 
@@ -42,6 +43,11 @@ class Result:
         """The method's name in every file, ``"<supervisor>+<controller>"``."""
         return method_key(self.supervisor, self.controller)
 
+    @property
+    def display(self) -> str:
+        """The method's name for people."""
+        return display_method(self.supervisor, self.controller)
+
     @classmethod
     def of(cls, trajectory: Trajectory, solver_share: float | None = None) -> "Result":
         """The result of an episode that ran to its end."""
@@ -56,14 +62,6 @@ class Result:
 def method_key(supervisor: str, controller: str) -> str:
     """The name of a method in summaries and files: ``scripted+sorlc``; of what a user's file has, without its folder."""
     return f"{short_name(supervisor)}+{short_name(controller)}"
-
-
-def short_name(name: str) -> str:
-    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
-    file, _, attribute = name.rpartition(":")
-    if file:
-        return f"{Path(file).stem}.{attribute}"
-    return Path(name).stem if "/" in name or name.endswith(".safetensors") else name
 
 
 def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str, str]) -> dict[str, Any]:
@@ -91,7 +89,16 @@ def _entry(result: Result) -> dict[str, Any]:
 
 def write_csv(results: Sequence[Result], path: Path) -> Path:
     """Write episodes.csv: a row per method and agent, the team's columns repeated; for a failed method one row without agent."""
-    header = ("supervisor", "controller", "agent", "failure", *AGENT_KEYS, *(f"team_{key}" for key in TEAM_KEYS))
+    header = (
+        "supervisor",
+        "controller",
+        "supervisor_name",
+        "controller_name",
+        "agent",
+        "failure",
+        *AGENT_KEYS,
+        *(f"team_{key}" for key in TEAM_KEYS),
+    )
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, header, restval="")
         writer.writeheader()
@@ -101,7 +108,8 @@ def write_csv(results: Sequence[Result], path: Path) -> Path:
 
 
 def _csv_rows(result: Result) -> list[dict[str, Any]]:
-    method = {"supervisor": result.supervisor, "controller": result.controller}
+    names = {"supervisor_name": display_name(result.supervisor), "controller_name": display_name(result.controller)}
+    method = {"supervisor": result.supervisor, "controller": result.controller, **names}
     if result.metrics is None:
         return [{**method, "failure": one_line(result.failure)}]
     numbers = json_numbers(result.metrics)

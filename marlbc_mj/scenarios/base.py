@@ -1,9 +1,10 @@
 """A scenario: everything that defines one problem instance, as one frozen documented dataclass."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
 from functools import cached_property
 from math import factorial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.core.orders import Orders
 from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
 from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.settings import check_kinds
 
 Point = tuple[float, float]
 MOST_SUBSTEPS = 10_000  # in one mission step
@@ -112,6 +114,9 @@ class Scenario:
     communication: Communication = field(default=IDEAL, metadata=YOUNG)  # who hears whom, when, of what share of messages
 
     def __post_init__(self) -> None:
+        check_kinds(self, f"scenario {self.name!r}: ")
+        if not isinstance(self.disturbance, Disturbance):
+            raise ConfigurationError(f"scenario {self.name!r}: disturbance must be a Disturbance, got {self.disturbance!r}")
         object.__setattr__(self, "obstacles", tuple(Obstacle(*o) for o in self.obstacles))
         object.__setattr__(self, "schedule", tuple(Window(*w) for w in self.schedule))
         object.__setattr__(self, "motions", tuple(Motion(*m) for m in self.motions))
@@ -148,6 +153,12 @@ class Scenario:
         by_name = {b.name: b for b in self.behaviors}
         offsets = [by_name[name].offsets for name in self.formation_names]  # type: ignore[attr-defined]
         return np.array(offsets, dtype=np.float64)
+
+    @property
+    def draws(self) -> bool:
+        """Whether anything depends on the seed: starts, obstacles, drag, layout, noise of sensors or lost messages."""
+        noisy = self.imperfections.position_noise > 0 or self.imperfections.velocity_noise > 0
+        return self.perturbation != Perturbation() or self.layout is not None or noisy or self.communication.loss > 0
 
     @property
     def moving(self) -> bool:
@@ -224,7 +235,11 @@ class Scenario:
             raise unknown("split", self.split, SPLITS)
         arrays = {"starts": self.starts, "obstacles": self.obstacles, "path": (self.path_origin, self.path_velocity)}
         for name, values in arrays.items():
-            if not np.isfinite(np.array(values, dtype=float)).all():
+            try:
+                finite = np.isfinite(np.array(values, dtype=float)).all()
+            except (TypeError, ValueError):
+                raise ConfigurationError(f"scenario {self.name!r}: {name} must be numbers, got {values!r}") from None
+            if not finite:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be finite, got {values}")
 
     def _check_team(self) -> None:
@@ -283,6 +298,24 @@ class Scenario:
                 raise ConfigurationError(
                     f"{long} {getattr(self, long)} s must be a whole multiple of {short} {getattr(self, short)} s"
                 )
+
+
+def with_changes(made: Mapping[str, Any], changes: Mapping[str, Any]) -> Scenario:
+    """A scenario with these fields, some of them changed.
+
+    Raises:
+        ConfigurationError: a change that is no field.
+    """
+    known = [each.name for each in fields(Scenario)]
+    if "agents" in changes:
+        team = f"a team of {len(made['starts'])} of its own, and agents cannot be set"
+        raise ConfigurationError(
+            f"scenario {changes.get('name', made['name'])!r} has {team}; families such as 'field' and 'gates' take agents"
+        )
+    for name in changes:
+        if name not in known:
+            raise unknown("field of a scenario", name, known)
+    return Scenario(**{**made, **changes})
 
 
 def standard_behaviors(

@@ -1,4 +1,4 @@
-"""What all families of missions share: a team, its formation and its way. A frozen dataclass that builds a scenario.
+"""The base of all families of missions: a team, its formation and its way. A frozen dataclass that builds a scenario.
 
 A team in formation at rest at the origin travels ``length`` along +x at ``speed``, and reforms into a column (FR) where its
 supervisor says so. Every length, speed, gain and limit is a field, so a family fits robots of any size; what cannot be flown is
@@ -20,6 +20,7 @@ from marlbc_mj.scenarios.formations import column, make_formation
 from marlbc_mj.scenarios.layout import Layout, motions_of
 from marlbc_mj.scenarios.obstacles import Range
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.settings import check_kinds
 
 NOMINAL = 0
 """Number of the layout that a scenario shows before a seed is drawn: a training one."""
@@ -27,7 +28,7 @@ NOMINAL = 0
 
 @dataclass(frozen=True, kw_only=True)
 class Mission:
-    """What has nothing to do with where a mission leads: its clocks, its robots and how its agents avoid and keep formation."""
+    """The part of a mission that does not depend on its way: clocks, robots, avoidance and formation."""
 
     name: str
     safe_distance: float = 1.0  # to obstacles: d_OA [m]
@@ -73,7 +74,7 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Mission):
-    """What all families share; alone, it is a mission with nothing in the way.
+    """The base of all families; by itself, a mission with nothing in the way.
 
     Raises:
         ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
@@ -88,7 +89,7 @@ class Family(Mission):
     column_spacing: float = 3.0  # between neighbors in the column [m]
     length: float = 60.0  # of the way [m]
     speed: float = 1.0  # [m/s]
-    two_sided: bool = False  # OA as the printed equality (erratum 6)
+    two_sided: bool = False  # OA as the published equality (erratum 6)
     split: Literal["train", "test"] = "train"  # whose layouts are drawn; the held-out ones are "test"
     summary: ClassVar[str] = "nothing in the way"
     cluttered: ClassVar[bool] = False  # whether the way must have room for obstacles
@@ -136,6 +137,7 @@ class Family(Mission):
             raise ConfigurationError(
                 f"scenario {self.name!r} has no setting {sorted(unfit)[0]!r}; it has: {', '.join(sorted(own))}"
             )
+        check_kinds(family, f"scenario {family.name!r}: ")
         family.check()
         return family._scenario(rest)
 

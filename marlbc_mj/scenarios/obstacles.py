@@ -88,12 +88,12 @@ class Walls:
     reach: float  # walls across reach at least this far from the path [m]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """All passages, every opening where chance puts it."""
+        """All passages, every opening at a random place."""
         walls = [self._passage(*ends, float(rng.uniform(-self.shift, self.shift))) for ends in self.passages]
         return Sample(np.concatenate(walls), np.zeros((0, NUMBERS)))
 
     def _passage(self, first: float, last: float, middle: float) -> np.ndarray:
-        """(k, 3) discs; as many whatever the opening."""
+        """(k, 3) discs; the same number for every opening."""
         side = 0.5 * self.width + self.radius
         across = side + 2.0 * self.radius * np.arange(int(np.ceil((self.reach + self.shift - side) / (2.0 * self.radius))) + 1)
         along = np.linspace(first, last, int(np.ceil((last - first) / (2.0 * self.radius))) + 1)[1:]

@@ -1,8 +1,8 @@
-"""Many draws of a scenario side by side in one World: flown together, measured one by one, and let go.
+"""Many draws of a scenario side by side in one World: flown together and measured one by one.
 
 Worlds and teams do not interact. So what comes of a draw, its metrics or the reason why there are none, is to the bit what
-:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only the time of a decision is another: that of all teams
-together, shared out evenly.
+:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only decision times differ: that of all teams together is
+shared out evenly.
 """
 
 from collections.abc import Sequence
@@ -36,7 +36,7 @@ RECORD_BYTES = 128e6
 
 
 class Entry(NamedTuple):
-    """What is flown on every draw."""
+    """The method that flies every draw."""
 
     scenario: Scenario
     supervisor: Supervisor
@@ -181,7 +181,7 @@ class JointFlight:
         self.reward[:, m], self.shield = step.reward, step.shield
 
     def _drop_diverged(self) -> bool:
-        """Whether worlds diverged; they have failed, and begin an episode that nobody looks at, since others go on."""
+        """Whether worlds diverged; they have failed, and begin an episode that is not recorded, since the others continue."""
         world, state = self.world, self.world.state
         diverged = np.flatnonzero(state.status).tolist()
         for b in diverged:

@@ -1,16 +1,18 @@
 """The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it leaves."""
 
+import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
+from time import monotonic
 from typing import Any, Literal
 
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.recording.reader import read_log
-from marlbc_mj.report.bundle import write_report
+from marlbc_mj.report.bundle import write_report, write_so_far
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
@@ -20,10 +22,14 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.supervisors import CHECKPOINT_SUFFIX, ON_REQUEST, SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
-from marlbc_mj.util.files import check_folder, write_json
+from marlbc_mj.util.files import JOBS_FOLDER, check_folder, write_json, writing
 from marlbc_mj.util.modules import names_attribute
-from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.progress import Progress, note, silent
 from marlbc_mj.util.provenance import provenance
+
+SO_FAR = "so_far"
+"""Folder of the page of an unfinished run, among its other files."""
+REWRITE_AFTER = 1.0  # least time between two versions of that page [s]
 
 
 @dataclass(frozen=True)
@@ -118,24 +124,74 @@ class BenchStudy:
 
 
 def run_bench(
-    scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None
+    scenario: Scenario,
+    config: BenchConfig,
+    out: Path,
+    *,
+    progress: Progress | None = None,
+    ended: Callable[[Result], None] | None = None,
 ) -> tuple[list[Result], list[str]]:
     """Run the whole matrix and write ``out``; returns the results and what could not be written (a video without GL).
 
-    A method that fails, or cannot start in this scenario, is a reported outcome, not a missing row.
+    A method that fails, or cannot start in this scenario, is a reported outcome, not a missing row. Until all have ended, a page
+    and tables of those that have are in ``out/.jobs/so_far``.
+
+    Args:
+        scenario: what is flown.
+        config: the methods, and what is written of them.
+        out: folder of the results.
+        progress: called with what is being done, how much of it is done and how much there is.
+        ended: called with the result of each method as soon as it ends.
 
     Raises:
         ConfigurationError: a setting or the output folder; nothing is written then.
     """
+    study = BenchStudy(scenario, config)
+    page = SoFar(out / JOBS_FOLDER / SO_FAR, describe(scenario, config), [job.key for job in study.jobs()])
+
+    def tell(job: EpisodeJob, result: Result) -> None:
+        page.add(result)
+        if ended is not None:
+            ended(result)
+
     done = run_study(
-        BenchStudy(scenario, config),
+        study,
         out,
         overwrite=config.overwrite,
         workers=config.workers,
         engine=config.engine,
         progress=progress or silent,
+        ended=tell,
     )
     return done.results, list(done.report.problems)
+
+
+class SoFar:
+    """The page and the tables of a benchmark that has not ended; they grow as methods end.
+
+    Args:
+        folder: where they go; made with the first.
+        facts: of the run, as config.json has them.
+        keys: of all methods, in the order in which they are shown.
+    """
+
+    def __init__(self, folder: Path, facts: dict[str, Any], keys: Sequence[str]) -> None:
+        self.folder, self.facts, self.keys = folder, facts, keys
+        self.results: dict[str, Result] = {}
+        self._written = -math.inf  # when [s]
+
+    def add(self, result: Result) -> None:
+        """One more method has ended."""
+        self.results[result.key] = result
+        if monotonic() - self._written < REWRITE_AFTER and len(self.results) < len(self.keys):
+            return
+        if not self.folder.is_dir():
+            with writing(self.folder):
+                self.folder.mkdir(parents=True)
+            note(f"{self.folder / 'index.html'} grows as methods end")
+        with writing(self.folder):
+            write_so_far([self.results[key] for key in self.keys if key in self.results], len(self.keys), self.folder, self.facts)
+        self._written = monotonic()
 
 
 def describe(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
@@ -165,7 +221,7 @@ def _render_videos(
             key = result.key
             path = folder / "video" / f"{key}.mp4"
             log = read_log(folder / "logs" / f"{key}.mcap")
-            render_video(log, path, progress=partial(progress, f"video {key}"))
+            render_video(log, path, progress=partial(progress, f"video of {result.display}"))
             videos.append(path)
     except MarlbcError as error:
         return videos, [f"no video: {error}"]

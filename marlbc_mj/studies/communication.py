@@ -1,4 +1,4 @@
-"""What communication costs a distributed supervisor, and how long agents take to agree."""
+"""Costs of communication for a distributed supervisor, and the time that agents take to agree."""
 
 import csv
 from collections.abc import Sequence
@@ -92,7 +92,7 @@ class CommunicationStudy:
                 table.writerows(rows)
             facts = {"supervisor": self.supervisor, "controller": self.controller, "seeds": self.seeds, "shield": self.shield}
             write_json(out / "config.json", {**facts, "missions": self.missions, **provenance()})
-        return Report(to_markdown(case_table(rows)))
+        return Report(to_markdown(case_table(rows)), rows)
 
 
 def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | None]) -> dict[str, Any]:

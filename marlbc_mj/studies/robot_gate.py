@@ -26,6 +26,7 @@ from marlbc_mj.studies.runner import Conclusion, counting, run_study
 from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
 from marlbc_mj.util.errors import SimulationError, unknown
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 
 GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
@@ -33,7 +34,7 @@ GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
-"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
+"""Supervisors of the benchmark, with lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
 
 GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
@@ -41,7 +42,7 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
         position_error_gain=robot.gains[0], velocity_error_gain=robot.gains[1], identifier_rate=10.0 * robot.gains[1] / 16.0
     ),
 }
-"""With the robot's gains per unit mass."""
+"""Controllers with the robot's gains per unit mass."""
 
 STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
 CLIP = (0.10, 0.66)  # shares of the mission
@@ -107,7 +108,7 @@ class GateStudy:
             (out / "gate.md").write_text(text + "\n")
             rows = [row._asdict() for row in results]
             write_json(out / "gate.json", {"schema": 1, "controller": self.controller, "rows": rows})
-        return Report(text)
+        return Report(text, list(results))
 
 
 def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateRow, Trajectory]:
@@ -195,11 +196,11 @@ def gate_table(rows: Sequence[GateRow]) -> str:
 
 def _gate_cells(r: GateRow) -> tuple[str, ...]:
     if r.failure is not None:
-        return (r.robot, r.supervisor, f"failed: {r.failure}", *("–",) * 7)
+        return (r.robot, display_name(r.supervisor), f"failed: {r.failure}", *("–",) * 7)
     flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
     return (
         r.robot,
-        r.supervisor,
+        display_name(r.supervisor),
         f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
         f"{r.violation:.2f} s",
         str(r.collisions),
@@ -245,8 +246,7 @@ def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str
         folder / f"{name}.mp4",
         VideoStyle(
             speed=float(max(1, round((end - start) / 10.0))),
-            width=960,
-            height=540,
+            size=(960, 540),
             camera="close",
             start=start,
             end=end,

@@ -1,4 +1,4 @@
-"""What teams of any size cost: time per agent and mission step, and memory of a world, from 4 to 256 agents.
+"""Cost of teams from 4 to 256 agents: time per agent and mission step, and memory of a world.
 
 Every size runs the same mission: a grid formation among discs, as many per agent at every size, each agent under OA>AA>FM, so
 that every mission step asks for the nearest obstacle and the nearest neighbor of everybody. Sizes take turns within one process,
@@ -29,6 +29,7 @@ from marlbc_mj.studies.runner import Conclusion, run_study
 from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import cpu, provenance
 
@@ -110,7 +111,7 @@ class ScaleStudy:
         figures = self.gather(results)
         if out is not None:
             write_scale(figures, out)
-        return Report(to_markdown(scale_table(figures)))
+        return Report(to_markdown(scale_table(figures)), figures)
 
 
 def run_scale(
@@ -193,12 +194,12 @@ def resident() -> int:
 
 
 def scale_table(figures: dict[str, Any]) -> Table:
-    """One row a size."""
+    """One row per size."""
     columns = (
         Column("", "agents"),
         Column("mission step", "µs per agent"),
         Column("mission step", f"of {SIZES[0]} agents'"),
-        *(Column("decision", f"{name}, µs per agent") for name in SCALED_SUPERVISORS),
+        *(Column("decision", f"{display_name(name)}, µs per agent") for name in SCALED_SUPERVISORS),
         Column("memory", "KiB per world"),
         Column("memory", "KiB per agent"),
     )

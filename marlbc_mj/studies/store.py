@@ -72,7 +72,7 @@ class RunStore:
             self._writer = None
 
     def begin(self, about: Mapping[str, Any]) -> None:
-        """Write what this run is, and remove what killed workers left."""
+        """Write the description of this run, and remove files of killed workers."""
         with writing(self.folder):
             self.files.mkdir(exist_ok=True)
             for path in self.files.glob(f"{_BEGUN}*"):
@@ -80,7 +80,7 @@ class RunStore:
         write_json(self.folder / _RUN, {"schema": STORE_SCHEMA, **about})
 
     def about(self) -> dict[str, Any]:
-        """What the last run here was; empty where none has begun.
+        """Description of the last run in this folder; empty where none has begun.
 
         Raises:
             ConfigurationError: the folder was written by something else, or by another version.

@@ -1,4 +1,6 @@
-"""What a mission supervisor is: observations of B teams in, orders out, with velocities or without, at every mission step."""
+"""The interface of mission supervisors: observations of B teams in, orders out, with or without velocities, at every mission
+step.
+"""
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -86,12 +88,18 @@ def split_decision(decision: Decision, shape: tuple[int, ...]) -> tuple[np.ndarr
     orders, velocity = decision if isinstance(decision, Blend) else (decision, None)
     if not isinstance(orders, np.ndarray) or orders.dtype.kind not in "iu":
         found = orders.dtype if isinstance(orders, np.ndarray) else type(orders).__name__
-        raise ConfigurationError(f"a supervisor's orders must be an array of integers with shape {shape}, got {found}")
+        names = " of names; scenario.orders.index gives the number of a name" if _names(orders) else ""
+        raise ConfigurationError(f"a supervisor's orders must be an array of integers with shape {shape}, got {found}{names}")
     if orders.shape != shape:
         raise ConfigurationError(f"a supervisor's orders must have shape {shape}, got {orders.shape}")
     if velocity is not None and np.shape(velocity) != (*shape, 2):
         raise ConfigurationError(f"a supervisor's velocities must have shape {(*shape, 2)}, got {np.shape(velocity)}")
     return orders, velocity
+
+
+def _names(orders: Any) -> bool:
+    """Whether orders were given by their names."""
+    return isinstance(next(iter(np.asarray(orders, dtype=object).ravel()), None), str)
 
 
 def carry_out(world: World, decision: Decision) -> Step:

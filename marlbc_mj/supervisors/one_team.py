@@ -1,4 +1,4 @@
-"""Supervisors that decide for one team, made to decide for B: one memory per team, one call per team."""
+"""Supervisors of one team, wrapped to decide for B teams: one memory per team, one call per team."""
 
 import inspect
 from dataclasses import dataclass
@@ -69,6 +69,8 @@ def batched(supervisor: Supervisor | OneTeamSupervisor) -> Supervisor:
     Raises:
         ConfigurationError: an object without ``start`` and ``decide``.
     """
+    if isinstance(supervisor, type):
+        raise ConfigurationError(f"supervisor is the class {supervisor.__name__}; make one of it: {supervisor.__name__}()")
     lacking = [each for each in ("start", "decide") if not callable(getattr(supervisor, each, None))]
     if lacking:
         raise ConfigurationError(f"a supervisor has start and decide; {type(supervisor).__name__} lacks {', '.join(lacking)}")

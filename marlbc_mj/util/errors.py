@@ -1,7 +1,9 @@
-"""The two ways in which this package refuses to go on; every message names the value and the valid ones."""
+"""The errors that this package raises on purpose; every message names the value and the valid ones."""
 
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+
+from marlbc_mj.util.text import nearest_word
 
 
 class MarlbcError(Exception):
@@ -21,14 +23,17 @@ class SimulationError(MarlbcError, RuntimeError):
 
 
 class NoSpaceError(ConfigurationError):
-    """An output that the disk has no room for: the command was right, what it was to leave is missing. Exit status 3."""
+    """An output that the disk has no room for; the command itself was right. Exit status 3."""
 
     exit_status = 3
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
-    """The error for a name that is not in a list: says which one and shows the list."""
-    return ConfigurationError(f"unknown {kind} {name!r}; choose from: {', '.join(valid)}")
+    """The error for a name that is not in a list: says which one and which is spelled like it, and shows the list."""
+    names = list(valid)
+    like = nearest_word(name, names) if isinstance(name, str) else None
+    perhaps = "" if like is None else f" perhaps {like!r};"
+    return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Output folders and files, which appear whole or not at all, and never in the place of what somebody else wrote."""
+"""Output folders and files, which appear whole or not at all, and never replace files of others."""
 
 import errno
 import json
@@ -93,7 +93,7 @@ def busy(out: Path) -> str:
 
 
 def _counts_not(name: str) -> bool:
-    """Whether what has this name in an output folder is something unfinished of this program's."""
+    """Whether a name in an output folder belongs to an unfinished output of this program."""
     return PARTIAL in name or name == JOBS_FOLDER
 
 

@@ -1,4 +1,6 @@
-"""A user's Python file as a module: the same one in every process, whatever the current folder is, and anew after an edit."""
+"""A user's Python file as a module: the same one in every process, whatever the current folder is, and run again after an
+edit.
+"""
 
 import importlib.util
 import os
@@ -27,7 +29,13 @@ _MOST_BESIDE = 500
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one."""
+    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one.
+
+    Raises:
+        ConfigurationError: something else than a text.
+    """
+    if not isinstance(name, str):
+        raise ConfigurationError(f"a name must be a text, got {type(name).__name__}")
     file, colon, attribute = name.rpartition(":")
     return (file, attribute) if colon and file.endswith(_SUFFIX) else (name, "")
 
@@ -134,7 +142,7 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
 
 
 def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:
-    """What a user's code returns.
+    """The return value of a user's code.
 
     Args:
         call: the user's code.

@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
+from numbers import Integral, Real
 from types import GenericAlias
 from typing import Any, Literal, NamedTuple, NewType, TypeVar, get_args, get_origin, get_type_hints
 
@@ -54,6 +55,36 @@ def check(settings: Any, prefix: str = "") -> None:
         for rule in getattr(hint, "__metadata__", ()):
             if not rule.holds(value):
                 raise ConfigurationError(f"{prefix}{name} {rule.words}, got {value}")
+
+
+def check_kinds(settings: Any, prefix: str = "") -> None:
+    """Check that fields of a dataclass that are annotated as numbers, texts or dataclasses hold such; others may hold anything.
+
+    Args:
+        settings: the dataclass.
+        prefix: text before the fields' names in messages.
+
+    Raises:
+        ConfigurationError: naming the first field that holds something else.
+    """
+    owner: Any = type(settings)
+    for name, hint in annotations(owner).items():
+        kind = hint.__origin__ if hasattr(hint, "__metadata__") else hint
+        value = getattr(settings, name)
+        if kind in _KINDS:
+            wanted = _KINDS[kind]
+            right = isinstance(value, _ABSTRACT.get(kind, kind)) and isinstance(value, bool) == (kind is bool)
+        elif is_dataclass(kind) and isinstance(kind, type):
+            wanted, right = f"a {kind.__name__}", isinstance(value, kind)
+        else:
+            continue
+        if not right:
+            raise ConfigurationError(f"{prefix}{name} must be {wanted}, got {value!r}")
+
+
+_KINDS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+_ABSTRACT: dict[Any, type] = {float: Real, int: Integral}
+"""What NumPy's numbers are, too."""
 
 
 @cache

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from marlbc_mj.report.table import to_markdown
+from marlbc_mj.report.table import table_document, to_markdown
 from marlbc_mj.studies.ablation.cases import AblationRow, Case, Measured, Question, compare_rows, measure_case
 from marlbc_mj.studies.ablation.page import ablation_table, write_ablation_page
 from marlbc_mj.studies.engines import EngineName
@@ -48,7 +48,8 @@ class AblationStudy:
         if out is not None:
             facts = {"revision": git_revision(), "versions": ", ".join(f"{k} {v}" for k, v in versions().items())}
             write_ablation_page(rows, out, facts)
-        return Report("\n".join(to_markdown(ablation_table(question, made)) for question, made in rows.values()))
+        tables = [ablation_table(question, made) for question, made in rows.values()]
+        return Report("\n".join(map(to_markdown, tables)), list(map(table_document, tables)))
 
 
 def run_ablation(

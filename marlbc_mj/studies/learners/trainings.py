@@ -1,4 +1,4 @@
-"""The study of learners: one training per variant and seed, in a folder of its own, where it goes on after a stop.
+"""The study of learners: one training per variant and seed, in a folder of its own, in which it resumes after a stop.
 
 A run that finished leaves ``DONE`` with the hash of its configuration, one that failed ``FAILED`` with its reason.
 """
@@ -105,7 +105,7 @@ class LearnerStudy:
         """CSV files, table and figure of all runs in the folder of the study, also those of earlier calls."""
         rows, curves = records.collect(self.out)
         if not rows or out is None:
-            return Report(to_markdown(learners_table(rows)) if rows else "")
+            return Report(to_markdown(learners_table(rows)) if rows else "", list(rows))
         records.write_csvs(out, rows, curves)
         return compare_learners(rows, curves, out)
 
@@ -114,7 +114,7 @@ def compare_learners(rows: Sequence[CsvLine], curves: Sequence[CsvLine], folder:
     """Table and figure from the lines of the CSV files alone."""
     write_comparison(folder, rows, curves)
     table = to_markdown(learners_table(rows))
-    return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show it all")
+    return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show it all", list(rows))
 
 
 def train_learners(study: LearnerStudy, workers: int, progress: Progress = silent) -> int:

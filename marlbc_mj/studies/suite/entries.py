@@ -1,15 +1,15 @@
-"""Which methods fly the suite: every supervisor under the composition that it is meant for, and every controller."""
+"""Methods that fly the suite: every supervisor under the composition that it is meant for, and every controller."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
 
 from marlbc_mj.controllers import CONTROLLERS, make_controller
 from marlbc_mj.results.layout_runs import Method
-from marlbc_mj.results.summary import short_name
 from marlbc_mj.scenarios.base import COMPOSITIONS
 from marlbc_mj.studies.suite.definition import TRACKS
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.method_names import short_name
 
 SUITE_SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
 """Supervisors that try out futures at every decision. A quick run leaves them out unless they are named."""
@@ -22,7 +22,7 @@ FOR_SET_BASED = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed"
 
 
 class Choice(NamedTuple):
-    """What the command line chooses among the methods."""
+    """The selection of methods by the command line."""
 
     supervisors: tuple[str, ...] | None = None  # None: all that are not too slow
     controllers: tuple[str, ...] | None = None  # of the control track; None: all

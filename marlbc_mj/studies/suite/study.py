@@ -5,7 +5,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
-from marlbc_mj.report.leaderboard import write_leaderboard
+from marlbc_mj.report.leaderboard import leading_tables, write_leaderboard
+from marlbc_mj.report.table import table_document, to_markdown
 from marlbc_mj.results.layout_runs import LayoutRun, MissionRuns
 from marlbc_mj.studies.addresses import code_version
 from marlbc_mj.studies.protocol import Report, Watch
@@ -58,8 +59,10 @@ class SuiteStudy:
         flown = {job.method: job.entrant for job in self.jobs()}
         problems = render_clips(gathered.groups, flown, out, progress) if self.clips else []
         write_suite(gathered, out)
-        text = write_leaderboard(gathered.groups, gathered.facts, track_summaries(), out)
-        return Report(text, (*problems, *_strangeness(gathered)))
+        tables = write_leaderboard(gathered.groups, gathered.facts, track_summaries(), out)
+        document = {"facts": gathered.facts, "tables": list(map(table_document, tables))}
+        text = "\n".join(map(to_markdown, leading_tables(tables)))
+        return Report(text, document, (*problems, *_strangeness(gathered)))
 
 
 def _strangeness(results: SuiteResults) -> list[str]:

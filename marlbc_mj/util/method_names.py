@@ -1,12 +1,13 @@
-"""Names and sources of supervisors and controllers as a leaderboard shows them; the literature is listed in REFERENCES.md."""
+"""Names and sources of supervisors and controllers as people read them; the literature is listed in REFERENCES.md."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 _PAPER = "Zhang et al. 2024"
 
 
 class Source(NamedTuple):
-    """How a method is called in print, and who is to be cited for it."""
+    """Display name of a method, and its citation."""
 
     display: str
     citation: str = ""  # empty: a user's own
@@ -45,15 +46,39 @@ NAMES = {
     "terminal-sliding": Source("Terminal sliding mode", "Feng et al. 2002"),
     "predefined-time": Source("Predefined-time", "Sánchez-Torres et al. 2018"),
 }
-"""By the name of the command line."""
+"""Sources by command-line name."""
 LIMITED_SUFFIX = "-limited"
 
 
+def short_name(name: str) -> str:
+    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
+    file, _, attribute = name.rpartition(":")
+    if file:
+        return f"{Path(file).stem}.{attribute}"
+    return Path(name).stem if "/" in name or name.endswith(".safetensors") else name
+
+
 def source_of(name: str) -> Source:
-    """Of a supervisor or controller; a name that is not listed stands for itself."""
+    """The source of a supervisor or controller; one that is not listed has its short name."""
     if name in NAMES:
         return NAMES[name]
     if name.endswith(LIMITED_SUFFIX) and name.removesuffix(LIMITED_SUFFIX) in NAMES:
         law = NAMES[name.removesuffix(LIMITED_SUFFIX)]
         return Source(f"{law.display}, limited", law.citation)
-    return Source(name)
+    return Source(short_name(name))
+
+
+def display_name(name: str) -> str:
+    """Display name of a supervisor or controller."""
+    return source_of(name).display
+
+
+def display_key(key: str) -> str:
+    """Display name of a method by its key, ``mpcms+sorlc``; any other text as it is."""
+    supervisor, plus, controller = key.partition("+")
+    return display_method(supervisor, controller) if plus and " " not in key else key
+
+
+def display_method(supervisor: str, controller: str) -> str:
+    """Display name of a supervisor with a controller: ``MPCMS + SORLC``."""
+    return f"{display_name(supervisor)} + {display_name(controller)}"

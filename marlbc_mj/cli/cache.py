@@ -1,0 +1,12 @@
+"""The advice that a command gives where compiled code cannot be cached."""
+
+import sys
+
+from marlbc_mj.util.progress import note
+
+
+def suggest_cache() -> None:
+    """Say where compiled code could be kept, if this command has compiled some that it could not keep."""
+    compiling = sys.modules.get("marlbc_mj.core.compiling")  # not imported for this: most commands compile nothing
+    if compiling is not None and compiling.compiled_in_vain():
+        note("compiled code cannot be kept here and is compiled by every command; set NUMBA_CACHE_DIR to a folder to write into")

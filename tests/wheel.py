@@ -1,0 +1,75 @@
+"""Is the wheel small, and does it work where nothing else of the project is? ``python tests/wheel.py dist [--install FOLDER]``.
+
+With ``--install`` it goes into a new environment in the folder, which is removed afterwards, and an episode is flown there. What
+is printed: seconds and megabytes of the installation, and seconds to the end of the first and the second command.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import time
+import venv
+from collections.abc import Sequence
+from pathlib import Path
+
+MOST_BYTES = 2_000_000
+ROOT = Path(__file__).resolve().parents[1]
+EPISODE = ("run", "paper", "--controller", "pd", "--duration", "1", "--overwrite", "--quiet")
+
+
+def the_wheel(folder: Path) -> Path:
+    """The one wheel in a folder; the process ends with 1 where there is none, or it is too large."""
+    wheels = sorted(folder.glob("*.whl"))
+    if len(wheels) != 1:
+        sys.exit(f"{folder} holds {len(wheels)} wheels")
+    for path in (*wheels, *folder.glob("*.tar.gz")):
+        size = path.stat().st_size
+        print(f"{path.name}: {size / 1e6:.2f} MB")
+        if size > MOST_BYTES:
+            sys.exit(f"{path} is larger than {MOST_BYTES / 1e6:g} MB")
+    return wheels[0]
+
+
+def install(wheel: Path, folder: Path, extras: Sequence[str]) -> None:
+    """A new environment with the wheel, from which commands are run in an empty folder."""
+    shutil.rmtree(folder, ignore_errors=True)
+    began = time.monotonic()
+    venv.create(folder / "env", with_pip=True)
+    python, wanted = folder / "env" / "bin" / "python", f"{wheel}[{','.join(extras)}]" if extras else str(wheel)
+    call([str(python), "-m", "pip", "install", "--quiet", "--no-compile", "-c", str(ROOT / "constraints.txt"), wanted], folder)
+    held = sum(path.lstat().st_size for path in (folder / "env").rglob("*") if path.is_file() and not path.is_symlink())
+    print(f"installed {wheel.name} with {' '.join(extras) or 'no extras'}: {time.monotonic() - began:.0f} s, {held / 1e6:.0f} MB")
+    marlbc = str(folder / "env" / "bin" / "marlbc")
+    for line in (("--version",), ("list", "--quiet"), EPISODE, EPISODE):
+        began = time.monotonic()
+        call([marlbc, *line], folder)
+        print(f"marlbc {' '.join(line)}: {time.monotonic() - began:.1f} s")
+    if "parquet" in extras:
+        call([marlbc, "export", "out/run/logs/scripted+pd.mcap", "episode.parquet"], folder)
+    shutil.rmtree(folder)
+
+
+def call(command: Sequence[str], folder: Path) -> None:
+    """Run a command in the folder with nothing of the caller's Python; the process ends with its status where that is not 0."""
+    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV", "PIP_TARGET")}
+    done = subprocess.run(command, cwd=folder, env={**environment, "NUMBA_CACHE_DIR": str(folder.resolve() / "cache")})
+    if done.returncode:
+        sys.exit(done.returncode)
+
+
+def main() -> None:
+    """Check the wheel, and install it if asked."""
+    options = argparse.ArgumentParser(description=__doc__)
+    options.add_argument("dist", type=Path)
+    options.add_argument("--install", type=Path)
+    options.add_argument("--extras", nargs="*", default=[])
+    given = options.parse_args()
+    wheel = the_wheel(given.dist)
+    if given.install is not None:
+        install(wheel.resolve(), given.install.resolve(), given.extras)
+
+
+if __name__ == "__main__":
+    main()
