@@ -123,11 +123,11 @@ def _unbox_reference(kind, value, c):
 
 
 class EntryType(types.Type):
-    """numba's type of :class:`Entry`: ``kinds`` are those that its function takes."""
+    """numba's type of :class:`EntryPoint`: ``kinds`` are those that its function takes."""
 
     def __init__(self, kinds: tuple[types.Type, ...]) -> None:
         self.kinds = kinds
-        super().__init__(name=f"Entry({', '.join(map(str, kinds))})")
+        super().__init__(name=f"EntryPoint({', '.join(map(str, kinds))})")
 
 
 class RecordType(types.Type):
@@ -143,7 +143,7 @@ class _EntryModel(models.PrimitiveModel):
         super().__init__(manager, kind, ir.IntType(64))
 
 
-class Entry:
+class EntryPoint:
     """Address of a compiled function, as :func:`call` takes it. Made by :func:`entry`; :func:`no_entry` has its type alone."""
 
     def __init__(self, address: int, kinds: tuple[types.Type, ...]) -> None:
@@ -200,7 +200,7 @@ def _call_at(typing_context, entry, *arguments):
 
 
 class _Call(_Intrinsic):  # type: ignore[misc]
-    """Call a function that returns a whole number: itself in Python, by its :class:`Entry` in compiled code."""
+    """Call a function that returns a whole number: itself in Python, by its :class:`EntryPoint` in compiled code."""
 
     def __call__(self, function, *arguments):
         return function(*arguments)
@@ -221,10 +221,10 @@ def entry(function: Law, *arguments: Any) -> Any:
     found = function.overloads[taken]  # type: ignore[attr-defined]
     if types.unliteral(found.signature.return_type) != types.int64:
         raise TypeError(f"{function} returns {found.signature.return_type}; called by address, it must return a whole number")
-    return Entry(int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name)), tuple(kinds))
+    return EntryPoint(int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name)), tuple(kinds))
 
 
 def no_entry(*arguments: Any) -> Any:
     """A field's value before its :func:`entry` is known: of the same type. A class of records stands for a reference to one."""
     kinds = (RecordType(a.__name__) if isinstance(a, type) else _passed(numba.typeof(a)) for a in arguments)
-    return Entry(0, tuple(kinds))
+    return EntryPoint(0, tuple(kinds))
