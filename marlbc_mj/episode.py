@@ -39,7 +39,7 @@ class Frame(NamedTuple):
 
     @property
     def first(self) -> Record:
-        """The first substep, (N, 2) each: where the team was when orders were given, and what it did first."""
+        """The first substep, (N, 2) each: the state in which orders were given, and the first forces."""
         return Record(*(rows[0] for rows in self.record))
 
 
@@ -173,7 +173,7 @@ def _shield(frames: list[Frame]) -> ShieldCounts | None:
 
 
 def _hearing(frames: list[Frame]) -> Hearing | None:
-    """Who heard whom at each mission step; None where nobody said anything, or all heard everything."""
+    """Who heard whom at each mission step; None without communication or with ideal communication."""
     moments = [f.hearing for f in frames if f.hearing is not None]
     return Hearing(*(np.array(rows) for rows in zip(*moments, strict=True))) if moments else None
 

@@ -18,7 +18,7 @@ from marlbc_mj.util.seeding import stream
 
 
 class DecisionOutcome(NamedTuple):
-    """What a decision of every team led to."""
+    """Outcome of one decision of every team."""
 
     state: np.ndarray  # (B, S) of the next decision; where an episode ended, of the new one
     final_state: np.ndarray  # (B, S) the same, but the true successor where an episode ended

@@ -113,25 +113,25 @@ class FormationTask(composer.Task):
             ConfigurationError: another shape, no whole numbers, or an index that is no order.
         """
         orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
-        self._start(0, orders, self._orders_alone, *self._arguments[:-1])
+        self._start(0, orders, self._orders_alone, *self._arguments[1:-1])
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
-        mission, _, native, plant, state, _ = self._arguments
+        _, mission, _, native, plant, state, _ = self._arguments
         failed = self._apply(0, self._substep, mission, native, plant, state)
         if failed:
             raise team.diverged(self.plan, self.state, 0, failed, int(self.state.steps[0]))
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Measure, and advance the reference position."""
-        mission, _, native, plant, state, record = self._arguments
+        _, mission, _, native, plant, state, record = self._arguments
         self._settle(0, self._substep, mission, native, plant, state, record)
         self._substep += 1
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Clearances, formation identifier and reward."""
-        mission, _, _, _, state, _ = self._arguments
+        _, mission, _, _, _, state, _ = self._arguments
         loop.finish(0, mission, state)
 
     def get_reward(self, physics: mjcf.Physics) -> float:

@@ -1,4 +1,4 @@
-"""What people hand to the environments: scenarios and controllers, by name or made in Python, and arrays of actions."""
+"""Arguments of the environments: scenarios and controllers, by name or made in Python, and arrays of actions."""
 
 from collections.abc import Mapping
 from dataclasses import replace

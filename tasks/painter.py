@@ -88,7 +88,7 @@ class Drawn:
 
 
 _painting: WeakSet[Painter] = WeakSet()
-"""All that have drawn; where somebody forgets to close one, its OpenGL context is given back before the interpreter ends."""
+"""All painters with an OpenGL context; one that is not closed gives it back before the interpreter ends."""
 
 
 def _close_all() -> None:

@@ -1,6 +1,7 @@
 """Shared by all tests: hypothesis settings, and the expensive episodes, each run once per session."""
 
 import os
+import signal
 from collections.abc import Callable
 from functools import cache
 from typing import Any
@@ -17,6 +18,9 @@ from marlbc_mj.supervisors import make_supervisor
 
 settings.register_profile("marlbc", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("marlbc")
+
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background; the programs that tests interrupt inherit it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MOST_WORKERS = 8  # of parallel tests: each takes up to 1.2 GB
 

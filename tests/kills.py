@@ -28,11 +28,12 @@ from marlbc_mj.studies.packs import entries, packs
 
 MOST_SECONDS = 400.0  # of one command
 ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
-TIMES = ("decision", "wall", "solver", "command", "seconds", "steps_per_s", "git_revision")
+TIMES = ("decision", "wall", "cpu_s", "solver", "command", "seconds", "steps_per_s", "git_revision")
 """What may differ between two runs: keys and columns with any of these in their names."""
 TEMPORARY = (".partial", ".old-", ".begun-", ".new-")
 """Parts of names that nothing has that is left in the end."""
 TINY = ["worlds=8", "hidden=8", "batch=16", "updates=1", "capacity=400", "start_length=1.0", "evaluate_every=800"]
+SMALL = ["families=field", "teams=wedge-4", "worlds=2", "hidden=8", "batch=16", "updates=2", "layouts=1", "evaluate_every=600"]
 SHORT = ["--duration", "4", "--overwrite"]
 RAY_PARTS = ("ray::", "raylet", "gcs_server")
 
@@ -90,8 +91,9 @@ TARGETS = {
         ("train", "--budget", "6400", "--threads", "1", "--overwrite", "--out", "OUT", "--set", *TINY),
         again=_resumed,
     ),
+    "general": Target(("train", "marlms-general", "--budget", "2000", "--overwrite", "--out", "OUT", "--set", *SMALL)),
     "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
-    "video": Target(("video", "LOG", "--width", "160", "--height", "90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
+    "video": Target(("video", "LOG", "--size", "160x90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
 }
 """By name."""
 
@@ -184,10 +186,11 @@ class Killer:
         until = time.monotonic() + ORPHANS_END
         while (alive := list(self.processes())) and time.monotonic() < until:
             time.sleep(0.2)
+        names = [_command_line(process) for process in alive]
         for process in alive:
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
-        return [f"{len(alive)} processes stay"] * bool(alive) + torn(_output(name, out))
+        return [f"{len(alive)} processes stay: {names}"] * bool(alive) + torn(_output(name, out))
 
     def processes(self) -> Iterator[int]:
         """Those that descend from a command of ours."""
@@ -245,10 +248,15 @@ def _descendants(parent: int) -> list[int]:
 
 
 def _is_worker(process: int) -> bool:
+    line = _command_line(process)
+    return "spawn_main" in line or line.startswith(RAY_PARTS) or "/raylet" in line
+
+
+def _command_line(process: int) -> str:
+    """What a process was started as; empty if it has gone."""
     with suppress(OSError):
-        line = Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")
-        return "spawn_main" in line or line.startswith(RAY_PARTS) or "/raylet" in line
-    return False
+        return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:200]
+    return ""
 
 
 def _output(name: str, out: Path) -> Path:

@@ -27,7 +27,7 @@ def result(request: pytest.FixtureRequest, switch: Scenario) -> Calibration:
 
 
 def test_search_finds_the_printed_maximum(result: Calibration) -> None:
-    """The largest maximum is the printed one, within the tolerance; found gain and default differ by less than 1 %."""
+    """The largest maximum is the published one, within the tolerance; found gain and default differ by less than 1 %."""
     assert max(result.at_found) == pytest.approx(max(result.printed), rel=1e-4)
     assert result.found == pytest.approx(result.shipped, rel=0.01)
     assert result.shipped == CALIBRATED[result.controller].velocity_gain
@@ -35,7 +35,7 @@ def test_search_finds_the_printed_maximum(result: Calibration) -> None:
 
 
 def test_one_gain_explains_all_agents_but_one(result: Calibration) -> None:
-    """Every other maximum is within half a percent of the printed one, too; agent 2's under fixed-time is not."""
+    """Every other maximum is within half a percent of the published one, too; agent 2's under fixed-time is not."""
     exceptions = {"finite-time": set(), "fixed-time": {1}}[result.controller]
     for errors in (result.errors, result.shipped_errors):
         assert {agent for agent, error in enumerate(errors) if abs(error) > 0.005} == exceptions
@@ -59,16 +59,17 @@ def test_wrong_requests_are_refused(switch: Scenario) -> None:
         calibrate("pd")
     with pytest.raises(ConfigurationError, match="tolerance must be positive"):
         calibrate("finite-time", switch, tolerance=0.0)
-    with pytest.raises(SimulationError, match="no gain from 2 to 32 /s gives the printed maximum"):
+    with pytest.raises(SimulationError, match="no gain from 2 to 32 /s gives the published maximum"):
         calibrate("finite-time", replace(switch, schedule=(Window(0.0, 0.0, -1, "FM"),)))
 
 
 def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, switch: Scenario) -> None:
-    """Printed, found and shipped row of each controller; an unknown controller is one line."""
+    """Published, found and shipped row of each controller; an unknown controller is one line."""
     monkeypatch.setattr("marlbc_mj.studies.calibration.paper", lambda: switch)
     main(["calibrate", "--controllers", "fixed-time"])
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split("|")[1].strip() for line in lines[2:]] == [f"fixed-time, {row}" for row in ("printed", "found", "shipped")]
+    rows = [line.split("|")[1].strip() for line in lines[2:]]
+    assert rows == ["fixed-time, published", "fixed-time, found", "fixed-time, shipped"]
     with pytest.raises(SystemExit) as stopped:
         main(["calibrate", "--controllers", "pd"])
     assert stopped.value.code == 2
@@ -78,7 +79,7 @@ def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatc
 def test_table_has_a_row_for_each_gain() -> None:
     made = Calibration("x", (384.0, 768.0), 7.9, 8.0, (383.99999, 768.0), (385.0, 769.0), 5)
     assert calibration_lines([made])[2:] == [
-        "| x, printed | – | 384 / 768 | – |",
+        "| x, published | – | 384 / 768 | – |",
         "| x, found | 7.9000 | 384.00 / 768.00 | +0.00% / +0.00% |",
         "| x, shipped | 8.0000 | 385.00 / 769.00 | +0.26% / +0.13% |",
     ]

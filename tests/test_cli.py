@@ -245,7 +245,7 @@ def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.Captur
     assert json.loads(capsys.readouterr().out)["metadata"]["marlbc"]["supervisor"] == "scripted"
     main(["log", "export", str(log), str(out / "episode.npz")])
     assert np.load(out / "episode.npz")["position"].shape == (20, 4, 2)
-    main(["video", str(log), "--width", "320", "--height", "180", "--fps", "5"])
+    main(["video", str(log), "--size", "320x180", "--fps", "5"])
     assert log.with_suffix(".mp4").stat().st_size > 1000
     torn = out / "torn.mcap"
     torn.write_bytes(log.read_bytes()[:-100])

@@ -11,6 +11,7 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.controllers import CONTROLLERS
+from marlbc_mj.core.disturbances import DISTURBANCES
 from marlbc_mj.studies.learners import VARIANTS
 from marlbc_mj.supervisors import SUPERVISORS
 from marlbc_mj.training.methods import METHODS
@@ -19,7 +20,7 @@ from marlbc_mj.training.rivals import LEARNERS
 DOCS = Path(__file__).parent.parent / "docs"
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 FENCE = re.compile(r'^```(\w+)(?: title="([\w./-]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
-MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp))""")
+MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp|gif))""")
 MOST_LINES = 60
 MOST_BYTES, MOST_BYTES_TOGETHER = 150_000, 1_500_000
 
@@ -58,7 +59,7 @@ def run_page(page: Path, folder: Path) -> None:
 @pytest.fixture
 def own_names():
     """What a page registers is forgotten again."""
-    before = [(registry, dict(registry)) for registry in (CONTROLLERS, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
+    before = [(registry, dict(registry)) for registry in (CONTROLLERS, DISTURBANCES, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
     yield
     for registry, entries in before:
         registry.clear()
@@ -74,7 +75,8 @@ def test_a_how_to_runs(page, tmp_path, monkeypatch):
 
 
 def test_there_is_a_how_to_for_everything_of_ones_own():
-    assert {"command_line", "controller", "leaderboard", "learner", "robot", "scenario", "supervisor"} <= {p.stem for p in HOW_TO}
+    pages = {"behavior", "command_line", "controller", "disturbance", "leaderboard", "learner", "robot", "scenario", "supervisor"}
+    assert pages <= {page.stem for page in HOW_TO}
 
 
 def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():
@@ -100,6 +102,13 @@ def test_pages_load_nothing_from_elsewhere():
     for page in DOCS.rglob("*.md"):
         assert not re.search(r"""<(?:script|link|iframe)|src=["']?(?:https?:)?//|!\[[^]]*\]\(http""", page.read_text()), page
     assert "font: false" in (DOCS.parent / "mkdocs.yml").read_text()
+
+
+def test_search_works_in_pages_opened_from_the_disk():
+    """Browsers start no workers there: the index is a script, and a shim of the project's own pages stands in for workers."""
+    settings = (DOCS.parent / "mkdocs.yml").read_text()
+    assert "  - offline" in settings and "polyfills: [assets/iframe-worker.js]" in settings
+    assert "window.Worker=o" in (DOCS / "assets" / "iframe-worker.js").read_text()
 
 
 def test_every_page_is_in_the_navigation():

@@ -15,7 +15,7 @@ from test_files import small_disk
 
 from marlbc_mj.cli import main
 from marlbc_mj.cli.robot import RobotGateCommand
-from marlbc_mj.recording import video
+from marlbc_mj.recording.video import VideoStyle, _encode
 from marlbc_mj.studies import robot_gate
 from marlbc_mj.util.errors import SimulationError
 
@@ -87,8 +87,12 @@ def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers)
             time.sleep(0.05)
         time.sleep(1.0)
         os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
-        said = process.stderr.read()
-        assert process.wait(60) == status
+        try:
+            _, said = process.communicate(timeout=100)
+        finally:
+            if process.poll() is None:  # whatever is wrong, it does not stay
+                os.killpg(process.pid, signal.SIGKILL)
+        assert process.returncode == status
     assert said.strip().splitlines()[-1] in ("marlbc: terminated", "marlbc: interrupted") and "Traceback" not in said
     assert list(tmp_path.iterdir()) == []
 
@@ -142,15 +146,15 @@ def test_a_video_that_does_not_fit_is_an_error(tmp_path):
     """ffmpeg writes what it can and looks finished: its exit status tells."""
     with small_disk(tmp_path / "disk") as disk:
         with pytest.raises(SimulationError, match="encoder failed.*No space left"):
-            video._encode(pictures(40, 128), disk / "a.mp4", (128, 128), 30, 40, None)
+            _encode(pictures(40, 128), disk / "a.mp4", VideoStyle(size=(128, 128)), 40)
         (disk / "a.mp4").unlink()
-        video._encode(pictures(1, 64), disk / "a.mp4", (64, 64), 30, 1, None)
+        _encode(pictures(1, 64), disk / "a.mp4", VideoStyle(size=(64, 64)), 1)
 
 
 def test_an_encoder_that_ends_early_is_an_error(tmp_path, monkeypatch):
     monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "true")  # takes nothing, and says that all is well
     with pytest.raises(SimulationError, match="encoder failed"):
-        video._encode(pictures(40, 256), tmp_path / "a.mp4", (256, 256), 30, 40, None)
+        _encode(pictures(40, 256), tmp_path / "a.mp4", VideoStyle(size=(256, 256)), 40)
 
 
 def test_an_interrupted_video_ends_its_encoder(tmp_path):
@@ -158,7 +162,7 @@ def test_an_interrupted_video_ends_its_encoder(tmp_path):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        video._encode(pictures(3, 64), tmp_path / "a.mp4", (64, 64), 30, 3, stop)
+        _encode(pictures(3, 64), tmp_path / "a.mp4", VideoStyle(size=(64, 64)), 3, stop)
 
 
 def test_rendering_that_is_switched_off_renders_nothing(tmp_path):

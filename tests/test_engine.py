@@ -361,7 +361,7 @@ def test_seeds_draw_within_the_perturbation_and_are_reproducible():
 
 
 def test_record_is_what_mujoco_applied_within_the_limit(episode):
-    """The recorded force is actuator_force, the law's wish clipped at +-200 N, and the limit is reached."""
+    """The recorded force is actuator_force, the law's output clipped at +-200 N, and the limit is reached."""
     world = World(paper(), record=True)
     for _ in range(10):
         record = world.step(orders_of(world.scenario, "FM")).record
@@ -371,7 +371,9 @@ def test_record_is_what_mujoco_applied_within_the_limit(episode):
 
 
 def test_the_actuator_holds_the_limit_even_if_the_law_does_not():
-    """A limited controller that asks for 1e6 N gets 200; an unlimited one gets actuators without a range, and its wish."""
+    """A limited controller that asks for 1e6 N gets 200; an unlimited one gets actuators without a range, and all that it asks
+    for.
+    """
     wish = np.full((20, 4, 2), 1e6)
     for limited, force in ((True, 200.0), (False, 1e6)):
         world = World(paper(disturbance=STILL), Replay(wish, limited=limited), record=True)

@@ -10,6 +10,8 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
+from marlbc_mj.policies.general import Sensed, read_general
+from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.policies.states import make_state
@@ -85,6 +87,32 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     both = finite & np.isfinite(values)
     np.testing.assert_allclose(values[both], expected[both], rtol=1e-4, atol=1e-4)
     assert (orders == greedy(expected, last, fresh, policy.margin)).mean() > 0.999
+
+
+def test_the_general_policy_is_exported_as_it_decides(tmp_path):
+    """One graph for every size of team; agents that have heard nothing of some others, and agents alone."""
+    policy, _ = read_general(shipped("marlms-general"))
+    out, rng = tmp_path / "agent.onnx", np.random.default_rng(3)
+    main(["export", str(shipped("marlms-general")), str(out)])
+    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
+    assert json.loads(session.get_modelmeta().custom_metadata_map["layout"]) == INPUT_LAYOUT
+    for teams, agents in ((1, 4), (7, 9), (2, 1)):
+        features = rng.normal(size=(teams, agents, FEATURES)).astype(np.float32)
+        heard = rng.normal(size=(teams, agents, agents, FEATURES)).astype(np.float32)
+        age = np.where(rng.random((teams, agents, agents)) < 0.3, np.inf, rng.uniform(0.0, 5.0, (teams, agents, agents)))
+        last, fresh = rng.integers(2, size=(teams, agents)), np.arange(teams) % 2 == 1
+        rows = teams * agents
+        given = {
+            "features": features.reshape(rows, -1),
+            "heard": heard.reshape(rows, agents, -1),
+            "age": age.reshape(rows, agents).astype(np.float32),
+            "last": np.where(fresh[:, None], -1, last).reshape(rows),
+        }
+        values, action = session.run(["values", "action"], given)
+        expected = policy.values(join_inputs(features, heard, age).reshape(rows, -1))
+        np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-4)
+        decided = policy.decide(Sensed(features, last, fresh), heard, age)
+        np.testing.assert_array_equal(action.reshape(teams, agents), decided)
 
 
 def test_the_file_says_what_it_is_for(tmp_path, capsys):

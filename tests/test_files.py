@@ -12,7 +12,7 @@ import pytest
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.training.run import write_table
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import MANIFEST, remove_leftovers, staged_file, staged_folder, write_json
+from marlbc_mj.util.files import MANIFEST, alone_in, remove_leftovers, staged_file, staged_folder, write_json
 
 WRITERS = {
     "arrays": lambda path, size: write_arrays(path.with_suffix(".safetensors"), {"x": np.zeros(size)}, {}),
@@ -261,3 +261,20 @@ def test_a_full_disk_during_a_study_is_one_line_and_status_3(tmp_path):
             assert error.value.exit_status == 3 and list(disk.iterdir()) == []
         fill(disk)
         assert listed(disk) == {"a.json", "logs/b.mcap"}
+
+
+def test_one_process_writes_into_a_folder(tmp_path):
+    """A second is refused while the first is at it, and afterwards unless it may overwrite; a folder without a file goes."""
+    out = tmp_path / "runs" / "run"
+    for content in ("", "a.json"):
+        with alone_in(out, overwrite=False):
+            with pytest.raises(ConfigurationError, match="is being written by another process"), alone_in(out, overwrite=True):
+                pass
+            if content:
+                (out / content).touch()
+        assert out.parent.exists() == bool(content)
+    with pytest.raises(ConfigurationError, match="is not empty"), alone_in(out, overwrite=False):
+        pass
+    with alone_in(out, overwrite=True):
+        pass
+    assert (out / "a.json").exists()

@@ -1,6 +1,8 @@
 """The general policy: inputs without scale, pooling that takes what it gets, one network for all teams, and its training."""
 
 import csv
+import itertools
+import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +24,7 @@ from marlbc_mj.training.general.config import GeneralConfig, input_mask, read_te
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.run import RESUME, Interrupted
 from marlbc_mj.util.errors import ConfigurationError
 
 SMALL = GeneralConfig(budget=400, families=("field",), teams=("wedge-4",), worlds=2, hidden=(8,), updates=2, batch=16, layouts=1)
@@ -289,6 +292,34 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
     for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
         with pytest.raises(ConfigurationError, match=said):
             GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
+
+
+def test_a_stopped_run_goes_on_bit_for_bit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A signal saves the run; resumed by the command, it ends with the networks of a run that nobody stopped."""
+    short = {"field_wedge-4": make_scenario("field", composition="set-based", split="test", duration=2.0)}
+    monkeypatch.setattr("marlbc_mj.training.general.run.judging_scenarios", lambda _: short)
+    config = replace(SMALL, budget=800, evaluate_every=10_000, lossy=1.0, start_spread=0.1, capacity=2_000)
+    train_general(config, tmp_path / "whole")
+    calls, advance = itertools.count(1), GeneralTrainer.advance
+
+    def interrupted(trainer: GeneralTrainer) -> None:
+        advance(trainer)
+        if next(calls) == 9:
+            signal.raise_signal(signal.SIGTERM)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(GeneralTrainer, "advance", interrupted)
+        assert train_general(config, tmp_path / "stopped") == Interrupted(signal.SIGTERM)
+    assert next(calls) == 10 and not (tmp_path / "stopped" / "eval.csv").exists()
+    main(["train", "--resume", str(tmp_path / "stopped")])
+    assert "success" in capsys.readouterr().out
+    whole, stopped = (read_arrays(tmp_path / name / RESUME) for name in ("whole", "stopped"))
+    assert whole[0].keys() == stopped[0].keys() and whole[1]["scalars"] == stopped[1]["scalars"]
+    for name, array in whole[0].items():
+        np.testing.assert_array_equal(array, stopped[0][name], err_msg=name)
+    assert whole[1]["scalars"]["updates"] > 20
 
 
 def test_lost_messages_age() -> None:

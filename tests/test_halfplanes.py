@@ -50,7 +50,9 @@ def violation(v, planes) -> float:
 
 
 def optimum_of_candidates(wish, planes, speed) -> np.ndarray | None:
-    """The optimum is the wish, its projection on a border or the circle, or a corner; None where none of them is feasible."""
+    """The optimum is the desired velocity, its projection on a border or the circle, or a corner; None where none of them is
+    feasible.
+    """
     n, b = planes[:, :2], planes[:, 2]
     tangents = np.stack([-n[:, 1], n[:, 0]], axis=-1)
     candidates = [wish, wish * speed / max(np.linalg.norm(wish), 1e-300)]
@@ -107,7 +109,7 @@ def test_within_a_speed_the_optimum_is_the_best_candidate(seed):
 
 @given(seeds)
 def test_where_half_planes_contradict_the_greatest_violation_is_least(seed):
-    """As a linear solver has it, to 1e-6 (its tolerance); of the velocities that reach it, the one nearest to the wish."""
+    """As a linear solver has it, to 1e-6 (its tolerance); of the velocities that reach it, the one nearest to the desired one."""
     rng = np.random.default_rng(seed)
     normals, bounds = draw(rng)
     planes, wish = half_planes(normals, bounds + 2.0), rng.normal(scale=4.0, size=2)

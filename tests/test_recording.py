@@ -379,7 +379,7 @@ def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main(["video", str(short[0]), "--speed", "0"])
     assert capsys.readouterr().err == "marlbc: speed must be positive, got 0.0\n"
-    small = ["--width", "128", "--height", "96", "--fps", "2", "--end", "1"]
+    small = ["--size", "128x96", "--fps", "2", "--end", "1"]
     main(["video", str(short[0]), "--out", str(tmp_path / "a.mp4"), *small])
     assert capsys.readouterr().err.startswith("marlbc: off-screen rendering with ")
 

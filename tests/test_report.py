@@ -7,6 +7,7 @@ import shutil
 import subprocess
 from dataclasses import replace
 from importlib import resources
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +25,7 @@ from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actu
 from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_benchmark_page
 from marlbc_mj.report.paper_values import order_mark
-from marlbc_mj.report.pareto import coincident, pareto
+from marlbc_mj.report.pareto import pareto
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
 from marlbc_mj.report.templates import render
@@ -384,15 +385,32 @@ def test_gap_to_the_oracle(results: list[Result]) -> None:
     assert table.rows[1][2] == f"{1e4 - results[2].metrics['team']['return']:.0f}" and table.rows[2][1] == "failed"
 
 
-def test_marks_that_coincide_are_named(results: list[Result]) -> None:
-    """Controllers whose cost, return, violation and formation error are the same; in a comparison of both, by method."""
+def test_no_mark_covers_another(results: list[Result]) -> None:
+    """Of methods with the same numbers one stands aside, and a line leads to its place; others stand where they belong."""
     sorlc = results[0]
     twin, other = scaled("scripted+sorlc-off", sorlc, 1.0), scaled("scripted+lqr", sorlc, 0.1)
-    assert coincident([sorlc, other, twin]) == [["sorlc", "sorlc-off"]]
-    both = [sorlc, other, *(scaled(f"fms+{name}", like, 1.0) for name, like in (("sorlc", sorlc), ("lqr", other)))]
-    assert coincident(both) == [["scripted+sorlc", "fms+sorlc"], ["scripted+lqr", "fms+lqr"]]
-    (plot,) = [p for p in figures.plots([sorlc, other, twin]) if p.stem == "pareto_all"]
-    assert plot.caption.endswith("Marks of sorlc and sorlc-off coincide.")
+    figure = pareto([sorlc, other, twin])
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        marks = [line for line in axes.lines if line.get_marker() in tuple("os^")]
+        places = [72.0 / figure.dpi * line.get_transform().transform(line.get_xydata())[0] for line in marks]
+        true = [72.0 / figure.dpi * axes.transData.transform(line.get_xydata())[0] for line in marks]
+        assert len(places) == 3 and min(np.hypot(*(a - b)) for a, b in combinations(places, 2)) > 6.0
+        aside = [not np.allclose(place, at) for place, at in zip(places, true, strict=True)]
+        assert aside == [False, False, True] and sum(text.arrow_patch is not None for text in axes.texts) == 1
+        assert np.hypot(*(places[2] - true[2])) < 7.0
+
+
+def test_other_missions_do_not_speak_of_the_paper() -> None:
+    """Neither captions of figures nor those of tables have its numbers."""
+    made = []
+    for names in (("scripted", "sorlc"), ("scripted", "rlc"), ("fsams", "sorlc")):
+        world = World(replace(paper(duration=1.0), name="mine"), make_controller(names[1]), record=True)
+        made.append(Result.of(run_episode(world, make_supervisor(names[0]), names=names)))
+    captions = [plot.caption for plot in figures.plots(made)]
+    tables = make_tables(made, "mine")
+    said = [*captions, *(table.caption for table in tables), *(note for table in tables for note in table.notes)]
+    assert len(captions) > 10 and not [text for text in said if re.search(r"[Pp]aper|Figure \d|[Pp]ublished", text)]
 
 
 def test_spans_of_numbers() -> None:
@@ -423,14 +441,16 @@ def test_bands_hold_every_sample() -> None:
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
 def test_latex_compiles(results: list[Result], tmp_path: Path) -> None:
-    """tables.tex as it is, in a document that loads booktabs and nothing else."""
-    (tmp_path / "tables.tex").write_text(latex_document(make_tables(results, "paper"), "100 % of x_y."))
+    """tables.tex as it is, in a document that loads what it says; no table is wider than the text, whatever its names are."""
+    wide = Table("wide", "c", tuple(Column("g", f"column {k}", "m/s") for k in range(24)), (("123 456.78",) * 24,))
+    (tmp_path / "tables.tex").write_text(latex_document([*make_tables(results, "paper"), wide], "100 % of x_y."))
     (tmp_path / "all.tex").write_text(
-        r"\documentclass[twocolumn]{article}\usepackage{booktabs}\begin{document}\input{tables}\end{document}"
+        r"\documentclass[twocolumn]{article}\usepackage{booktabs,graphicx}\begin{document}\input{tables}\end{document}"
     )
     command = ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "all.tex"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stdout[-1000:]
+    assert "Overfull" not in done.stdout
 
 
 def test_envelope_keeps_peaks_and_ends() -> None:
@@ -468,7 +488,7 @@ def test_comparison_figures(results: list[Result]) -> None:
     episodes = [result.trajectory for result in results if result.trajectory is not None]
     figure = trajectories(episodes)
     assert figure.get_figwidth() == plotting.DOUBLE
-    assert sum(axes.get_visible() for axes in figure.axes) == len(episodes)
+    assert sum(axes.axison for axes in figure.axes) == len(episodes) == 3 and figure.axes[3].get_legend() is not None
     assert len(pareto(results[:2]).axes) == 3 and len(pareto(results).axes) == 6  # supervisors above, controllers below
     assert curves.has_weights(episodes[0]) and not curves.has_weights(episodes[1])
     for draw in (curves.weight_norms, curves.weight_errors):

@@ -153,7 +153,7 @@ def test_a_crazyflie_follows_newton_and_coasts_to_a_stop_in_its_own_drag():
 
 
 def test_crazyflie_has_the_measured_numbers_and_keeps_its_thrust_limits():
-    """Mass, inertia and thrust limits are the package's; a wish beyond them is cut, and counted."""
+    """Mass, inertia and thrust limits are the package's; a command beyond them is cut, and counted."""
     drone = crazyflie._measured("data")
     world, *_ = push("crazyflie", (50.0, 0.0), 0.2, 0.2)
     model, data = world.plan.model, world.data[0]

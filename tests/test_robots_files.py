@@ -123,7 +123,7 @@ DRIVEN = {
 
 @pytest.mark.parametrize("case", DRIVEN)
 def test_the_recorded_force_is_what_moves_the_body(case, write):
-    """m dv = F h in both directions, p is MuJoCo's xpos, and a wish beyond the file's limits gives the file's limit."""
+    """m dv = F h in both directions, p is MuJoCo's xpos, and a force beyond the file's limits gives the limit."""
     text, limit = DRIVEN[case]
     name = write(text)
     robot = make_robot(name)

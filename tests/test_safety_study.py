@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.results.layouts import CellScores, LayoutMark, Marks, MissionCell
+from marlbc_mj.results.layouts import CellScores, LayoutMark, Marks, MissionCell, mark
 from marlbc_mj.results.outcomes import FAILED_MISSION, MissionOutcome
-from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.scenarios import Scenario, held_out, make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
+from marlbc_mj.studies import safety
+from marlbc_mj.studies.protocol import Watch
 from marlbc_mj.studies.safety import (
     DRAG_DRAWS,
     DRAWS_EACH,
@@ -33,12 +35,39 @@ def test_every_layout_of_every_cell_is_in_one_job() -> None:
     study = SafetyStudy(layouts=250, searched=20)
     jobs = pickle.loads(pickle.dumps(study)).jobs()
     cells = study.cells()
-    assert len(set(jobs)) == len(jobs) and {job.cell for job in jobs} == set(cells) and len(set(cells)) == len(cells)
+    assert len(set(jobs)) == len(jobs) and len(set(cells)) == len(cells)
+    assert [cell for job in jobs for cell in job.cells if job.seeds[0] == study.seed] == cells
     for cell in cells:
-        seeds = [seed for job in jobs if job.cell == cell for seed in job.seeds]
-        assert seeds == list(range(70_000, 70_000 + (20 if cell.supervisor in SEARCHES else 250)))
+        seeds = [seed for job in jobs if cell in job.cells for seed in job.seeds]
+        assert seeds == list(range(80_000, 80_000 + (20 if cell.supervisor in SEARCHES else 250)))
         assert (cell.composition == OWN) == (cell.supervisor in VELOCITY_GIVERS)
     assert {cell.composition for cell in cells} == {*COMPOSITIONS, OWN}
+
+
+@pytest.mark.parametrize(("supervisor", "composition", "touched"), [("fixed", "set-based", False), ("fsams", "null-space", True)])
+def test_a_layout_that_the_shield_leaves_alone_is_flown_once(
+    supervisor: str, composition: str, touched: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is said of it without a shield is what flying it without one says, to the bit."""
+    short = make_scenario("paper", duration=20.0) if touched else held_out(make_scenario("field", duration=2.0))
+    monkeypatch.setattr(safety, "ground", lambda name: short)
+    flown: list[tuple[bool, int]] = []
+    fly = safety.evaluate_batch
+
+    def counted(scenario: Scenario, seeds: Any, *names: str, shield: bool, **rest: Any) -> Any:
+        flown.extend((shield, seed) for seed in seeds)
+        return fly(scenario, seeds, *names, shield=shield, **rest)
+
+    monkeypatch.setattr(safety, "evaluate_batch", counted)
+    study = SafetyStudy(("field",), (supervisor,), (composition,), layouts=2)
+    (job,) = study.jobs()
+    both = study.run(job, Watch())
+    assert [marks.cell.shield for marks in both] == [False, True]
+    for marks in both:
+        runs = fly(short, job.seeds, supervisor, composition=composition, shield=marks.cell.shield)
+        assert marks.layouts == tuple(mark(run, short) for run in runs)
+    assert [one.intervened for one in both[1].layouts] == [touched] * 2
+    assert flown.count((True, job.seeds[1])) == 1 and ((False, job.seeds[1]) in flown) == touched
 
 
 def test_draws_around_the_case_study_are_the_published_ones() -> None:

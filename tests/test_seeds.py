@@ -127,7 +127,7 @@ def test_progress_and_rows_grow_with_methods_times_seeds(results: SeedResults, t
 
 
 def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
-    """A drag a million times the printed one throws every episode out of the physical range; the rest is reported."""
+    """A drag a million times the published one throws every episode out of the physical range; the rest is reported."""
     wild: Scenario = paper(duration=2.0, disturbance=PaperDrag(1e6))
     results = run_seeds(wild, ("scripted",), ("pd", "sorlc"), seed_range(3))
     for method in results.methods:
@@ -253,6 +253,7 @@ def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, f
     ("call", "message"),
     [
         (lambda: seed_range(0), "seeds must be at least 1, got 0"),
+        (lambda: seed_range(2**63), "seeds must be at most 10000000 in one run, got 9223372036854775808"),
         (lambda: seed_range(3, first=-1), "seed must not be negative, got -1"),
         (lambda: run_seeds(paper(), (), ("pd",), (0,)), "at least one supervisor"),
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), ()), "at least one seed"),

@@ -1,4 +1,6 @@
-"""Set-based composition: avoidance holds for any wish, orders keep their meaning, and every view of a world composes alike."""
+"""Set-based composition: avoidance holds for any desired velocity, orders keep their meaning, and every view of a world
+composes alike.
+"""
 
 from dataclasses import replace
 
@@ -123,7 +125,9 @@ BRAKING = Barrier(
 
 @given(seeds)
 def test_any_wish_can_be_braked(seed):
-    """Hostile wishes, up to 8 m/s and new in every step, four agents, discs, no half-planes at all: braking alone keeps d."""
+    """Hostile desired velocities, up to 8 m/s and new in every step, four agents, discs, no half-planes at all: braking alone
+    keeps d.
+    """
     rng = np.random.default_rng(seed)
     at = np.array([(-6.0, 0.0), (6.0, 0.0), (0.0, 6.0), (0.0, -6.0)]) + rng.uniform(-1, 1, (4, 2))
     discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9.3, 11) * u, 1.0) for u in np.eye(2))])

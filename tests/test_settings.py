@@ -165,6 +165,8 @@ def test_texts_that_are_no_setting_are_refused(setting, fragments):
 
 def test_texts_are_read_by_the_fields_they_are_for():
     """Whole numbers for a field of floats too, and infinity."""
+    together = with_settings(TrainConfig(), ("worlds=100000", "capacity=1000000", "shaping.dwell=3", "shaping.margin=0.2"))
+    assert (together.rows, together.shaping.dwell, together.shaping.margin) == (10, 3.0, 0.2)  # neither alone would do
     config = with_settings(TrainConfig(), ("huber=inf", "cool_by=1", "state=printed", "shaping.dwell=2", "dueling=FALSE"))
     assert (config.huber, config.cool_by, config.state, config.dueling) == (math.inf, 1.0, "printed", False)
     assert config.shaping.dwell == 2.0 and type(config.cool_by) is float

@@ -39,7 +39,7 @@ STRONG = Trial(ForceBound(linear=5.0 * np.sqrt(2.0)), speed_cap=14.0)
 )
 @pytest.mark.parametrize("substep", [0.005, 0.001])
 def test_no_force_within_its_bound_leads_out_of_the_safe_set(bound, substep):
-    """Random states on the edge of S, hostile wishes, f at its bound where it hurts most: one obstacle, or one neighbor."""
+    """Random states on the edge of S, hostile forces, f at its bound in the worst direction: one obstacle, or one neighbor."""
     assert leave_rate(Trial(bound, speed_cap=14.0, substep=substep, things=1), 100_000, seed=1) == 0.0
 
 

@@ -86,7 +86,7 @@ def test_a_stamp_that_is_dropped_too_early_is_found(wrong):
 
 
 def test_stamps_move_on_where_messages_arrive():
-    """Safe would be to keep the first stamp for ever, too."""
+    """Safe would be to keep the first stamp forever, too."""
     one, other = START, START
     for time in range(1, 50):
         one, other = (

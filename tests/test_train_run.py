@@ -24,9 +24,12 @@ from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_arrays, read_policy, write_arrays
 from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
+from marlbc_mj.studies.learners.trainings import LearnerStudy, train_learners
 from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.training.general.config import GeneralConfig
+from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.run import RESUME, make_trainer, rank, resume, train
@@ -34,6 +37,7 @@ from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util import provenance
 from marlbc_mj.util.changes import with_settings
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
+from marlbc_mj.util.files import alone_in
 
 SMALL = {
     "worlds": 128, "interval": 2, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1,
@@ -255,6 +259,7 @@ def test_runs_have_folders_of_their_own(arguments, folder, monkeypatch, capsys):
         (["train", "--budget", "0"], ["budget", "0"]),
         (["train", "--resume", "nowhere"], ["nowhere", RESUME]),
         (["train", "--device", "cuda"], ["cuda"]),
+        (["train", "--set", "copies=2147483648"], ["copies", "more memory than there is"]),
         (
             ["train", "--resume", "x", "--budget", "9", "--threads", "1", "--device", "cpu", "--set", "gamma=0.9", "--out", "y"],
             ["--resume", "--budget, --threads, --device, --set", "--out"],
@@ -278,6 +283,25 @@ def test_a_folder_with_results_is_not_overwritten(finished, capsys):
         main(["train", "--out", str(finished)])
     assert "not empty" in capsys.readouterr().err
     assert (finished / "eval.csv").read_bytes() == before
+
+
+def test_a_folder_has_one_run_at_a_time(finished, tmp_path):
+    """A second run there, new, resumed, or of a study, is refused before anything of the first is touched."""
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+    study = LearnerStudy(out, ("vdn",), 1, 1_600)
+    general = GeneralConfig(families=("field",), teams=("wedge-4",), worlds=1)
+    with alone_in(out, overwrite=True):
+        for again in (
+            lambda: train(small(), out, overwrite=True),
+            lambda: train_general(general, out, overwrite=True),
+            lambda: resume(out),
+            lambda: train_learners(study, 1),
+        ):
+            with pytest.raises(ConfigurationError, match="is being written by another process"):
+                again()
+    assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
 
 
 def damage(kind, path, source):

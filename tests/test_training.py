@@ -534,7 +534,7 @@ def test_presets_and_json():
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("method", METHODS)
 def test_no_own_cost_is_worth_paying(method, preset):
-    """The discounted cost of being out of formation for ever, sum of gamma^k centre interval, is below that of being lost."""
+    """The discounted cost of being out of formation forever, sum of gamma^k centre interval, is below that of being lost."""
     config = make_config(preset, **METHODS[method][0])
     if config.shaping.own_violation_cost:
         worst = sum(config.gamma**k * config.shaping.centre * config.interval for k in range(10_000))

@@ -40,7 +40,9 @@ def random_planes(rng: np.random.Generator, count: int, through: float) -> np.nd
 
 
 def corners(planes: np.ndarray, wish: np.ndarray, speed: float) -> np.ndarray:
-    """Every point at which the optimum can lie: the wish, its feet on lines and circle, and where two of these meet."""
+    """Every point at which the optimum can lie: the desired velocity, its feet on lines and circle, and where two of these
+    meet.
+    """
     points = [wish, wish * speed / np.linalg.norm(wish)]
     for n, c in zip(planes[:, :2], planes[:, 2], strict=True):
         points.append(wish + (c - n @ wish) * n)

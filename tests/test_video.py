@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from io import BytesIO
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,21 +14,26 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import Episode
+from PIL import Image, ImageSequence
 
 from marlbc_mj.controllers import SORLC
 from marlbc_mj.recording.camera import make_camera, project
 from marlbc_mj.recording.caption import Caption
+from marlbc_mj.recording.encoding import poster
 from marlbc_mj.recording.gl import choose_gl
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.marks import corner_indices
 from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
-from marlbc_mj.recording.video import VideoStyle, frame_times, render_still, render_video
+from marlbc_mj.recording.video import VideoStyle, frame_times, parse_size, render_still, render_video
 from marlbc_mj.recording.view import HOME, LEFT, RIGHT, SPACE, Playback, view
+from marlbc_mj.robots import ROBOTS
+from marlbc_mj.scenarios import SCENARIOS
+from marlbc_mj.scenarios.titles import MISSION_TITLES, ROBOT_TITLES, mission_title
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import AGENT_COLORS, BEHAVIOR_COLORS, agent_color, ink_on, rgba
 
-SMALL = {"width": 320, "height": 180}
+SMALL: dict[str, Any] = {"size": (320, 180)}
 
 
 @pytest.fixture(scope="module")
@@ -70,9 +77,35 @@ def test_video_decodes_to_what_was_asked_for(log: EpisodeLog, tmp_path: Path) ->
     assert len(frames) == count == 10
     assert counted == [(k, 10) for k in range(1, 11)]
     still = render_still(log, 19.0, **SMALL, samples=0)
-    picture = slice(Caption(log, 320, 180).header + 1, 158)
+    picture = slice(Caption(log, 320, 180).header + 1, 140)
     assert np.abs(frames[0][picture].astype(int) - still[picture]).mean() < 4
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("suffix", [".webp", ".gif"])
+def test_animations_repeat_for_ever_and_show_the_frames(log: EpisodeLog, tmp_path: Path, suffix: str) -> None:
+    """Five frames of 0.1 s, of which the first one is the still of its time."""
+    path = tmp_path / f"clip{suffix}"
+    assert render_video(log, path, VideoStyle(start=19, end=21, fps=10, samples=4, **SMALL)) == 5
+    with Image.open(path) as animation:
+        assert (animation.n_frames, animation.size, animation.info["loop"]) == (5, (320, 180), 0)
+        frames = [np.asarray(frame.convert("RGB")).astype(int) for frame in ImageSequence.Iterator(animation)]
+        assert animation.info["duration"] == 100
+    still = render_still(log, 19.0, **SMALL)
+    picture = slice(Caption(log, 320, 180).header + 1, 140)
+    assert np.abs(frames[0][picture] - still[picture]).mean() < 4
+    assert np.abs(frames[0] - frames[-1]).mean() > 0.1
+    assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize(
+    "text", ["1280", "1280x", "x720", "12.5x3", "1280x720x3", "-64x64", "99999999999x64", "66x65", "\u00b2x64"]
+)
+def test_a_wrong_size_is_named(text: str) -> None:
+    """With what a size looks like."""
+    with pytest.raises(ConfigurationError, match=f"size must be two even numbers .*, 1280x720 for example; got '?{text}"):
+        parse_size(text)
+    assert parse_size("640X360") == (640, 360)
 
 
 def test_video_replaces_a_file_only_when_told(log: EpisodeLog, tmp_path: Path) -> None:
@@ -97,7 +130,7 @@ def test_interrupted_video_leaves_nothing(log: EpisodeLog, tmp_path: Path) -> No
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("camera", ["track", "top"])
+@pytest.mark.parametrize("camera", ["track", "top", "wide"])
 @pytest.mark.parametrize("time", [20.0, 65.0])
 def test_agents_are_where_they_are_projected(log: EpisodeLog, camera: str, time: float) -> None:
     """The pixel at an agent's projected middle has the agent's hue."""
@@ -168,9 +201,14 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"width": 321}, "width must be an even number"),
-        ({"height": 20}, "height must be"),
-        ({"camera": "moon"}, "choose from: track, top"),
+        ({"size": (321, 180)}, "size must be two even numbers of pixels from 64 to 4096, 1280x720 for example; got 321x180"),
+        ({"size": (320, 20)}, "size must be"),
+        ({"samples": 17}, "samples must be from 0 to 16"),
+        ({"camera": "moon"}, "unknown camera 'moon'; choose from: track, close, agent1, wide, at:X,Y,R, top, agent2,"),
+        ({"camera": "agent5"}, "unknown camera 'agent5'"),
+        ({"camera": "at:1,2"}, "camera 'at:1,2' must be at:X,Y,R"),
+        ({"camera": "at:1,2,0"}, "must be at:X,Y,R"),
+        ({"camera": "at:nan,2,1"}, "must be at:X,Y,R"),
         ({"speed": 0.0}, "speed must be positive"),
         ({"fps": -1}, "fps must be positive"),
         ({"start": 50.0, "end": 40.0}, "leave nothing"),
@@ -185,8 +223,8 @@ def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict
 
 
 def test_wrong_files_and_logs_are_named(log: EpisodeLog, tmp_path: Path) -> None:
-    """A name that is no MP4's, a folder that cannot be made, a log without steps or with another's model."""
-    with pytest.raises(ConfigurationError, match="must end in .mp4"):
+    """A name that is no video's, a folder that cannot be made, a log without steps or with another's model."""
+    with pytest.raises(ConfigurationError, match=r"must end in \.mp4, \.webp or \.gif, got 'clip.avi'"):
         render_video(log, tmp_path / "clip.avi")
     (tmp_path / "none").touch()
     with pytest.raises(ConfigurationError, match="cannot write"):
@@ -257,13 +295,62 @@ def test_playback_obeys_speed_and_keys() -> None:
     assert playback.time == 0.0
 
 
+SIGHTS = {
+    "normal": np.eye(3),
+    "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
+    "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
+}
+"""What linear RGB becomes, by sight (Machado, Oliveira and Fernandes 2009)."""
+
+
+def _linear(color: str) -> np.ndarray:
+    values = np.array(rgba(color)[:3])
+    return np.asarray(np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4))
+
+
+def _lab(color: str, sight: str) -> np.ndarray:
+    """CIELAB of a color as a sight sees it."""
+    to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
+    seen = np.clip(np.array(SIGHTS[sight]) @ _linear(color), 0.0, 1.0)
+    x, y, z = np.cbrt(to_xyz @ seen / [0.95047, 1.0, 1.08883])
+    return np.array([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
+
+
+@pytest.mark.parametrize(("sight", "least"), [("normal", 30.0), ("deuteranopia", 10.0), ("protanopia", 10.0)])
+def test_agents_and_behaviors_share_no_color(sight: str, least: float) -> None:
+    """The first four agents' colors differ from each other and from behaviors' in CIELAB, the others' for normal sight."""
+    agents = [_lab(color, sight) for color in (AGENT_COLORS if sight == "normal" else AGENT_COLORS[:4])]
+    behaviors = [_lab(color, sight) for color in BEHAVIOR_COLORS.values()]
+    assert min(np.linalg.norm(a - b) for a in agents for b in behaviors) > least
+    assert min(np.linalg.norm(a - b) for a, b in combinations(agents[:4], 2)) > least
+
+
+def test_a_poster_is_a_frame_of_the_video(log: EpisodeLog, tmp_path: Path) -> None:
+    """As a JPEG; none beyond the video's end."""
+    render_video(log, tmp_path / "clip.mp4", VideoStyle(start=19, end=21, fps=10, **SMALL))
+    with Image.open(BytesIO(poster(tmp_path / "clip.mp4", 0.3))) as picture:
+        assert (picture.format, picture.size) == ("JPEG", (320, 180))
+    assert poster(tmp_path / "clip.mp4", 5.0) == b""
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [
+        ("paper", "Case study"),
+        ("robot_gate-crazyflie", "Point and gate, Crazyflies"),
+        ("traffic", "Traffic"),
+        ("my_own-run", "My own-run"),
+        ("", ""),
+    ],
+)
+def test_missions_have_titles(name: str, title: str) -> None:
+    """What people read; a name of one's own stays readable."""
+    assert mission_title(name) == title
+    assert set(MISSION_TITLES) == set(SCENARIOS) and set(ROBOT_TITLES) == set(ROBOTS)
+
+
 @pytest.mark.parametrize("color", [*AGENT_COLORS, *BEHAVIOR_COLORS.values()])
 def test_text_is_readable_on_every_color(color: str) -> None:
     """At least 2.6 to 1 (WCAG's contrast), which suits large bold text."""
-
-    def luminance(name: str) -> float:
-        linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in rgba(name)[:3]]
-        return float(np.dot([0.2126, 0.7152, 0.0722], linear))
-
-    low, high = sorted([luminance(color), luminance(ink_on(color))])
+    low, high = sorted(float(np.dot([0.2126, 0.7152, 0.0722], _linear(name))) for name in (color, ink_on(color)))
     assert (high + 0.05) / (low + 0.05) > 2.6

@@ -1,4 +1,4 @@
-"""What every training run has: worlds, a learner's reward, and a state that can be saved and restored bit for bit."""
+"""The base of every training run: worlds, a learner's reward, and a state that can be saved and restored bit for bit."""
 
 from abc import ABC, abstractmethod
 from typing import Any

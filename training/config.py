@@ -1,9 +1,9 @@
-"""What a training run is: one frozen dataclass, its presets, and how it is read from JSON data and from texts."""
+"""Configuration of a training run: one frozen dataclass, its presets, and conversion from JSON data and texts."""
 
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from marlbc_mj.training.methods import METHODS, PPO, WITHOUT_RISKS
 from marlbc_mj.training.shaping import Shaping
@@ -110,7 +110,7 @@ class TrainConfig:
     learner: Literal["lenient", "hysteretic", "plain"] = "lenient"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
     hash: Literal["autoencoder", "plain"] = "autoencoder"
-    """What is hashed: the codes of an auto-encoder (autoencoder) or the states as they are (plain)."""
+    """Input of the hash: the codes of an auto-encoder (autoencoder) or the states as they are (plain)."""
     bits: Annotated[int, AT_LEAST_ONE, _BITS] = 16
     """Bits of a hash code."""
     cool_by: Annotated[float, POSITIVE] = 0.35
@@ -127,7 +127,7 @@ class TrainConfig:
     switching_margin: float = 0.1
     """The greedy policy leaves an order only for one whose value is higher by more than this."""
     shaping: Shaping = SHAPING
-    """The reward that is learned from."""
+    """Reward shaping."""
     ppo: PPO = DEFAULT_PPO
     """Settings of MAPPO alone."""
 
@@ -221,17 +221,23 @@ def make_config(preset: str, **changes: Any) -> TrainConfig:
 
 
 _JSON = json_data()
+Configuration = TypeVar("Configuration")
 
 
 def from_json(data: Mapping[str, Any]) -> TrainConfig:
-    """The configuration whose JSON data :func:`marlbc_mj.util.provenance.plain_data` gives; settings that are missing have their
-    defaults.
+    """:func:`config_from_json` of a run for one team."""
+    return config_from_json(data, TrainConfig)
+
+
+def config_from_json(data: Mapping[str, Any], kind: type[Configuration]) -> Configuration:
+    """The configuration, of a ``kind``, whose JSON data :func:`marlbc_mj.util.provenance.plain_data` gives; settings that are
+    missing have their defaults.
 
     Raises:
         ConfigurationError: an unknown setting or a value that cannot be run.
     """
     try:
-        config: TrainConfig = convert(_JSON, _without_types(data), TrainConfig)
+        config: Configuration = convert(_JSON, _without_types(data), kind)
     except ConfigurationError as error:
         raise ConfigurationError(f"not the configuration of a training run: {error}") from error
     return config

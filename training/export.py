@@ -1,6 +1,7 @@
-"""A trained team as an ONNX file, for computers that have an ONNX runtime and no Python; needs the ``onnx`` extra.
+"""A trained policy as an ONNX file, for computers that have an ONNX runtime and no Python; needs the ``onnx`` extra.
 
-torch writes the graph from the networks that learn, so there is no second definition of a policy here.
+torch writes the graph from the networks that learn, so there is no second definition of a network here. The general policy's
+pooling of what was heard is written twice, in NumPy for the supervisor and in torch here; a test holds them together.
 """
 
 import json
@@ -17,6 +18,8 @@ from torch import Tensor, nn
 
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
+from marlbc_mj.policies.general import ACTIONS_OF_AGENT, INTERVAL, GeneralPolicy, is_general, read_general
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
@@ -32,25 +35,37 @@ IR = 8
 def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> str:
     """Write a checkpoint's policy as ONNX; returns one line that says what goes in and what comes out.
 
-    Inputs are ``state`` (batch, S) float32, of the kind that the signature names, and ``last`` (batch, N) int64, the actions in
-    force; a row with a negative entry has none. Outputs are ``values`` (batch, N, A) float32 as ``Policy.values`` gives them,
-    minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as :func:`marlbc_mj.policies.greedy.greedy`
-    chooses: indices into the action set, the last action unless the best is better by more than the margin. A network over joint
-    actions has ``values`` (batch, 1, A^N).
+    The policy of one team: inputs are ``state`` (batch, S) float32, of the kind that the signature names, and ``last`` (batch, N)
+    int64, the actions in force; a row with a negative entry has none. Outputs are ``values`` (batch, N, A) float32 as
+    ``Policy.values`` gives them, minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as
+    :func:`marlbc_mj.policies.greedy.greedy` chooses: indices into the action set, the last action unless the best is better by
+    more than the margin. A network over joint actions has ``values`` (batch, 1, A^N). The metadata are texts: ``signature``
+    (JSON: what the policy is tied to), ``actions`` (JSON: the order that each index stands for), ``margin`` and ``risk``.
+
+    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent sensed, which it also sends;
+    ``heard`` (batch, agents, F) float32, the last vector heard of each agent, its own included; ``age`` (batch, agents) float32,
+    how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action in force, negative
+    for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata are ``layout`` (JSON,
+    what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and ``margin``.
 
     Args:
         checkpoint: the checkpoint's file.
         out: the ONNX file.
         overwrite: whether an existing file may be replaced.
 
-    The file's metadata are texts: ``signature`` (JSON, what the policy is tied to), ``actions`` (JSON, the order that each index
-    stands for), ``margin`` and ``risk``.
-
     Raises:
         ConfigurationError: no ``onnx`` extra, no checkpoint, or ``out`` is there already.
     """
     _need_packages()
     check_target(out, overwrite=overwrite)
+    model, says = _general_model(checkpoint) if is_general(checkpoint) else _team_model(checkpoint)
+    with staged_file(out, overwrite=overwrite) as staging:
+        staging.write_bytes(model.SerializeToString())
+    return f"{out}: {says}"
+
+
+def _team_model(checkpoint: Path) -> tuple[Any, str]:
+    """The graph of one team's policy, and what it takes and gives."""
     policy, description = read_policy(checkpoint)
     try:
         signature, scenario = description["signature"], make_scenario(description["train"]["scenario"])
@@ -64,13 +79,25 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
         "margin": repr(policy.margin),
         "risk": repr(policy.risk),
     }
-    model = build(policy, agents, metadata)
-    with staged_file(out, overwrite=overwrite) as staging:
-        staging.write_bytes(model.SerializeToString())
     networks, values = policy.weights[-1].shape[0], policy.columns
-    return (
-        f"{out}: state (batch, {len(policy.scale)}) and last (batch, {agents}) give "
+    return build(policy, agents, metadata), (
+        f"state (batch, {len(policy.scale)}) and last (batch, {agents}) give "
         f"values (batch, {networks}, {values}) and orders (batch, {agents})"
+    )
+
+
+def _general_model(checkpoint: Path) -> tuple[Any, str]:
+    """The graph of one agent under the general policy, and what it takes and gives."""
+    policy, _ = read_general(checkpoint)
+    metadata = {
+        "layout": json.dumps(INPUT_LAYOUT),
+        "interval": repr(INTERVAL),
+        "actions": json.dumps(["formation", "column"]),
+        "margin": repr(policy.network.margin),
+    }
+    return build_general(policy, metadata), (
+        f"features (batch, {FEATURES}), heard (batch, agents, {FEATURES}), age (batch, agents) and last (batch,) give "
+        f"values (batch, {ACTIONS_OF_AGENT}) and action (batch,)"
     )
 
 
@@ -127,6 +154,39 @@ class TeamPolicy(nn.Module):
         return values, chosen if self.strides is None else chosen.div(self.strides, rounding_mode="floor") % self.each
 
 
+class AgentPolicy(nn.Module):
+    """``GeneralPolicy.decide`` of one agent in torch; what it heard is pooled as by
+    :func:`~marlbc_mj.policies.general_inputs.pool_heard`.
+    """
+
+    def __init__(self, policy: GeneralPolicy) -> None:
+        super().__init__()
+        self.team = TeamPolicy(policy.network, 1)
+
+    def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+        """Values (B, 2) and chosen actions (B,) from features (B, F), vectors heard (B, N, F), their ages (B, N), last actions
+        (B,), negative for none.
+        """
+        values, chosen = self.team(torch.cat([features, pool(heard, age)], dim=-1), last[:, None])
+        return values[:, 0], chosen[:, 0]
+
+
+def pool(heard: Tensor, age: Tensor) -> Tensor:
+    """(B, P) of vectors heard (B, N, F) and their ages (B, N)."""
+    known = torch.isfinite(age)[..., None]
+    count = known.sum(dim=1).clamp(min=1)
+    counted = torch.cat([(heard[..., :WAYS] < 0.0).to(heard.dtype), heard[..., WAYS:]], dim=-1)
+    nothing, changing = torch.zeros_like(heard), slice(WAYS, AGE_ENTRIES + 2)
+    parts = (
+        torch.where(known, heard, nothing + MOST_BEYOND).amin(dim=1),
+        torch.where(known, counted, nothing).sum(dim=1) / count,
+        torch.where(known, heard, nothing)[..., changing].amax(dim=1),
+        count / heard.shape[1],
+        1.0 - torch.exp(-torch.where(known, age[..., None], 0.0).amax(dim=1) / COARSE),
+    )
+    return torch.cat(parts, dim=-1)
+
+
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Without what torch's exporter says about itself and about packages that it does not need here."""
@@ -143,19 +203,37 @@ def _quiet() -> Iterator[None]:
 
 def build(policy: Policy, agents: int, metadata: dict[str, str]) -> Any:
     """The ``onnx.ModelProto`` of a policy of ``agents``, checked; see :func:`export_policy`."""
-    onnx: Any = import_module("onnx")
-    inputs = torch.zeros(2, len(policy.scale)), torch.zeros(2, agents, dtype=torch.int64)
+    inputs = {"state": torch.zeros(2, len(policy.scale)), "last": torch.zeros(2, agents, dtype=torch.int64)}
     batch = torch.export.Dim("batch")
+    return _graph(TeamPolicy(policy, agents), inputs, ["values", "orders"], ({0: batch}, {0: batch}), metadata)
+
+
+def build_general(policy: GeneralPolicy, metadata: dict[str, str]) -> Any:
+    """The ``onnx.ModelProto`` of one agent under a general policy, checked; see :func:`export_policy`."""
+    inputs = {
+        "features": torch.zeros(2, FEATURES),
+        "heard": torch.zeros(2, 3, FEATURES),
+        "age": torch.zeros(2, 3),
+        "last": torch.zeros(2, dtype=torch.int64),
+    }
+    batch, agents = torch.export.Dim("batch"), torch.export.Dim("agents")
+    shapes = ({0: batch}, {0: batch, 1: agents}, {0: batch, 1: agents}, {0: batch})
+    return _graph(AgentPolicy(policy), inputs, ["values", "action"], shapes, metadata)
+
+
+def _graph(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], shapes: Any, metadata: dict[str, str]) -> Any:
+    """The checked ``onnx.ModelProto`` of a module for inputs of such shapes."""
+    onnx: Any = import_module("onnx")
     with _quiet():
         program = torch.onnx.export(
-            TeamPolicy(policy, agents),
-            inputs,
+            module,
+            tuple(inputs.values()),
             dynamo=True,
             verbose=False,
             opset_version=OPSET,
-            input_names=["state", "last"],
-            output_names=["values", "orders"],
-            dynamic_shapes=({0: batch}, {0: batch}),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=shapes,
         )
     assert program is not None
     model = program.model_proto

@@ -1,4 +1,4 @@
-"""Methods of learning by name: what each changes in a preset."""
+"""Training methods by name: their changes of a preset."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
@@ -48,7 +48,7 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "hysteretic": ({"learner": "hysteretic"}, "the same, but a negative TD error counts half instead of being overlooked"),
     "iql": ({"learner": "plain"}, "independent Q-learning: the same without leniency"),
     "vdn": ({"learner": "plain"}, "value decomposition: the team's value is the sum of the agents'"),
-    "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', mixed as the state says"),
+    "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', with weights from the state"),
     "central": (
         # the team's return would end with any member's, and nobody would learn to get everybody out again: a punishment instead
         {
@@ -75,7 +75,7 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
             "together": 0.0,
             "agreement": 0.0,
         },
-        "single agents side by side: own state, formation with or without avoidance, prioritised replay",
+        "agents that learn alone: own state, formation with or without avoidance, prioritised replay",
     ),
     "mappo": (
         {
@@ -88,7 +88,7 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
             # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
             "shaping": replace(CARE["shaping"], own_switch_cost=0.0),
         },
-        "multi-agent PPO: an actor each, one critic on the state, rollouts instead of a replay buffer",
+        "multi-agent PPO: one actor per agent, one critic on the state, rollouts instead of a replay buffer",
     ),
 }
 """Changes of a preset and one line of description by method."""

@@ -23,10 +23,10 @@ from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
-from marlbc_mj.training.saved import CONFIG_FILE, check_origin, check_snapshot, saved_config, saved_rows
+from marlbc_mj.training.saved import CONFIG_FILE, check_origin, restore_trainer, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
-from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import check_folder, remove_leftovers, staged_file, write_json, writing
+from marlbc_mj.util.errors import ConfigurationError, enough_memory
+from marlbc_mj.util.files import alone_in, remove_leftovers, staged_file, write_json, writing
 from marlbc_mj.util.provenance import provenance
 
 RESUME = "resume.safetensors"
@@ -34,6 +34,8 @@ TABLES = ("eval.csv", "progress.csv")
 COUNTED = ("wall_s", "mission_steps")
 """First columns of both tables."""
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
+MEMORY_SETTINGS = "these settings (worlds, hidden, copies, capacity, batch)"
+"""What a run's memory depends on, for messages."""
 TrainingScores = dict[str, float]
 """A line of eval.csv or progress.csv."""
 TrainingProgress = Callable[[BaseTrainer, TrainingScores], None]
@@ -90,19 +92,18 @@ def train(
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: a setting that cannot be run, or ``out`` is not empty.
+        ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    check_folder(out, overwrite=overwrite)
-    run = TrainingRun(make_trainer(config), out)
-    begin_folder(out, run.origin, config)
-    return run.go(progress)
+    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
+        run = TrainingRun(make_trainer(config), out)
+        begin_folder(out, run.origin, config)
+        return run.go(progress)
 
 
 def begin_folder(out: Path, origin: Mapping[str, Any], config: Any) -> None:
-    """The folder of a new run: without what another one left there, and with the configuration of this one."""
+    """Make a folder that of a new run: without what another one left there, and with the configuration of this one."""
     with writing(out):
-        out.mkdir(parents=True, exist_ok=True)
         remove_run(out)
     write_json(out / CONFIG_FILE, {**origin, "train": config})
 
@@ -125,27 +126,40 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: ``out`` holds no run; or its saved state is damaged, of other versions of the code, or of another
-            configuration than the one beside it.
+        ConfigurationError: ``out`` holds no run, or another process is at it; or its saved state is damaged, of other versions
+            of the code, or of another configuration than the one beside it.
         SimulationError: a world diverged.
+    """
+    path = saved_run(out)
+    with alone_in(out, overwrite=True), enough_memory(MEMORY_SETTINGS):
+        return _restored(path).go(progress)
+
+
+def saved_run(out: Path) -> Path:
+    """The file of the run that was saved in a folder.
+
+    Raises:
+        ConfigurationError: there is none.
     """
     path = out / RESUME
     if not path.is_file():
         raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
+    return path
+
+
+def _restored(path: Path) -> "TrainingRun":
+    """The run that was saved in a file, in the file's folder, without what a killed process left there."""
+    out = path.parent
     arrays, description = read_arrays(path)
     check_origin(path, description)
-    run = TrainingRun(make_trainer(saved_config(path, description["train"])), out)
-    check_snapshot(path, (arrays, description["scalars"]), run.trainer.snapshot())
-    try:
-        run.trainer.restore(arrays, description["scalars"])
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random stream's own checks
-        raise ConfigurationError(f"{path} does not fit the run that it was saved from: {error}") from error
+    run = TrainingRun(make_trainer(saved_config(path, description["train"], TrainConfig)), out)
+    restore_trainer(path, run.trainer, arrays, description["scalars"])
     run.evaluations = saved_rows(path, description["evaluations"], (*COUNTED, "return", "violation_time"))
     run.curve = saved_rows(path, description["curve"], COUNTED)
     run.wall = saved_rows(path, [{"wall_s": description["wall_s"]}], ())[0]["wall_s"]
     remove_leftovers(out)
     run.write_rows()
-    return run.go(progress)
+    return run
 
 
 def resumable(out: Path) -> bool:

@@ -4,11 +4,11 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
-from marlbc_mj.training.config import TrainConfig, flat_settings, from_json
+from marlbc_mj.training.config import Configuration, config_from_json, flat_settings
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import UNKNOWN, plain_data, provenance
 
@@ -30,6 +30,16 @@ Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
 """Arrays, and the rest as JSON data."""
 
 
+class Restorable(Protocol):
+    """A trainer whose state can be saved and restored bit for bit."""
+
+    def snapshot(self) -> Snapshot:
+        """Everything that the run needs to go on."""
+
+    def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+        """Return to a :meth:`snapshot` of a run with the same configuration."""
+
+
 def check_origin(path: Path, description: Mapping[str, Any]) -> None:
     """Raise ConfigurationError if a description is not a saved run's, or of other versions or another revision of the code."""
     for name, kind in SAVED_KINDS.items():
@@ -47,17 +57,18 @@ def check_origin(path: Path, description: Mapping[str, Any]) -> None:
             )
 
 
-def saved_config(path: Path, train: dict[str, Any]) -> TrainConfig:
+def saved_config(path: Path, train: dict[str, Any], kind: type[Configuration]) -> Configuration:
     """The configuration that a run was saved with.
 
     Args:
         path: file of the saved run.
         train: JSON data of the configuration in it.
+        kind: its class.
 
     Raises:
         ConfigurationError: it has other settings than runs of this version, or other values than ``config.json`` beside it.
     """
-    config, found = from_json(train), flat_settings(train)
+    config, found = config_from_json(train, kind), flat_settings(train)
     odd = sorted(found.keys() ^ flat_settings(plain_data(config)).keys())
     if odd:
         raise ConfigurationError(f"{path} was saved by another version: it and this one do not both have {', '.join(odd)}")
@@ -92,6 +103,19 @@ def saved_rows(path: Path, rows: list[Any], columns: Iterable[str]) -> list[dict
     except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
         raise ConfigurationError(f"{path} is not a saved run: its tables are damaged, {error}") from error
     return found
+
+
+def restore_trainer(path: Path, trainer: Restorable, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+    """Put a new ``trainer`` in the state of a saved snapshot.
+
+    Raises:
+        ConfigurationError: the snapshot is not of such a run.
+    """
+    check_snapshot(path, (arrays, scalars), trainer.snapshot())
+    try:
+        trainer.restore(arrays, scalars)
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random stream's own checks
+        raise ConfigurationError(f"{path} does not fit the run that it was saved from: {error}") from error
 
 
 def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:

@@ -90,7 +90,7 @@ class ScenarioOptions:
         return with_settings(scenario, self.set)
 
     def _robot_changes(self, name: str) -> dict[str, Any]:
-        """What another robot changes, but for what other options set."""
+        """Fields that another robot changes, without those that other options set."""
         from marlbc_mj.robots import make_robot
 
         if self.robot is None:
@@ -149,7 +149,7 @@ class BenchCommand:
         self.output.say(f"{self.out / 'index.html'} shows it all")
 
     def _run_once(self) -> None:
-        """One episode of every method, a line as each ends; the page grows with them."""
+        """One episode of every method; the page grows and a line is printed as each ends."""
         from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_bench
         from marlbc_mj.util.provenance import versions
@@ -177,7 +177,7 @@ class BenchCommand:
         return BenchConfig(**{each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)})
 
     def scenario_drawn(self) -> "Scenario":
-        """The scenario with the options' changes, and with the range that draws multiply its disturbance by.
+        """The scenario with the options' changes, and with the range of factors of its disturbance over draws.
 
         Raises:
             ConfigurationError: a range without draws.
@@ -322,7 +322,7 @@ class SafetyCommand:
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, or draws around the case study."""
     supervisors: SomeSupervisors = None
-    """Supervisors to run; by default every one that needs neither learning nor a known map, and scripted."""
+    """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
     compositions: Compositions = ("null-space", "set-based")
     """How orders become references."""
     shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
@@ -331,7 +331,7 @@ class SafetyCommand:
     """Layouts of every supervisor on every mission."""
     searched: int = 100
     """Layouts of mpcms and rollout, which take seconds each."""
-    seed: int = 70_000
+    seed: int = 80_000
     """First seed of the layouts."""
     controller: ControllerName = "sorlc"
     """Controller that all run with."""

@@ -1,4 +1,4 @@
-"""What is said where compiled code cannot be kept."""
+"""The advice that a command gives where compiled code cannot be cached."""
 
 import sys
 

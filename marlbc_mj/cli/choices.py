@@ -115,7 +115,7 @@ def looks_like_file(word: str) -> bool:
 
 
 def file_of(word: str) -> Path | None:
-    """The file that a word names; None where that is not for this module to say."""
+    """The file that a word names; None where this module cannot tell."""
     file, colon, _ = word.partition(":")
     if colon and not file.endswith(".py"):
         return None

@@ -34,8 +34,8 @@ _AGAIN = 0.25  # after which what was dropped is raised again [s]
 def in_one_line(prog: str) -> Iterator[None]:
     """Run a command; whatever stops it is said in one line.
 
-    Exits with 2 for a wrong setting, 3 for a failed run or a full disk, 130 after Ctrl-C, 143 after SIGTERM, and with 141,
-    quietly, if the reader of its output has gone.
+    Exits with 2 for a wrong setting, 3 for a failed run, a full disk or a lack of memory, 130 after Ctrl-C, 143 after
+    SIGTERM, and with 141, quietly, if the reader of its output has gone.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -52,6 +52,8 @@ def in_one_line(prog: str) -> Iterator[None]:
         _end(f"{prog}: interrupted", INTERRUPTED)
     except Terminated:
         _end(f"{prog}: terminated", TERMINATED)
+    except MemoryError:
+        _end(f"{prog}: not enough memory", 3)
     except BrokenPipeError:
         _end("", PIPE_CLOSED)
     except OSError as error:

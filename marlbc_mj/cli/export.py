@@ -15,7 +15,8 @@ LOG_SUFFIX = ".mcap"
 class ExportCommand:
     """Write a checkpoint's policy as ONNX (extra onnx), or a log in another format.
 
-    Formats of a log: a table (.csv, .jsonl, or .parquet with the extra parquet), arrays (.npz), or for Rerun (.rrd).
+    The general policy becomes the graph of one agent: what it sensed and heard goes in, its action comes out. Formats of a log:
+    a table (.csv, .jsonl, or .parquet with the extra parquet), arrays (.npz), or for Rerun (.rrd).
     """
 
     source: Positional[ExistingPath]

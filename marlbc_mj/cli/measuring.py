@@ -1,4 +1,6 @@
-"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and what is behind it."""
+"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and where numbers come
+from.
+"""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +26,7 @@ class PerfCommand:
     """Measure this machine: bare mj_step, the closed loop, the Python loop, batches, an episode, a log."""
 
     out: SomePath = None
-    """JSON file for the figures."""
+    """JSON file for the measurements."""
     rounds: int = 9
     """Rounds, each running every variant once; medians are reported."""
     overwrite: bool = False

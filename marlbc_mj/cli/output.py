@@ -1,4 +1,4 @@
-"""What a command says and where: results on standard output, as text or as one JSON document; progress on standard error."""
+"""Where a command writes: results on standard output, as text or as one JSON document; progress on standard error."""
 
 import json
 import sys

@@ -13,26 +13,24 @@ from marlbc_mj.util.progress import note
 
 @dataclass(frozen=True)
 class VideoCommand:
-    """Render a video from a log, off-screen."""
+    """Render a video from a log, off-screen: .mp4, .webp or .gif."""
 
     log: Positional[ExistingPath]
     """MCAP log."""
     out: SomePath = None
-    """Video file; the log's name with .mp4 by default."""
+    """Video file, whose ending chooses the format; the log's name with .mp4 by default."""
     speed: float = 4.0
     """Mission seconds per video second."""
     fps: int = 30
     """Frames per second."""
     camera: str = "track"
-    """Camera: track or top."""
+    """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one of the model."""
     start: SomeNumber = None
     """First mission time shown [s]."""
     end: SomeNumber = None
     """Last mission time shown [s]."""
-    width: int = 1280
-    """Picture width [pixel]."""
-    height: int = 720
-    """Picture height [pixel]."""
+    size: str = "1280x720"
+    """Width and height [pixel]."""
     samples: int = 0
     """Multisampling of edges: 0 is fast, 4 is smoother and takes about twice as long."""
     overwrite: bool = False
@@ -43,9 +41,11 @@ class VideoCommand:
         """Render, with progress; the backend is named once there is a first frame."""
         from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
-        from marlbc_mj.recording.video import VideoStyle, render_video
+        from marlbc_mj.recording.video import VideoStyle, parse_size, render_video
 
         out = self.out or self.log.with_suffix(".mp4")
+        given = {each.name: getattr(self, each.name) for each in fields(VideoStyle)}
+        style = VideoStyle(**{**given, "size": parse_size(self.size)})
         with self.output.progress(ends=False) as told:
 
             def show(done: int, total: int) -> None:
@@ -53,7 +53,6 @@ class VideoCommand:
                     note(f"off-screen rendering with {choose_gl()}")
                 told.progress("video", done, total)
 
-            style = VideoStyle(**{each.name: getattr(self, each.name) for each in fields(VideoStyle)})
             render_video(read_log(self.log), out, style, overwrite=self.overwrite, progress=show)
         self.output.say(out)
 
@@ -139,7 +138,7 @@ class LogExportCommand:
 
 @dataclass(frozen=True)
 class LogCommand:
-    """Look into, salvage or convert MCAP logs."""
+    """Inspect, salvage or convert MCAP logs."""
 
     action: OmitSubcommandPrefixes[
         Annotated[LogInfoCommand, subcommand("info")]
@@ -148,5 +147,5 @@ class LogCommand:
     ]
 
     def run(self) -> None:
-        """Hand over to the action."""
+        """Run the chosen subcommand."""
         self.action.run()

@@ -1,4 +1,4 @@
-"""``marlbc robot check`` and ``gate``: a robot tried out, and every robot on its mission."""
+"""``marlbc robot check`` and ``gate``: check one robot, or fly robots through their gate mission."""
 
 import sys
 from dataclasses import dataclass, field
@@ -88,5 +88,5 @@ class RobotCommand:
     ]
 
     def run(self) -> None:
-        """Hand over to the action."""
+        """Run the chosen subcommand."""
         self.action.run()

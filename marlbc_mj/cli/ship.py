@@ -1,4 +1,4 @@
-"""``marlbc ship``: make a training run's best checkpoint one that comes with the package."""
+"""``marlbc ship``: copy a training run's best checkpoint into the package."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,7 +17,7 @@ class ShipCommand:
     name: Positional[str]
     """Name that the supervisor gets: marlms, rlms, marlms-general."""
     overwrite: bool = False
-    """Replace the one that is there."""
+    """Replace an existing checkpoint."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:

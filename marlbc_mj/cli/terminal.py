@@ -40,7 +40,7 @@ def prepare_gl(strict: bool) -> None:
 
 
 class Told(NamedTuple):
-    """How a command tells of its progress."""
+    """Callbacks by which a command reports its progress."""
 
     progress: Progress
     line: Callable[[str], None]
@@ -206,7 +206,7 @@ def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
 
 
 def no_display(trainer: Any, row: dict[str, float]) -> None:
-    """The display of a training run that nobody watches."""
+    """The display of a training run that shows nothing."""
 
 
 @contextmanager

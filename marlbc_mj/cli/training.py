@@ -1,9 +1,9 @@
-"""``marlbc train``: learn a mission supervisor, or go on learning."""
+"""``marlbc train``: train a mission supervisor, or resume a training."""
 
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NoReturn
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -14,6 +14,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 if TYPE_CHECKING:
     from marlbc_mj.training.config import TrainConfig
     from marlbc_mj.training.general.config import GeneralConfig
+    from marlbc_mj.training.run import Interrupted
 
 
 @dataclass(frozen=True)
@@ -21,7 +22,7 @@ class TrainCommand:
     """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
 
     method: Positional[MethodName] = "marlms"
-    """What is learned."""
+    """Training method."""
     preset: PresetName = "fast"
     """Hyper-parameters; those of paper are published."""
     seed: int = 0
@@ -29,7 +30,7 @@ class TrainCommand:
     out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
     resume: SomePath = None
-    """Folder of a run that was interrupted: it goes on, bit for bit, with its own settings."""
+    """Folder of an interrupted run, which continues bit for bit with its own settings."""
     budget: SomeCount = None
     """Mission steps, over all worlds."""
     threads: SomeCount = None
@@ -47,8 +48,9 @@ class TrainCommand:
         from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
         from marlbc_mj.training.general.config import GENERAL
+        from marlbc_mj.training.general.run import is_general_run
 
-        if self.method == GENERAL and self.resume is None:
+        if is_general_run(self.resume) if self.resume is not None else self.method == GENERAL:
             self.run_general()
             return
         with self.output.display(training_display) as progress:
@@ -60,8 +62,7 @@ class TrainCommand:
                 folder = self.out or Path("runs") / f"{config.method}-{config.preset}-{config.seed}"
                 ended = run.train(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, run.Interrupted):
-            print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
-            sys.exit(128 + ended.signal)
+            say_how_to_go_on(folder, ended)
         best = max(ended, key=run.rank)
         switches = "/".join(f"{value:.0f}" for name, value in best.items() if name.startswith("switches_"))
         text = (
@@ -72,18 +73,21 @@ class TrainCommand:
         self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def run_general(self) -> None:
-        """Train the policy for every team; an interrupted run leaves the policy that it had."""
+        """Train the policy for every team; an interrupted run says how to continue it."""
         from marlbc_mj.cli.terminal import general_display
-        from marlbc_mj.training.general.run import judged_rank, train_general
+        from marlbc_mj.training.general.run import judged_rank, resume_general, train_general
         from marlbc_mj.training.run import Interrupted
 
-        config = self.general_config()
-        folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
         with self.output.display(general_display) as progress:
-            ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
+            if self.resume is not None:
+                self.refuse_others()
+                folder, ended = self.resume, resume_general(self.resume, progress=progress)
+            else:
+                config = self.general_config()
+                folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
+                ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, Interrupted):
-            print(f"marlbc: stopped; {folder / 'checkpoint'} holds the best and the last policy so far", file=sys.stderr)
-            sys.exit(128 + ended.signal)
+            say_how_to_go_on(folder, ended)
         best = max(ended, key=judged_rank)
         rates = ", ".join(f"{k.removeprefix('success_')} {100 * v:.4g} %" for k, v in best.items() if k.startswith("success_"))
         text = f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps: success {rates}"
@@ -91,7 +95,7 @@ class TrainCommand:
         self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def general_config(self) -> "GeneralConfig":
-        """The settings of the policy for every team, with the command line's changes.
+        """The settings of the general policy, with the command line's changes.
 
         Raises:
             ConfigurationError: an option that this method does not have.
@@ -129,3 +133,9 @@ class TrainCommand:
         changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **given}
         config = make_config(self.preset, **changes)
         return with_settings(config, self.set)
+
+
+def say_how_to_go_on(folder: Path, ended: "Interrupted") -> NoReturn:
+    """Leave with the status of the signal that interrupted a run."""
+    print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
+    sys.exit(128 + ended.signal)

@@ -17,7 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.modules import made, names_attribute
 
 _UNLIMITED: dict[str, tuple[type[RLC | FiniteTime | FixedTime | LQR | TerminalSliding | PredefinedTime], str]] = {
-    "rlc": (RLC, "single-agent RL controller: SORLC's networks, next to no damping, no limit"),
+    "rlc": (RLC, "single-agent RL controller: SORLC's networks, little damping, no limit"),
     "finite-time": (FiniteTime, "finite-time law, no limit, true drag known"),
     "fixed-time": (FixedTime, "fixed-time law, no limit, true drag known"),
     "lqr": (LQR, "Riccati gains of the paper's own cost, no limit, true drag known"),
@@ -39,7 +39,7 @@ for _name, (_law, _line) in _UNLIMITED.items():
 
 
 CONTROLLER_PARTS = ("law", "limited", "linear_gains", "params", "initial_state")
-"""What every controller has."""
+"""Attributes that every controller has."""
 
 
 def require_controller(found: object, name: str = "controller") -> Controller:

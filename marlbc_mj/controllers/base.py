@@ -1,4 +1,4 @@
-"""What the engine asks of a controller, and the checks that all of them share."""
+"""The interface of controllers, and the checks that all of them share."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable

@@ -1,4 +1,4 @@
-"""Saturated PD: what SORLC becomes once its networks have nothing to say; the baseline of every comparison."""
+"""Saturated PD: SORLC without its networks; the baseline of every comparison."""
 
 from dataclasses import dataclass
 

@@ -66,7 +66,7 @@ def bound_obstacles(p, obstacles, distance, level, barrier, planes, count):
 def bound_neighbors(team, i, distance, level, barrier, planes, count):
     """AA as half-planes: n_ij . v >= -alpha / 2 (d_ij - d_AA - m) for every agent j within reach of agent ``i``.
 
-    ``team`` (N, 2) [m]; the rest as in :func:`bound_obstacles`. Two agents in one place part along x.
+    ``team`` (N, 2) [m]; the rest as in :func:`bound_obstacles`. Two agents at one place separate along x.
     """
     for j in range(team.shape[0]):
         x, y = team[i, 0] - team[j, 0], team[i, 1] - team[j, 1]

@@ -14,7 +14,8 @@ from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError
 
 EVERYTHING, NEAREST_OBSTACLE, NEAREST_NEIGHBOR = 0, 1, 2
-"""What a behavior's law looks at: all obstacles and agents, or only the nearest of one kind. Of large teams, a law that says so
+"""The part of the surroundings that a behavior's law needs: all obstacles and agents, or only the nearest of one kind. Of large
+teams, a law that says so
 (by an attribute ``sees``) is handed that one alone, found in a grid; what it computes is the same."""
 
 
@@ -101,12 +102,12 @@ def obstacle_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jac
 
 @laws.behavior(gains=("gain", "distance"))
 def agent_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
-    """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T. The project's own.
+    """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T. Defined by this project.
 
     d = |p - p_j| to the nearest other agent j and n = (p - p_j) / d. The rate d' = n^T (v - p_j') has the neighbor's velocity in
     it, which an agent does not know; the path's, which the team has in common, stands in for it. One-sided, and more so than OA:
-    from d_AA on it has no row, so that on top it shuts no direction, and an agent that may leave does. Two agents in one place
-    part along x.
+    from d_AA on it has no row, so that on top it shuts no direction, and an agent that may leave does. Two agents at one place
+    separate along x.
     """
     nearest, distance = -1, np.inf
     for other in range(team.shape[0]):
@@ -140,7 +141,7 @@ def formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out
 
 @runtime_checkable
 class Behavior(Protocol):
-    """What the engine asks of a behavior: a name, its law, whether J has full rank, and its gains."""
+    """The interface of behaviors: a name, the law, whether J has full rank, and the gains."""
 
     @property
     def name(self) -> str: ...
@@ -194,7 +195,7 @@ class AgentAvoidance:
 
 @dataclass(frozen=True)
 class Formation:
-    """Hold one's slot around the moving desired centroid: FM (10), and with the column's offsets FR (11)."""
+    """Hold a slot around the moving desired centroid: FM (10), and with the column's offsets FR (11)."""
 
     name: str
     offsets: tuple[tuple[float, float], ...]  # (x, y) of each agent [m]

@@ -2,8 +2,8 @@
 
 An agent's *way* is the straight line that it makes until it rests, if it brakes from the next mission step on. A velocity is
 admissible if its way keeps d_OA + m from every obstacle at rest, and if it and the way of every other agent keep d_AA + m between
-any two of their points. What is left of a way after one mission step lies within the way that was foreseen. So who brakes stays
-admissible: from an admissible state there always is an admissible velocity, whatever the wishes are.
+any two of their points. What is left of a way after one mission step lies within the way that was foreseen. So an agent that
+brakes stays admissible: from an admissible state there always is an admissible velocity, for any desired velocities.
 
 For one obstacle and T -> 0, |v| max(0, -n . v) <= 2 A (d - d_OA - m) is enough. The distance to a convex body is convex along a
 line, so at the end of the way and before it is at least d + n . v |v| / (2 A).
@@ -19,11 +19,12 @@ BISECTIONS = 8
 
 @allocation_free
 def restrain(i, before, barrier, at, obstacles, v_r):
-    """Change the wish ``v_r[i]`` of agent ``i`` to an admissible velocity that the acceleration limit allows, in place.
+    """Change the desired velocity ``v_r[i]`` of agent ``i`` to an admissible one that the acceleration limit allows, in place.
 
-    Of the velocities between braking and the limited wish it is one far towards the wish, found by bisection. Agents choose one
+    It lies between braking and the desired velocity within its limit, close to the latter, and is found by bisection. Agents
+    choose one
     after the other: i knows what those before it chose, and those behind it can still brake from the velocity that they have.
-    Obstacles that move bound the wish alone (:mod:`marlbc_mj.core.barriers`); nothing is promised for them.
+    Moving obstacles bound the desired velocity only (:mod:`marlbc_mj.core.barriers`); nothing is promised for them.
 
     Args:
         i: agent.

@@ -2,7 +2,7 @@
 
 A grid is one float64 array, so that worlds keep theirs as rows of a batch: a header, for every point the next one in its cell,
 and for every cell its first point. It is a linked cell list with about one point a cell. Where a grid cannot help (numbers that
-are not finite, a query from far away), all points are tried, so a grid changes what a query costs and never what it says.
+are not finite, a query from far away), all points are tried, so a grid changes the cost of a query and never its result.
 """
 
 import numpy as np
@@ -98,7 +98,7 @@ def nearest(p, points, grid, own):
 
 @allocation_free
 def _of_all(p, points, own):
-    """What :func:`nearest` says, from its definition."""
+    """The result of :func:`nearest`, from its definition."""
     best, found = np.inf, -1
     for k in range(points.shape[0]):
         gap = _gap(p, points, k)

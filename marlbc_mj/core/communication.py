@@ -1,4 +1,4 @@
-"""Communication between the agents of a team: what a scenario says of it, and the graph that follows from it."""
+"""Communication between the agents of a team: the settings of a scenario, and the graph that follows from them."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,14 +12,14 @@ PROTOCOLS = ("flooding", "consensus")
 
 @dataclass(frozen=True)
 class Communication:
-    """How the agents of one scenario hear each other. The default is ideal: everyone knows what everyone says, at once.
+    """How the agents of one scenario hear each other. The default is ideal: every message reaches every agent at once.
 
     Every ``period`` an agent broadcasts; who is within ``range`` then hears it ``delay`` later, unless the message is lost. Each
     direction of each link loses its messages independently, by numbers drawn from the world's seed: the same for any batch size
     and number of threads. Agents that are silent hear, but send nothing. Where agents are is what is measured.
 
     Raises:
-        ConfigurationError: naming the value that cannot be.
+        ConfigurationError: naming the invalid value.
     """
 
     protocol: Literal["flooding", "consensus"] = "flooding"  # newest entries passed on, or dynamic average consensus
@@ -68,7 +68,7 @@ class Communication:
 
 
 IDEAL = Communication()
-"""Everyone knows what everyone says, at once."""
+"""Ideal communication: every message reaches every agent at once."""
 
 
 def within_range(position: np.ndarray, reach: float) -> np.ndarray:

@@ -46,10 +46,10 @@ def threads_usable(threads: int) -> bool:
 
 
 _threads_of = 0
-"""The process whose threads numba has started; 0: none has."""
+"""The process in which numba has started threads; 0: none."""
 
 COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
-"""What is found in files that hold compiled code."""
+"""Texts by which files with compiled code are found."""
 _PACKAGE = Path(__file__).parents[1]
 SOURCES = sources_stamp(_PACKAGE)
 _MOST_BESIDE = 500
@@ -57,7 +57,9 @@ _MOST_BESIDE = 500
 
 
 def _stamp(function: Law) -> tuple[Any, ...]:
-    """What compiled code of a function depends on: this package, and for a user's law the files beside it and what it uses."""
+    """The sources that compiled code of a function depends on: this package, and for a user's law the files beside it and what
+    it uses.
+    """
     path = Path(function.__code__.co_filename)
     if path.is_relative_to(_PACKAGE):
         return (SOURCES,)
@@ -205,5 +207,5 @@ def is_compiled(law: Law) -> bool:
 
 
 def plain(law: Law) -> Law:
-    """The law as plain Python: for a debugger, and for measuring what compilation is worth."""
+    """The law as plain Python: for a debugger, and for measuring the gain of compilation."""
     return law.py_func if isinstance(law, Dispatcher) else law

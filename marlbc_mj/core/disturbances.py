@@ -1,4 +1,4 @@
-"""Unknown dynamics f(chi) of the plant (1): what the controllers do not know. One law and one dataclass each."""
+"""Unknown dynamics f(chi) of the plant (1). One law and one dataclass each."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -63,9 +63,9 @@ def wind_gusts(gains, t, p, v, force_out):
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """What the engine asks of a disturbance. Its first gain is ``scale``, which a perturbation draw multiplies.
+    """The interface of disturbances. Its first gain is ``scale``, which a perturbation draw multiplies.
 
-    One that offers ``force_bound() -> ForceBound`` can be shielded against without further ado.
+    One that offers ``force_bound() -> ForceBound`` needs no further settings for a shield.
     """
 
     @property
@@ -140,7 +140,7 @@ class ConstantWind(_Scaled):
 class WindGusts(_Scaled):
     """Wind that comes and goes: a steady force and ``HARMONICS`` sines whose frequencies and phases ``seed`` draws.
 
-    The same seed blows the same at the same mission time, whatever the agents do. Harmonic k has an amplitude that falls with its
+    The wind of a seed depends on the mission time only. Harmonic k has an amplitude that falls with its
     frequency as 1 / sqrt(1 + (w_k T)^2), as in a Dryden spectrum, and together they have the root mean square ``strength``.
     """
 

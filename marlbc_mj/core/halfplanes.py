@@ -1,11 +1,11 @@
-"""The velocity nearest to a wish that satisfies half-planes, exactly: a quadratic program in the plane, without a solver.
+"""The velocity nearest to a desired one that satisfies half-planes, exactly: a quadratic program in the plane, without a solver.
 
 minimise |v - wish|^2  subject to  n_k . v >= b_k  and  |v| <= speed.
 
 Half-planes are inserted one at a time: where one cuts off the optimum so far, the new optimum lies on its border, and there the
 problem has one dimension (M. de Berg et al., Computational Geometry, ch. 4; J. van den Berg et al., Reciprocal n-body collision
 avoidance, 2011). Where half-planes contradict, those of a higher level win: the greatest violation of the first level is made as
-small as possible, then that of the second, and so on, then the distance from the wish.
+small as possible, then that of the second, and so on, then the distance from the desired velocity.
 
 A half-plane is a row of four: n_x, n_y (a unit normal), b [m/s], level. Rows are sorted by level, the most important first.
 """

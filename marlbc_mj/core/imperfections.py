@@ -1,4 +1,4 @@
-"""What a plant does worse than its model: noise and age of measurements, lost actuation. Off by default, and free when off."""
+"""Imperfections of a plant: noise and age of measurements, lost actuation. Off by default, without cost when off."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -31,7 +31,7 @@ class Imperfections:
     force between the law and the robot's drive.
 
     Raises:
-        ConfigurationError: naming the value that cannot be.
+        ConfigurationError: naming the invalid value.
     """
 
     position_noise: float = 0.0  # standard deviation per axis [m]
@@ -111,7 +111,7 @@ def uniform(seed: np.ndarray, count: np.ndarray, streams: np.ndarray) -> np.ndar
 
 @allocation_free
 def sense(senses, seed, count, history, p, v, sensed):
-    """What is measured at substep ``count``: the true p, v (N, 2) of D - 1 substeps ago, with noise, in ``sensed`` (2, N, 2).
+    """The measurement at substep ``count``: the true p, v (N, 2) of D - 1 substeps ago, with noise, in ``sensed`` (2, N, 2).
 
     ``history`` (D, 2, N, 2) is a ring that this call adds the present to.
     """

@@ -1,6 +1,7 @@
-"""Obstacles that move with the mission clock: straight on, or to and fro. Beyond the paper, whose Assumption 2 has them at rest.
+"""Obstacles that move with the mission clock: in a straight line, or back and forth. Beyond the paper, whose Assumption 2 has
+them at rest.
 
-One law, evaluated by the engine, by metrics and by whatever draws an episode, so an obstacle is at one place at one time.
+One law for the engine, metrics and drawings, so that an obstacle has one place at one time.
 """
 
 import numpy as np
@@ -64,7 +65,7 @@ def obstacles_at(time: float, anchors: np.ndarray, motions: np.ndarray) -> np.nd
 
 
 def nearest_places(times: np.ndarray, positions: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """(K, 3) obstacles, each where it is nearest to an agent in an episode: the one place to draw where time cannot be shown.
+    """(K, 3) obstacles, each where it is nearest to an agent in an episode: the place to draw in a picture without time.
 
     ``positions`` (M, N, 2) [m] at ``times`` (M,) [s].
     """

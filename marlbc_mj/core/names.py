@@ -1,4 +1,4 @@
-"""Names for the numbers of a law: what it reads as ``gains.limit`` or ``state.tau[axis]`` is a row of float64 for the loop."""
+"""Names for the numbers of a law: a law reads ``gains.limit`` or ``state.tau[axis]``, and the loop has rows of float64."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,7 +17,7 @@ Numbers = Mapping[str, Any] | Sequence[float] | np.ndarray
 
 
 class Owner(NamedTuple):
-    """Whose names these are, for messages."""
+    """The object that owns the names, for messages."""
 
     law: str
     word: str  # "gain" or "state"

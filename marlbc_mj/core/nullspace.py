@@ -1,4 +1,4 @@
-"""The terms of null-space composition (12): what one behavior adds, and which directions it shuts (erratum 5).
+"""The terms of null-space composition (12): the part that one behavior adds, and the directions that it closes (erratum 5).
 
 A^+ A is the orthogonal projector onto the row space of A, the Jacobians of all behaviors of higher priority. So N = I - A^+ A is
 applied through an orthonormal basis of that space: no inverse is formed, a rank-deficient stack needs no special case, and any

@@ -51,12 +51,12 @@ ASSUMPTIONS = ("speed", "force", "state", "motion", "tube")
 
 @dataclass(frozen=True)
 class Shield:
-    """What a shield assumes and keeps. None takes the scenario's or the robot's own number.
+    """Assumptions and distances of a shield. None takes the scenario's or the robot's own number.
 
     What can be checked is checked when a world is made; what cannot is watched while it runs, see :class:`ShieldCounts`.
 
     Raises:
-        ConfigurationError: naming the value that cannot be.
+        ConfigurationError: naming the invalid value.
     """
 
     force_limit: float | None = None  # U, available in every direction within a substep; None: the scenario's, per axis [N]
@@ -78,7 +78,7 @@ class Shield:
 
     @property
     def mailed(self) -> bool:
-        """Whether agents know of each other by messages that are late or lost; else all know all at every moment."""
+        """Whether agents know each other's states from messages that may be late or lost; else they know them at every moment."""
         return self.latency > 0.0 or self.message_loss > 0.0 or self.silent >= 0
 
     def __post_init__(self) -> None:
@@ -115,7 +115,7 @@ class Shield:
 
 
 class ShieldCounts(NamedTuple):
-    """What a shield did and saw since the episode began: rows of one team, or (B, ...) of many."""
+    """Interventions and breaches of a shield since the episode began: rows of one team, or (B, ...) of many."""
 
     interventions: np.ndarray  # (N,) substeps in which it changed the force, or the reference velocity
     change: np.ndarray  # (N,) integral of |u - wish| dt, or m |v_r - wish| of every mission step [N s]
@@ -134,7 +134,7 @@ def within(x, y, centre_x, centre_y, radius):
 
 @allocation_free
 def nearest_safe(numbers, view, i, x, y):
-    """The wish (x, y) [m/s] projected on the disc that it is farthest out of, time and again; one thing needs one round.
+    """The desired velocity (x, y) [m/s], projected repeatedly on the disc that it is farthest out of; one thing needs one round.
 
     The result is within what the actuators reach; whether it is safe is for :func:`~marlbc_mj.core.stopping.stays_safe` to say.
     """
@@ -180,7 +180,7 @@ def last_resort(numbers, view, i, k):
 
 @allocation_free
 def safe_velocity(numbers, view, i, k, x, y):
-    """The first of {the wish (x, y) projected; its tangential part; braking} that stays safe: w [m/s] of agent ``i``.
+    """The first of {the projection of (x, y); its tangential part; braking} that stays safe: w [m/s] of agent ``i``.
 
     Where obstacles move, braking may not stay safe either: then it is the one of first and last that is less far out.
     """
@@ -274,7 +274,7 @@ def shield_team(numbers, view, last, force, counts):
         numbers: the shield's.
         view: what it knows.
         last: (N, 2, 2) v and u of the substep before, NaN at the start; this one's afterwards.
-        force: (N, 2) what controllers wish; in place.
+        force: (N, 2) the controllers' forces; changed in place.
         counts: rows of this team; added to.
     """
     longest = fill_stopping(numbers, view)
@@ -304,7 +304,7 @@ def restrain_references(numbers, braking_limit, duration, at, obstacles, previou
         at: (N, 2) references [m].
         obstacles: (K, 3) x, y, radius [m].
         previous: (N, 2) v_r of the mission step before [m/s]; what was chosen afterwards.
-        v_r: (N, 2) wishes within the limits of speed and acceleration.
+        v_r: (N, 2) desired velocities within the limits of speed and acceleration.
     """
     kept, between = numbers.clearance + numbers.tube, numbers.agent_distance + 2.0 * numbers.tube
     barrier = Barrier(0.0, 0.0, 0.0, np.inf, braking_limit, duration, kept, between)

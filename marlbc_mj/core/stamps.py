@@ -1,4 +1,4 @@
-"""How two agents keep apart whose messages are late or lost: by stamps, instants of which both know both.
+"""Separation of two agents whose messages are late or lost, by stamps: instants at which both states are known to both.
 
 Of a *stamp* x agent i knows p_j and L_j from a message, and its own p_i and L_i from memory. With n the unit vector from j to i
 at x, |p_i - p_j| is at least n.(p_i - p_j) ever after. So if each keeps
@@ -21,7 +21,7 @@ from marlbc_mj.core.imperfections import normal
 from marlbc_mj.core.laws import allocation_free
 
 NEVER_STAMPED = -1.0
-"""Instead of a stamp, where there is none."""
+"""Stands for a missing stamp."""
 NEWEST, OLDER = 0, 1
 STREAM = 1_000_003  # of random numbers: beyond those of sensors
 REMEMBERED = 400  # substeps of the past that agents know their own states of, besides the latency
@@ -43,7 +43,7 @@ class Mail(NamedTuple):
 
 @allocation_free
 def receive(stamps, planes, sent, newest, proposed, adopted, fits_sent, fits_newest):
-    """What a message changes of the live stamps with its sender: confirm, adopt, propose.
+    """Update of the live stamps with the sender of a message: confirm, adopt, propose.
 
     Args:
         stamps: (2,) live stamps, the newest first; NEVER_STAMPED where there is but one. In place.

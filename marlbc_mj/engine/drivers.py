@@ -1,31 +1,37 @@
 """How the loop is called: what a World hands over is referred to once, and worlds are stepped in series or by threads."""
 
+from typing import Any
+
 import numba
 import numpy as np
 
 from marlbc_mj.core.laws import compiled, threaded
+from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.loop import mission_step, shield_forces, shield_references
 from marlbc_mj.engine.plan import Plan
-from marlbc_mj.engine.records import Arguments, Native, Record, Team
-from marlbc_mj.engine.references import call, entry, refer
+from marlbc_mj.engine.records import Arguments, MissionRules, Native, Plant, Record, Team
+from marlbc_mj.engine.references import call, entry, no_entry, refer
 
 
 def hand_over(plan: Plan, native: Native, team: Team, record: Record, compiled_loop: bool) -> Arguments:
     """The parts as the loop takes them: referred to, with the entries of what this team needs if the loop is compiled."""
     mission, plant, team, record = map(refer, (plan.mission, plan.plant, team, record))
-    arguments = Arguments(mission, plan.behaviors, native, plant, team, record)
-    return _with_entries(arguments) if compiled_loop else arguments
-
-
-def _with_entries(a: Arguments) -> Arguments:
-    native = a.native
-    if a.team.last_substep.shape[1] > 0:
-        native = native._replace(shield_forces=entry(shield_forces, 0, 0.0, 0.0, a.plant, a.team))
-    elif a.team.interventions.shape[1] > 0:
-        native = native._replace(shield_references=entry(shield_references, 0, a.mission, a.behaviors, a.plant, a.team))
+    if not compiled_loop:
+        return Arguments(None, mission, plan.behaviors, native, plant, team, record)
+    native = refer(_with_shield(native, mission, plan.behaviors, plant, team))
     orders, given = np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 2))
-    step = entry(mission_step, 0, orders, given, *a._replace(native=refer(native)))
-    return a._replace(native=refer(native._replace(mission_step=step)))
+    parts = mission, plan.behaviors, native, plant, team, record
+    return Arguments(entry(mission_step, 0, orders, given, *parts), *parts)
+
+
+def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team: Any) -> Native:
+    """``native`` with the entries of the shield that the team has."""
+    forces, references = no_entry(0, 0.0, 0.0, Plant, Team), no_entry(0, MissionRules, Behaviors, Plant, Team)
+    if team.last_substep.shape[1] > 0:
+        forces = entry(shield_forces, 0, 0.0, 0.0, plant, team)
+    elif team.interventions.shape[1] > 0:
+        references = entry(shield_references, 0, mission, behaviors, plant, team)
+    return native._replace(shield_forces=forces, shield_references=references)
 
 
 @compiled
@@ -36,8 +42,7 @@ def play(b, sequence, given, a):
     """
     total = 0.0
     for m in range(sequence.shape[0]):
-        orders = sequence[m]
-        if call(a.native.mission_step, b, orders, given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record):
+        if call(a.step, b, sequence[m], given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record):
             break
         total += a.team.reward[b]
     return total

@@ -21,7 +21,7 @@ from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_
 from marlbc_mj.engine.loop import shield_forces, shield_references
 from marlbc_mj.engine.native import step_address
 from marlbc_mj.engine.records import MissionRules, Native, Plant
-from marlbc_mj.engine.references import entry, refer
+from marlbc_mj.engine.references import entry, no_entry, refer
 from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, make_robot
 from marlbc_mj.scenarios import Scenario
@@ -92,14 +92,14 @@ class Plan:
         team_laws = (0 if law is None else laws.address(law, kind) for law, kind in self._laws())
         arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
         columns = ([d._address for d in data], *arrays)
-        entries = map(np.uint64, (0, 0, 0, step_address(), self.model._address, *team_laws))
-        return Native._make((*entries, *(np.array(column, dtype=np.uint64) for column in columns)))
+        entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
+        return Native._make((None, None, *entries, *(np.array(column, dtype=np.uint64) for column in columns)))
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
         team_laws = (None if law is None else laws.for_team(law, kind) for law, kind in self._laws())
         columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
-        return Native._make((None, shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
+        return Native._make((shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
 
 
 def _arrays(data: Any) -> tuple[np.ndarray, ...]:
@@ -176,7 +176,7 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
     addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
     set_based = scenario.composition == "set-based"
     behaviors = Behaviors(
-        compose=np.uint64(0),
+        compose=no_entry(*_composed(Behaviors)),
         laws=addresses,
         params=params,
         sees=sees_array(scenario.behaviors),
@@ -189,9 +189,14 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         keeps=keeps_array(scenario.behaviors),
         **make_barrier(scenario)._asdict(),
     )
-    rows, team = np.zeros((1, 2)), set_based_team if set_based else null_space_team
-    compose = entry(team, 0.0, np.zeros(1, dtype=np.int64), refer(behaviors), rows, rows, np.zeros(1), rows, rows)
+    compose = entry(set_based_team if set_based else null_space_team, *_composed(refer(behaviors)))
     return cast(Behaviors, refer(behaviors._replace(compose=compose)))
+
+
+def _composed(behaviors: Any) -> tuple[Any, ...]:
+    """Arguments like those of a composition: time, orders, behaviors, positions, obstacles, grid, workspace, velocities."""
+    rows = np.zeros((1, 2))
+    return 0.0, np.zeros(1, dtype=np.int64), behaviors, rows, rows, np.zeros(1), rows, rows
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:

@@ -40,9 +40,8 @@ class Plant(NamedTuple):
 class Native(NamedTuple):
     """What is reached by address: addresses for compiled code, the objects themselves for the Python path."""
 
-    mission_step: Any  # entry of mission_step
-    shield_references: Any  # entry of shield_references
-    shield_forces: Any  # entry of shield_forces
+    shield_references: Any  # entry of the loop's part of this name; unset where the team has no such shield
+    shield_forces: Any
     step: Any  # mj_step
     model: Any  # MjModel
     controller: Any  # law of the whole team
@@ -111,6 +110,7 @@ class Arguments(NamedTuple):
     loop is compiled (behaviors always).
     """
 
+    step: Any  # entry of mission_step; unset for the Python path
     mission: Any
     behaviors: Any
     native: Any

@@ -5,17 +5,18 @@ compiled with hundreds of arguments, and every ``team.position`` reads all of it
 the field alone. The source is the same for both: attributes have the same names.
 
 What a function calls is compiled into it once more. So the loop's large parts are called by address, :func:`call`: each is
-compiled once, and only by those who need it. :func:`entry` compiles one and tells where it is.
+compiled once, and only by those who need it. :func:`entry` compiles one and tells where it is. Its type holds what it takes: a
+wrong argument is an error of the compiler, not of memory.
 """
 
 from typing import Any
 
 import numba
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
 from numba.core.datamodel import models
+from numba.core.errors import TypingError
 from numba.core.extending import _Intrinsic
 from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate
@@ -121,24 +122,69 @@ def _unbox_reference(kind, value, c):
     return NativeValue(c.builder.bitcast(pointer, c.context.get_value_type(kind)), is_error=c.pyapi.c_api_error())
 
 
-def _passed(kind: Any) -> Any:
-    """The type that an argument is passed as by :func:`call`: whole numbers as int64, arrays as C-contiguous ones.
+class EntryType(types.Type):
+    """numba's type of :class:`Entry`: ``kinds`` are those that its function takes."""
 
-    Raises:
-        TypeError: an array of another layout.
-    """
+    def __init__(self, kinds: tuple[types.Type, ...]) -> None:
+        self.kinds = kinds
+        super().__init__(name=f"Entry({', '.join(map(str, kinds))})")
+
+
+class RecordType(types.Type):
+    """Stands for a reference among the kinds of an entry, by the record's name alone: a record may hold entries that take it."""
+
+    def __init__(self, record: str) -> None:
+        super().__init__(name=f"&{record}")
+
+
+@register_model(EntryType)
+class _EntryModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: EntryType) -> None:
+        super().__init__(manager, kind, ir.IntType(64))
+
+
+class Entry:
+    """Address of a compiled function, as :func:`call` takes it. Made by :func:`entry`; :func:`no_entry` has its type alone."""
+
+    def __init__(self, address: int, kinds: tuple[types.Type, ...]) -> None:
+        self.address, self._numba_type_ = address, EntryType(kinds)
+
+
+@unbox(EntryType)
+def _unbox_entry(kind, value, c):
+    number = c.pyapi.object_getattr_string(value, "address")
+    address = c.pyapi.long_as_ulonglong(number)
+    c.pyapi.decref(number)
+    return NativeValue(address, is_error=c.pyapi.c_api_error())
+
+
+def _passed(kind: Any) -> Any:
+    """The kind as which an argument is passed: whole numbers as int64, arrays as C-contiguous ones, references by name."""
     if isinstance(kind, types.Array):
-        if kind.layout != "C":
-            raise TypeError(f"called by address, arrays must be contiguous, got {kind}")
         return types.Array(kind.dtype, kind.ndim, "C")
+    if isinstance(kind, ReferenceType):
+        return RecordType(kind.target.instance_class.__name__)
     if isinstance(kind, types.Integer):
         return types.int64
     return types.float64 if isinstance(kind, types.Float) else kind
 
 
-def _call_at(typing_context, address, *arguments):
-    given = arguments[0] if isinstance(arguments[0], types.BaseTuple) else types.BaseTuple.from_types(arguments)
-    kinds = [_passed(kind) for kind in given]
+def _check(given: Any, wanted: Any) -> None:
+    """Raise a numba error unless an argument can be passed as the kind that an entry takes."""
+    kind = _passed(given)
+    if isinstance(given, types.Array) and given.layout != "C":
+        raise TypingError(f"an array that is passed to an entry must be contiguous, got {given}")
+    if kind != wanted and (kind, wanted) != (types.int64, types.float64):
+        raise TypingError(f"an entry takes {wanted}, got {given}")
+
+
+def _call_at(typing_context, entry, *arguments):
+    given = types.BaseTuple.from_types(arguments)
+    if not isinstance(entry, EntryType) or len(given) != len(entry.kinds):
+        raise TypingError(f"called by address with {given}, got {entry}")
+    for pair in zip(given, entry.kinds, strict=True):
+        _check(*pair)
+    kinds = [own if isinstance(kind, RecordType) else kind for own, kind in zip(given, entry.kinds, strict=True)]
 
     def codegen(context, builder, signature, args):
         values = cgutils.unpack_tuple(builder, args[1])
@@ -150,11 +196,11 @@ def _call_at(typing_context, address, *arguments):
             context.call_conv.return_status_propagate(builder, status)
         return result
 
-    return types.int64(types.uintp, given), codegen
+    return types.int64(entry, given), codegen
 
 
 class _Call(_Intrinsic):  # type: ignore[misc]
-    """Call a function that returns a whole number: itself in Python, by its :func:`entry` in compiled code."""
+    """Call a function that returns a whole number: itself in Python, by its :class:`Entry` in compiled code."""
 
     def __call__(self, function, *arguments):
         return function(*arguments)
@@ -165,10 +211,20 @@ call._register()
 
 
 def entry(function: Law, *arguments: Any) -> Any:
-    """What :func:`call` takes for a compiled ``function`` of such arguments: its address; itself where numba is off."""
+    """What :func:`call` takes for a compiled ``function`` of such arguments; the function itself where numba is off."""
     if not is_compiled(function):
         return function
-    kinds = tuple(_passed(numba.typeof(argument)) for argument in arguments)
-    function.compile(kinds)  # type: ignore[attr-defined]
-    found = function.overloads[kinds]  # type: ignore[attr-defined]
-    return np.uint64(found.library.get_pointer_to_function(found.fndesc.llvm_func_name))
+    given = [numba.typeof(argument) for argument in arguments]
+    kinds = [_passed(kind) for kind in given]
+    taken = tuple(own if isinstance(kind, RecordType) else kind for own, kind in zip(given, kinds, strict=True))
+    function.compile(taken)  # type: ignore[attr-defined]
+    found = function.overloads[taken]  # type: ignore[attr-defined]
+    if types.unliteral(found.signature.return_type) != types.int64:
+        raise TypeError(f"{function} returns {found.signature.return_type}; called by address, it must return a whole number")
+    return Entry(int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name)), tuple(kinds))
+
+
+def no_entry(*arguments: Any) -> Any:
+    """A field's value before its :func:`entry` is known: of the same type. A class of records stands for a reference to one."""
+    kinds = (RecordType(a.__name__) if isinstance(a, type) else _passed(numba.typeof(a)) for a in arguments)
+    return Entry(0, tuple(kinds))

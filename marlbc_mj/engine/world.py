@@ -260,7 +260,7 @@ class World:
         if self.native:
             return self._play(self._returns, orders[np.newaxis], given)
         mission_step = laws.plain(loop.mission_step)
-        return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
+        return sum(mission_step(b, orders, given, *self._arguments[1:]) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)

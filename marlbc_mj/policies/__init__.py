@@ -1,1 +1,1 @@
-"""Learned policies without torch: what they see, what they choose from, how they decide, how they are read."""
+"""Learned policies without torch: inputs, action sets, decisions, checkpoints."""

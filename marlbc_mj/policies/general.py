@@ -17,7 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
 
 KIND = "general"
-"""What a checkpoint's header calls a policy of this kind."""
+"""Name of this kind of policy in a checkpoint's header."""
 FORMATION, COLUMN_ACTION = 0, 1
 """The actions: form the formation, form the column."""
 ACTIONS_OF_AGENT = 2
@@ -26,7 +26,7 @@ INTERVAL = 1.2
 
 
 class Sensed(NamedTuple):
-    """What B teams sensed at a decision, and what is in force."""
+    """Sensed inputs of B teams at a decision, and the actions in force."""
 
     features: np.ndarray  # (B, N, F) float32
     last: np.ndarray  # (B, N) actions in force

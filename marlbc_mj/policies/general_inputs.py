@@ -1,4 +1,4 @@
-"""What an agent of any team senses, sends and pools: inputs of the general policy (project).
+"""Features that an agent of any team senses, sends and pools: inputs of the general policy (project).
 
 Everything is relative and free of scale: lengths count in safe distances d_OA, times in settling times
 T = d_OA / v_max + 1 / min(Lambda, alpha), the time in which a reference covers d_OA and settles. So a larger robot, a slower one
@@ -47,11 +47,11 @@ INPUT_LAYOUT: dict[str, float | list[float]] = {
     **{"version": 1, "features": FEATURES, "pooled": POOLED, "edges": list(EDGES)},
     **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
 }
-"""What a network's weights depend on; ``version`` is raised when entries change their meaning."""
+"""Layout of the inputs, on which a network's weights depend; ``version`` is raised when entries change their meaning."""
 
 
 class Sight(NamedTuple):
-    """What it takes to compute the features of one scenario's teams."""
+    """The data needed to compute the features of one scenario's teams."""
 
     slots: np.ndarray  # (2, N, 2) of formation and column around the desired centroid [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]

@@ -1,4 +1,4 @@
-"""Where the checkpoints are that come with the package; each has a model card beside it."""
+"""Checkpoints that come with the package; each has a model card beside it."""
 
 from importlib.resources import files
 from pathlib import Path

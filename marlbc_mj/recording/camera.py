@@ -1,4 +1,4 @@
-"""Where the picture is taken from: a view that follows the team, a map of the whole mission, or a camera of the model."""
+"""Where the picture is taken from: behind the team or one agent, beside or above the whole mission, or a camera of the model."""
 
 from collections.abc import Callable
 
@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from marlbc_mj.recording.stage import Stage
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 TRACK_AZIMUTH = 38.0  # from the direction of travel; the team moves into the picture [deg]
 TRACK_ELEVATION = -33.0  # [deg]
@@ -16,25 +16,54 @@ TRACK_AHEAD = 5.0  # how far ahead of the team it looks [m]
 TRACK_DISTANCE = 3.45  # how far away it is, in team radii
 CLOSE_RADIUS = (4.0, 7.0)  # the same of the close view, which shows the robots rather than all of the team [m]
 TRACK_RADIUS = (10.5, 60.0)  # least and largest team radius it adapts to [m]
+CHASE_RADIUS = 2.2  # of the view of one agent, in place of a team's [m]
+WIDE_AZIMUTH, WIDE_ELEVATION, WIDE_FOVY = (
+    72.0,
+    -36.0,
+    24.0,
+)  # of the view from the side; azimuth from the direction of travel [deg]
+WIDE_MARGIN = 0.02  # share of the picture that stays free at each edge
 TOP_MARGIN = 4.0  # around everything in the log [m]
+
+CAMERAS = {
+    "track": "behind the team, and as far away as it is large",
+    "close": "behind the team, and near the robots",
+    "agent1": "behind agent 1, 2 and so on",
+    "wide": "beside the whole mission, at rest",
+    "at:X,Y,R": "beside the point (X, Y) [m], at rest, and R [m] to each side of it",
+    "top": "above the whole mission, as on a map",
+}
+"""What each camera shows; a model has others of its own."""
+SPOT = "at:"
+DISTANT = ("wide", "top")
+"""Cameras from which agents are small."""
 
 Camera = Callable[[float], mujoco.MjvCamera]
 
 
 def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
-    """The camera ``track``, ``close``, ``top`` or any one of the model, as a function of time [s].
+    """The camera of ``CAMERAS`` or of the model, as a function of time [s].
 
     Args:
+        name: "agent2" follows agent 2, and so on.
+        stage: what is seen.
         aspect: width of the picture over its height.
 
     Raises:
         ConfigurationError: unknown camera.
     """
+    agents = [f"agent{i + 1}" for i in range(stage.log.position.shape[1])]
+    if name in agents:
+        return _track(stage, stage.log.position[:, [agents.index(name)]], (CHASE_RADIUS, CHASE_RADIUS))
     if name in ("track", "close"):
-        return _track(stage, TRACK_RADIUS if name == "track" else CLOSE_RADIUS)
+        return _track(stage, stage.log.position, TRACK_RADIUS if name == "track" else CLOSE_RADIUS)
+    if name == "wide":
+        return _wide(stage, aspect)
+    if name.startswith(SPOT):
+        return _beside(stage, aspect, *_spot(name))
     names = [stage.model.camera(k).name for k in range(stage.model.ncam)]
     if name not in names:
-        raise unknown("camera", name, dict.fromkeys(["track", *names, "close"]))
+        raise unknown("camera", name, dict.fromkeys([*CAMERAS, *names, *agents]))
     if name == "top":
         _fit_top(stage, aspect)
     fixed = mujoco.MjvCamera()
@@ -43,11 +72,11 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
     return lambda time: fixed
 
 
-def _track(stage: Stage, bounds: tuple[float, float]) -> Camera:
-    """From behind and above, turned so that team, trails and what lies ahead are in the picture."""
+def _track(stage: Stage, position: np.ndarray, bounds: tuple[float, float]) -> Camera:
+    """From behind and above agents at (M, A, 2) [m], turned so that the picture shows them, their trails and what lies ahead."""
     log = stage.log
-    centroid = log.position.mean(axis=1, keepdims=True)
-    reach = np.linalg.norm(log.position - centroid, axis=-1).max(axis=1, keepdims=True)
+    centroid = position.mean(axis=1, keepdims=True)
+    reach = np.linalg.norm(position - centroid, axis=-1).max(axis=1, keepdims=True)
     team = np.hstack([centroid[:, 0], np.clip(reach, stage.scale * bounds[0], stage.scale * bounds[1])])
     smooth = _smoothed(team, max(1, round(TRACK_SMOOTHING / log.mission_step)))
     heading = _heading(centroid[:, 0])
@@ -80,6 +109,69 @@ def _smoothed(values: np.ndarray, window: int) -> np.ndarray:
     padded = np.pad(values, ((before, after), (0, 0)), mode="edge")
     total = np.cumsum(np.vstack([np.zeros((1, values.shape[1])), padded]), axis=0)
     return np.asarray((total[window:] - total[:-window]) / window)
+
+
+def _side_view(stage: Stage) -> tuple[np.ndarray, float]:
+    """Unit vectors to the right, up and ahead as the columns of (3, 3), and the azimuth [deg], of a look from the side."""
+    way = _heading(stage.log.position.mean(axis=1))
+    azimuth, elevation = np.arctan2(way[1], way[0]) + np.radians(WIDE_AZIMUTH), np.radians(WIDE_ELEVATION)
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    forward = np.cos(elevation) * level + np.array([0.0, 0.0, np.sin(elevation)])
+    return np.column_stack([right, np.cross(right, forward), forward]), float(np.degrees(azimuth))
+
+
+def _wide(stage: Stage, aspect: float) -> Camera:
+    """From the side and above, at rest, and just so far away that everything in the log is in the picture."""
+    axes, azimuth = _side_view(stage)
+    points = _corners(stage) @ axes
+    half = np.tan(np.radians(0.5 * WIDE_FOVY)) * np.array([aspect, 1.0]) * (1.0 - 2.0 * WIDE_MARGIN)
+    middle, distance = points.mean(axis=0), 0.0
+    for _ in range(20):  # of distance and middle: each is right for the other at the end
+        offset = points - middle
+        distance = float((np.abs(offset[:, :2]) / half - offset[:, 2:]).max())
+        seen = offset[:, :2] / (offset[:, 2:] + distance)
+        middle[:2] += 0.5 * (seen.min(axis=0) + seen.max(axis=0)) * distance
+    return _resting(stage, axes @ middle, distance, azimuth)
+
+
+def _beside(stage: Stage, aspect: float, x: float, y: float, reach: float) -> Camera:
+    """From the side and above, at rest, with ``reach`` [m] to the left and to the right of a point."""
+    distance = reach / (aspect * float(np.tan(np.radians(0.5 * WIDE_FOVY))))
+    return _resting(stage, np.array([x, y, 0.0]), distance, _side_view(stage)[1])
+
+
+def _spot(name: str) -> tuple[float, float, float]:
+    """The three numbers of ``at:X,Y,R``.
+
+    Raises:
+        ConfigurationError: there are others.
+    """
+    try:
+        x, y, reach = (float(part) for part in name.removeprefix(SPOT).split(","))
+    except ValueError:
+        x, y, reach = np.nan, np.nan, np.nan
+    if not (np.isfinite([x, y, reach]).all() and reach > 0):
+        raise ConfigurationError(f"camera {name!r} must be at:X,Y,R with a point and a positive reach [m], at:60,0,8 for example")
+    return x, y, reach
+
+
+def _resting(stage: Stage, target: np.ndarray, distance: float, azimuth: float) -> Camera:
+    """A camera that always looks at the same point."""
+    stage.model.vis.global_.fovy = WIDE_FOVY
+    camera = mujoco.MjvCamera()
+    camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+    camera.lookat[:] = target
+    camera.distance, camera.azimuth, camera.elevation = distance, azimuth, WIDE_ELEVATION
+    return lambda time: camera
+
+
+def _corners(stage: Stage) -> np.ndarray:
+    """(P, 3) places of agents and corners of the obstacles' zones [m]."""
+    low, high = stage.log.zone()
+    boxes = [np.column_stack([x, y]) for x in (low[:, 0], high[:, 0]) for y in (low[:, 1], high[:, 1])]
+    ground = np.concatenate([stage.log.position.reshape(-1, 2), *boxes])
+    return np.column_stack([ground, np.zeros(len(ground))])
 
 
 def _fit_top(stage: Stage, aspect: float) -> None:

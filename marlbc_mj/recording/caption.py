@@ -1,15 +1,18 @@
-"""The frame around a picture: who is driving and when above it, every agent's priorities and a legend below it."""
+"""The frame around a picture: mission, method and time above it, every agent's priorities and a legend below it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from typing import Literal
 
 import matplotlib
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from marlbc_mj.recording.log import EpisodeLog
+from marlbc_mj.scenarios.titles import mission_title
+from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import AGENT_COLORS, LINK_COLOR, SAFE_DISTANCE_COLOR, SHIELD_COLOR, command_color, ink_on
 
 FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
@@ -17,12 +20,17 @@ HEADER, FOOTER = 48, 80  # heights of the bars
 SHARP = 3  # bars are drawn this many times larger and reduced, which smooths their edges
 PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
-MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "reconstruction", "AA": "agent avoidance"}
+TEAM_STATES = {2: "in formation", 1: "in column"}
+"""The team's formation in words, by G."""
+MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "column", "AA": "agent avoidance"}
+
+NumberPlace = Literal["inside", "on", "above"]
+"""Where agents' numbers are: inside their balls, on badges that cover them, or on badges above them."""
 
 
 @lru_cache(maxsize=64)
 def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
-    """DejaVu Sans as matplotlib brings it along."""
+    """DejaVu Sans, which comes with matplotlib."""
     name = "DejaVuSans-Bold.ttf" if bold else "DejaVuSans.ttf"
     return ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / name), max(size, 4))
 
@@ -39,22 +47,24 @@ class Caption:
     width: int
     height: int
     speed: float | None = None  # None: a still
-    badges: bool = False  # agents' numbers on badges of their own, not on the agents
+    numbers: NumberPlace = "inside"
     _bars: dict[object, Image.Image] = field(default_factory=dict)
 
     @property
     def scale(self) -> float:
-        """Size of this frame's bars, 1 in a picture of 1280 x 720."""
-        return min(self.width / FULL[0], self.height / FULL[1])
+        """Size of this frame's bars, 1 in a picture of 1280 x 720; text shrinks less than the picture, so that it stays
+        legible.
+        """
+        return float(min(self.width / FULL[0], 1.5 * self.height / FULL[1]) ** 0.6)
 
     @property
     def header(self) -> int:
-        """Height of the upper bar."""
+        """Height of the upper bar [pixels]."""
         return round(HEADER * self.scale)
 
     @property
     def picture_height(self) -> int:
-        """What the bars leave."""
+        """Height of the scene between the bars [pixels]."""
         return self.height - self.header - round(FOOTER * self.scale)
 
     def frame(self, picture: np.ndarray, time: float, step: int, labels: np.ndarray, radii: np.ndarray) -> Image.Image:
@@ -68,11 +78,13 @@ class Caption:
         """
         frame = Image.new("RGB", (self.width, self.height), PAPER)
         image = Image.fromarray(np.ascontiguousarray(picture))
-        if self.badges:
-            _badge(image, labels, max(2, round(13 * self.scale)))
-        else:
-            _number(image, labels, radii)
         commands = tuple(self.log.commands[k] for k in self.log.command[step])
+        if self.numbers == "inside":
+            _number(image, labels, radii)
+        else:
+            above = self.numbers == "above"
+            rims = [PAPER if above else command_color(command) for command in commands]
+            _badge(image, labels, max(2, round((13 if above else 12) * self.scale)), rims, above=above)
         frame.paste(image, (0, self.header))
         frame.paste(self._kept("header"), (0, 0))
         frame.paste(self._kept((commands, int(self.log.formation[step]))), (0, self.header + self.picture_height))
@@ -95,9 +107,9 @@ class Caption:
         return self._bars[key]
 
 
-def _badge(image: Image.Image, labels: np.ndarray, radius: int) -> None:
-    """Every agent's number in a disc of its color: where it would hide the robot, it stands above it."""
-    side = 2 * radius * SHARP
+def _badge(image: Image.Image, labels: np.ndarray, radius: int, rims: Sequence[str], *, above: bool) -> None:
+    """Every agent's number in a disc of its color; ``above`` the place of its label, where it would hide a robot."""
+    side, rim = 2 * radius * SHARP, SHARP * (2 if above else max(2, round(0.25 * radius)))
     for agent, (column, row) in enumerate(labels):
         if not (0 <= column < image.width and 0 <= row < image.height):
             continue
@@ -105,18 +117,21 @@ def _badge(image: Image.Image, labels: np.ndarray, radius: int) -> None:
         badge, mask = Image.new("RGB", (side, side), color), Image.new("L", (side, side))
         ImageDraw.Draw(mask).ellipse((0, 0, side - 1, side - 1), 255)
         pen = ImageDraw.Draw(badge)
-        pen.ellipse((SHARP, SHARP, side - 1 - SHARP, side - 1 - SHARP), color, PAPER, 2 * SHARP)
-        pen.text((side // 2, side // 2), str(agent + 1), ink_on(color), _font(round(1.15 * radius * SHARP), True), "mm")
+        pen.ellipse((SHARP, SHARP, side - 1 - SHARP, side - 1 - SHARP), color, rims[agent], rim)
+        size = round((1.15 if above else 1.05) * radius * SHARP)
+        pen.text((side // 2, side // 2), str(agent + 1), ink_on(color), _font(size, True), "mm")
         small = badge.resize((2 * radius, 2 * radius), Image.Resampling.BOX), mask.resize((2 * radius,) * 2, Image.Resampling.BOX)
-        image.paste(small[0], (round(column) - radius, round(row) - 2 * radius), small[1])
+        image.paste(small[0], (round(column) - radius, round(row) - (2 if above else 1) * radius), small[1])
 
 
 def _number(image: Image.Image, labels: np.ndarray, radii: np.ndarray) -> None:
     """Write every agent's number on it."""
     pen = ImageDraw.Draw(image)
     for agent, (column, row) in enumerate(labels):
+        if not (0 <= column < image.width and 0 <= row < image.height):  # NaN behind the camera
+            continue
         size = round(min(1.25 * radii[agent], 0.05 * image.height))
-        if size >= 6 and 0 <= column < image.width and 0 <= row < image.height:
+        if size >= 6:
             ink = ink_on(AGENT_COLORS[agent % len(AGENT_COLORS)])
             pen.text((column, row), str(agent + 1), ink, _font(size, True), "mm")
 
@@ -136,7 +151,7 @@ class Pen:
         return _font(round(size * self.scale), bold)
 
     def length(self, text: str, size: float, bold: bool = False) -> float:
-        """How wide a text will be."""
+        """Width of a text [pixels of the full picture]."""
         return float(self.font(size, bold).getlength(text)) / self.scale
 
     def text(self, text: str, y: float, size: float, color: str, *, bold: bool = False, gap: float = 0.0) -> None:
@@ -179,10 +194,10 @@ class Pen:
 
 def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
     y = 0.5 * HEADER
-    pen.text(log.scenario, y, 20, INK, bold=True, gap=20)
-    for role, name in (("supervisor", log.supervisor), ("controller", log.controller), ("seed", str(log.seed))):
-        pen.text(role, y, 15, MUTED, gap=6)
-        pen.text(name, y, 15, INK, bold=True, gap=20)
+    pen.text(mission_title(log.scenario), y, 20, INK, bold=True, gap=18)
+    pen.text(" + ".join(source_of(name).display for name in (log.supervisor, log.controller) if name), y, 17, INK, gap=18)
+    if log.seed:
+        pen.text(f"seed {log.seed}", y, 15, MUTED)
     if speed is not None:
         pen.x = pen.width - 24 - pen.length("t = 000.0 s", 20, True) - 84
         pen.pill(f"{speed:g}\N{MULTIPLICATION SIGN}", y, 14, MUTED, width=52)
@@ -191,8 +206,8 @@ def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
 
 def _draw_footer(pen: Pen, log: EpisodeLog, commands: Sequence[str], formation: int) -> None:
     pen.rule(0.5)
-    state = f"formation G = {formation}"
-    room = pen.width - 48 - pen.length(state, 15, True)
+    state = TEAM_STATES.get(formation, "")
+    room = pen.width - 48 - pen.length(max(TEAM_STATES.values(), key=len), 15, True)
     widest = max(pen.length(_spelled(name), 14, True) for name in log.commands) + 22
     gap = 26 if len(commands) <= 6 else 8
     for agent, command in enumerate(commands):

@@ -1,4 +1,4 @@
-"""Which links between agents are drawn at one moment, and how clearly: what is stale fades."""
+"""Links between agents to draw at one moment; stale links are faded."""
 
 from typing import NamedTuple
 

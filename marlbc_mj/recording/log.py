@@ -17,14 +17,14 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Hearing
 
 NO_HEARING = Hearing(np.zeros((1, 0, 0), dtype=np.bool_), np.zeros((1, 0, 0)))
-"""Of one mission step in which agents did not talk, or all heard everything at once."""
+"""Hearing of one mission step without communication, or with ideal communication."""
 
 NO_SHIELD_ROWS = np.zeros((0, 2 + len(ASSUMPTIONS)))
-"""What a shield did in a team that has none."""
+"""Shield rows of a team without a shield."""
 
 
 class Course(NamedTuple):
-    """What metrics read of a scenario, by the scenario's own names."""
+    """The fields of a scenario that metrics need, under the scenario's names."""
 
     substep: float  # [s]
     mission_step: float  # [s]
@@ -36,7 +36,7 @@ class Course(NamedTuple):
 
 
 class Substeps(NamedTuple):
-    """T substeps of an episode: what metrics need and mission rate does not give."""
+    """T substeps of an episode: the data that metrics need beyond the mission rate."""
 
     course: Course
     position: np.ndarray  # (T + 1, N, 2) [m]

@@ -32,7 +32,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Trail:
-    """An agent's path as few straight pieces."""
+    """An agent's path, reduced to few straight pieces."""
 
     agent: int
     time: np.ndarray  # (P,) when each corner is passed [s]
@@ -67,7 +67,7 @@ def ribbon(a: np.ndarray, b: np.ndarray, width: float, height: float, color: Col
 
 
 def flat_disc(center: np.ndarray, radius: float, height: float, color: Color, scale: float = 1.0) -> Mark:
-    """A flat flat_disc around ``center`` (2,), ``height`` [m] above the ground."""
+    """A flat disc around ``center`` (2,), ``height`` [m] above the ground."""
     size = np.array([radius, SHEET * scale, 0.0])
     return Mark(mujoco.mjtGeom.mjGEOM_CYLINDER, size, np.array([*center, height]), _UPRIGHT, color)
 

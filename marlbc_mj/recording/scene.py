@@ -68,8 +68,8 @@ class Scene:
     ) -> tuple[bytes, bytes]:
         """SceneUpdate and FrameTransforms of one mission step.
 
-        Obstacles are in every SceneUpdate: after a seek a viewer gets one message a topic, and would show none of them
-        otherwise. It costs nothing, as the bytes of two messages joined are their merged message.
+        Obstacles are in every SceneUpdate: after a seek a viewer gets one message per topic, and would otherwise show none of
+        them. It costs nothing, as the bytes of two messages joined are their merged message.
 
         Args:
             stamp: [ns].

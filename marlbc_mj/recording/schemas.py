@@ -1,6 +1,6 @@
 """The JSON topics of a log: their fields, their JSON Schemas, and the compact encoding that is written at mission rate.
 
-Only what viewers understand is used: Foxglove's schema parser takes one plain type a field (no ``["number", "null"]``) and no
+Only what viewers understand is used: Foxglove's schema parser takes one plain type per field (no ``["number", "null"]``) and no
 arrays of arrays, PlotJuggler refuses a channel without a schema. Hence every topic is one object with scalars and a list
 ``agents`` of flat objects, and a number that is not finite is left out: JSON has neither NaN nor Infinity.
 """
@@ -31,7 +31,7 @@ class MessageField(NamedTuple):
 
 
 class Topic(NamedTuple):
-    """One JSON topic: scalars, and one row an agent."""
+    """One JSON topic: scalars, and one row per agent."""
 
     name: str
     schema_name: str
@@ -263,6 +263,6 @@ def message(scalars: list[str], rows: str) -> bytes:
 
 @cache
 def _template(columns: tuple[str, ...], agents: int) -> str:
-    """A %-template is several times faster than ``json.dumps``, which matters at eight messages a mission step."""
+    """A %-template is several times faster than ``json.dumps``, which matters at eight messages per mission step."""
     row = "{" + ",".join(f'"{name}":%r' for name in columns) + "}"
     return ",".join([row] * agents)

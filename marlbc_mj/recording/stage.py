@@ -1,4 +1,4 @@
-"""What a log looks like at one time: the posed model, and the marks that belong in the picture but not in the model.
+"""A log at one time as a picture shows it: the posed model, and marks that are not part of the model.
 
 Marks are flat shapes on the ground, added to a scene when it is drawn, so physics never pays for them.
 """
@@ -98,7 +98,7 @@ class Stage:
         return [mark for i, trail in enumerate(self.trails) for mark in trail.until(time, here[i])]
 
     def _links(self, time: float) -> list[Mark]:
-        """Who hears whom, where agents talk."""
+        """Links of a team with communication."""
         if not self.log.link.shape[1]:
             return []
         here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
@@ -151,7 +151,7 @@ def make_stage(log: EpisodeLog) -> Stage:
         data=data,
         joints=np.array(joints),
         discs=np.array(discs, dtype=np.int64),
-        radii=np.array([radius or _enlarge(model, agent_prefix(i), min(BALL, BALL_SHARE * log.safe_distance)) for i in agents]),
+        radii=np.array([radius or _enlarge(model, i, min(BALL, BALL_SHARE * log.safe_distance)) for i in agents]),
         rings=_rings(log, 0.0, unit),
         trails=[make_trail(i, log.time, log.position[:, i], unit) for i in agents],
         scale=unit,
@@ -211,7 +211,7 @@ def _size(model: mujoco.MjModel) -> tuple[float, float]:
 
 
 def _place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, discs: list[int], obstacles: np.ndarray, unit: float) -> None:
-    """Obstacles (K, 3) where an episode has them, and as large."""
+    """Set the places and radii of obstacles (K, 3)."""
     least = unit * (LEAST_SOLID if model.nmocap else POINT_RADIUS)
     for geom, (x, y, radius) in zip(discs, obstacles, strict=True):
         model.geom_size[geom, 0] = max(radius, least)
@@ -233,12 +233,15 @@ def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]
     return [flat_disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
 
 
-def _enlarge(model: mujoco.MjModel, prefix: str, least: float) -> float:
-    """Draw an agent's spheres no smaller than ``least`` [m], resting on the ground; returns the largest drawn radius [m]."""
+def _enlarge(model: mujoco.MjModel, agent: int, least: float) -> float:
+    """Draw an agent's spheres in its color and no smaller than ``least`` [m], resting on the ground; returns the largest drawn
+    radius [m].
+    """
     largest = least
     for geom in range(model.ngeom):
-        if not model.body(model.geom_bodyid[geom]).name.startswith(prefix):
+        if not model.body(model.geom_bodyid[geom]).name.startswith(agent_prefix(agent)):
             continue
+        model.geom_rgba[geom] = agent_color(agent)  # also of logs that were written with other colors
         size = model.geom_size[geom]
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE and size[0] < least:
             model.geom_pos[geom, 2] += least - size[0]

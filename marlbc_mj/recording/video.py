@@ -1,20 +1,16 @@
 """Videos and stills of an episode, drawn from its log after the run."""
 
-import subprocess
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
 from dataclasses import dataclass
-from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import IO
 
-import imageio_ffmpeg
 import numpy as np
 
-from marlbc_mj.recording.camera import make_camera, project
+from marlbc_mj.recording.camera import DISTANT, make_camera, project
 from marlbc_mj.recording.caption import Caption
+from marlbc_mj.recording.encoding import COLORS, PALETTE_FRAMES, check_format, common_palette, encoder
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.offscreen import Offscreen
 from marlbc_mj.recording.stage import make_stage
@@ -24,9 +20,7 @@ from marlbc_mj.util.text import one_line
 
 LEAST_PIXELS, MOST_PIXELS = 64, 4096  # pixels, either side
 MOST_SAMPLES = 16  # per pixel
-COLORS = "scale=out_color_matrix=bt709:out_range=tv,setparams=colorspace=bt709:color_primaries=bt709:color_trc=bt709"
-ENCODING = ["-vf", COLORS, "-crf", "20", "-preset", "veryfast", "-movflags", "+faststart"]
-"""Colors as players expect them of a high-definition picture, constant quality, and an index at the file's beginning."""
+_SIZES = f"size must be two even numbers of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, 1280x720 for example"
 
 
 @dataclass(frozen=True)
@@ -35,9 +29,8 @@ class VideoStyle:
 
     speed: float = 4.0  # seconds of the mission per second of video
     fps: int = 30  # frames per second of video
-    width: int = 1280  # [pixels], even
-    height: int = 720  # [pixels], even
-    camera: str = "track"  # ``track``, ``top``, ``close`` or a camera of the model
+    size: tuple[int, int] = (1280, 720)  # width and height [pixels], even
+    camera: str = "track"  # a key of camera.CAMERAS, "agent1" and so on, or a camera of the model
     start: float | None = None  # first moment of the mission that is shown [s]; None: its beginning
     end: float | None = None  # last one [s]; None: its end
     samples: int = 0  # per pixel; 4 smooths edges and takes about twice as long
@@ -51,11 +44,11 @@ def render_video(
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> int:
-    """Write an H.264 MP4 of an episode; the file appears under its name when it is complete.
+    """Write a video of an episode; the file appears under its name when it is complete.
 
     Args:
         log: the episode.
-        path: a name that ends in ``.mp4``.
+        path: its ending chooses the format: ``.mp4`` (H.264), or ``.webp`` and ``.gif``, which repeat for ever.
         style: what is shown, and how.
         overwrite: replace an existing file.
         progress: called after every frame with how many are done and how many there are.
@@ -68,30 +61,38 @@ def render_video(
         SimulationError: the encoder failed.
     """
     path = Path(path)
-    if path.suffix.lower() != ".mp4":
-        raise ConfigurationError(f"a video's name must end in .mp4, got {path.name!r}")
+    check_format(path)
     if not 0 <= style.samples <= MOST_SAMPLES:
         raise ConfigurationError(f"samples must be from 0 to {MOST_SAMPLES}, got {style.samples}")
     times = frame_times(log, speed=style.speed, fps=style.fps, start=style.start, end=style.end)
-    size = style.width, style.height
-    pictures = _frames(log, times, size, camera=style.camera, samples=style.samples, speed=style.speed)
+    pictures = _frames(log, times, style.size, camera=style.camera, samples=style.samples, speed=style.speed)
     with staged_file(path, overwrite=overwrite) as partial, closing(pictures):
+        palette = _palette(log, times, style, path.suffix)
         try:
-            _encode(pictures, partial, size, style.fps, len(times), progress)
+            _encode(pictures, partial, style, len(times), progress, palette)
         except (OSError, SimulationError) as error:
             raise SimulationError(f"cannot write video {path}: {one_line(error)}") from error
     return len(times)
 
 
+def _palette(log: EpisodeLog, times: np.ndarray, style: VideoStyle, suffix: str) -> np.ndarray | None:
+    """Colors of an animation, from frames that are spread over it."""
+    if suffix.lower() not in COLORS:
+        return None
+    spread = times[np.unique(np.linspace(0, len(times) - 1, PALETTE_FRAMES).astype(int))]
+    frames = _frames(log, spread, style.size, camera=style.camera, samples=style.samples, speed=style.speed)
+    return common_palette(frames, suffix)
+
+
 def render_still(
-    log: EpisodeLog, time: float, *, width: int = 1280, height: int = 720, camera: str = "track", samples: int = 4
+    log: EpisodeLog, time: float, *, size: tuple[int, int] = (1280, 720), camera: str = "track", samples: int = 4
 ) -> np.ndarray:
-    """(height, width, 3) uint8: the frame that a video shows at ``time`` [s].
+    """(height, width, 3) uint8: the frame that a video shows at ``time`` [s]; ``size`` is width and height.
 
     Raises:
         ConfigurationError: an argument that cannot be used, or no OpenGL.
     """
-    frames = _frames(log, np.array([time]), (width, height), camera=camera, samples=samples, speed=None)
+    frames = _frames(log, np.array([time]), size, camera=camera, samples=samples, speed=None)
     with closing(frames):
         return next(frames)
 
@@ -121,7 +122,7 @@ def _frames(
     """(height, width, 3) uint8 for every time [s]."""
     _check_size(*size)
     stage = make_stage(log)
-    caption = Caption(log, *size, speed, badges=bool(stage.free))
+    caption = Caption(log, *size, speed, numbers="above" if stage.free else "on" if camera in DISTANT else "inside")
     scene = size[0], caption.picture_height
     view = make_camera(camera, stage, scene[0] / scene[1])
     with Offscreen(stage, view, *scene, samples=samples) as offscreen:
@@ -134,10 +135,10 @@ def _frames(
 def _encode(
     pictures: Iterator[np.ndarray],
     path: Path,
-    size: tuple[int, int],
-    fps: int,
+    style: VideoStyle,
     count: int,
-    progress: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None] | None = None,
+    palette: np.ndarray | None = None,
 ) -> None:
     """Hand all pictures to the encoder, and see that it has written them.
 
@@ -145,57 +146,26 @@ def _encode(
         SimulationError: the encoder failed, for want of room on the disk for example.
     """
     first = next(pictures)  # before the encoder starts: what cannot be drawn fails here
-    with encoder(path, size, fps) as stream:
+    with encoder(path, style.size, style.fps, palette) as add:
         for done, picture in enumerate(chain([first], pictures), 1):
-            stream.write(np.ascontiguousarray(picture).data)
+            add(picture)
             if progress is not None:
                 progress(done, count)
 
 
-@contextmanager
-def encoder(path: Path, size: tuple[int, int], fps: int) -> Iterator[IO[bytes]]:
-    """A stream that takes pictures of ``size``, width and height, as RGB bytes; the video is whole when the block has ended.
+def parse_size(text: str) -> tuple[int, int]:
+    """Width and height [pixels] from ``1280x720``.
 
     Raises:
-        SimulationError: the encoder said that it failed, whatever the file looks like.
+        ConfigurationError: the text is no size, or a video cannot have it.
     """
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(Fraction(fps).limit_denominator())]
-    target = ["-an", "-vcodec", "libx264", "-pix_fmt", "yuv420p", "-v", "error", *ENCODING, str(path)]
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-y", *source, "-i", "-", *target]
-    with TemporaryFile() as errors:
-        # A group of its own: Ctrl-C is for the program, which then ends the encoder.
-        process = subprocess.Popen(
-            command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True
-        )
-        assert process.stdin is not None
-        whole = False
-        try:
-            with suppress(BrokenPipeError):  # the encoder has ended, and says why
-                yield process.stdin
-                process.stdin.close()
-                whole = True
-            status = process.wait()
-        except BaseException:
-            process.kill()
-            process.wait()
-            raise
-        finally:
-            with suppress(OSError):
-                process.stdin.close()
-        if status or not whole:
-            errors.seek(0)
-            said = errors.read().decode(errors="replace").strip().splitlines()
-            raise SimulationError(f"the encoder failed with status {status}: {_reason(said)}")
-
-
-def _reason(said: Sequence[str]) -> str:
-    """The line of the encoder that tells the most."""
-    return next(
-        (line for line in said if "No space left" in line or "too large" in line), said[-1] if said else "no reason given"
-    )
+    sides = text.lower().split("x")
+    if len(sides) != 2 or not all(side.isdecimal() and side.isascii() and len(side) < 6 for side in sides):
+        raise ConfigurationError(f"{_SIZES}; got {text!r}")
+    _check_size(int(sides[0]), int(sides[1]))
+    return int(sides[0]), int(sides[1])
 
 
 def _check_size(width: int, height: int) -> None:
-    for name, value in (("width", width), ("height", height)):
-        if not LEAST_PIXELS <= value <= MOST_PIXELS or value % 2:
-            raise ConfigurationError(f"{name} must be an even number of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, got {value}")
+    if any(not LEAST_PIXELS <= side <= MOST_PIXELS or side % 2 for side in (width, height)):
+        raise ConfigurationError(f"{_SIZES}; got {width}x{height}")

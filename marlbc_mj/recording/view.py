@@ -39,7 +39,7 @@ class Playback:
         return self.time
 
     def press(self, key: int) -> None:
-        """Obey a key; others do nothing."""
+        """Handle a key; other keys do nothing."""
         if key == SPACE:
             self.paused = not self.paused
         elif key in (LEFT, RIGHT):

@@ -250,7 +250,7 @@ def _create(path: Path, overwrite: bool) -> BinaryIO:
 
 
 def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[str, str]:
-    """What an :class:`EpisodeLog` holds of the scenario, as strings that read back exactly."""
+    """The scenario's fields of an :class:`EpisodeLog`, as strings that read back exactly."""
     return {
         "scenario": scenario.name,
         "composition": scenario.composition,
@@ -279,7 +279,7 @@ def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list
 
 
 def _draw(scenario: Scenario, seed: int) -> Draw:
-    """The episode that ``World.reset(seed)`` starts in its world 0, from the same stream."""
+    """The draw with which ``World.reset(seed)`` starts its world 0, from the same stream."""
     return scenario.draw(stream(seed))
 
 

@@ -24,10 +24,14 @@ _VIOLATION = "#1A1A1A"  # color of the casing of a path in violation
 
 
 def trajectories(episodes: Sequence[Trajectory]) -> Figure:
-    """Paths of all agents: one episode over both columns of text, several as panels of one column's width, two per row."""
+    """Paths of all agents: one episode over both columns of text, several as panels of one column's width, two per row.
+
+    The legend is above the panels, or in the last one where their number is odd.
+    """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
-    margins = pl.Margins(left=0.5, right=0.05, top=0.3 if columns == 1 else 0.42, across=0.12, between=0.3)
+    odd = columns == 2 and len(episodes) % 2 == 1
+    margins = pl.Margins(left=0.5, right=0.05, top=0.3 if columns == 1 else 0.18 if odd else 0.42, across=0.12, between=0.3)
     panel_width = (pl.DOUBLE - margins.left - margins.right - (columns - 1) * margins.across) / columns
     box = _extent(episodes, panel_width)
     panel_height = panel_width * (box[3] - box[2]) / (box[1] - box[0])
@@ -38,8 +42,6 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
         _draw_paths(axes, episode, 1.2 if columns == 1 else 0.8)
         if columns > 1:
             pl.panel_label(axes, label_of(episode, episodes))
-    for axes in panels.flat[len(episodes) :]:
-        axes.set_visible(False)
     panels[0, 0].set(xlim=box[:2], ylim=box[2:])
     for axes in panels[:, 0]:
         axes.set_ylabel("y [m]")
@@ -47,7 +49,11 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
         axes = panels[(len(episodes) - 1 - column) // columns, column]
         axes.set_xlabel("x [m]")
         axes.tick_params(labelbottom=True)
-    _legend(figure, episodes)
+    handles = _legend(episodes)
+    if odd:
+        pl.legend_in(panels.flat[-1], handles)
+    else:
+        pl.legend_above(figure, handles)
     return figure
 
 
@@ -71,7 +77,7 @@ def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float,
 
 
 def _discs(episode: Trajectory) -> np.ndarray:
-    """(K, 3) obstacles to draw: of those that move, where and when each is nearest to an agent."""
+    """(K, 3) obstacles to draw: moving ones at the place and time at which they are nearest to an agent."""
     every = episode.scenario.substeps
     return nearest_places(episode.time[::every], episode.position[:-1:every], episode.obstacles, episode.motions)
 
@@ -115,7 +121,8 @@ def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -
     axes.add_collection(LineCollection(bands, colors=_VIOLATION, linewidths=width, zorder=1.5))
 
 
-def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
+def _legend(episodes: Sequence[Trajectory]) -> list[Line2D]:
+    """What colors and lines mean."""
     handles = pl.command_handles(episodes[0].scenario.orders.commands)
     commands = {c for e in episodes for c in e.scenario.orders.commands if SEPARATOR in c}
     for handle in handles:
@@ -127,4 +134,4 @@ def _legend(figure: Figure, episodes: Sequence[Trajectory]) -> None:
         handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="path of an obstacle, drawn where it came nearest"))
     if any(violates(e.clearances(), distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
-    pl.legend_above(figure, handles)
+    return handles

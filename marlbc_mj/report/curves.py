@@ -13,14 +13,14 @@ from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.util.method_names import source_of
-from marlbc_mj.util.palette import AGENT_COLORS, command_color
+from marlbc_mj.util.palette import METHOD_COLORS, command_color
 from marlbc_mj.util.stretches import stretches
 
 _LANE = 1.25  # distance of two agents' strips, in strip heights
 _SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
 _ZOOM = 2.0  # width of the window that shows single force pulses [s]
 _PULSE = 1.0  # the same for one pulse [s]
-_AXIS_COLORS = (AGENT_COLORS[0], AGENT_COLORS[1])  # of the x and the y axis, where one agent is shown alone
+_AXIS_COLORS = METHOD_COLORS[:2]  # of the x and the y axis, where one agent is shown alone
 _FLAT = 1e-9  # relative change below which a weight counts as constant
 _SMALLEST_NORM = 1e-6  # share of the largest below which a norm is not drawn on a logarithmic axis
 
@@ -32,11 +32,13 @@ def priorities(episodes: Sequence[Trajectory]) -> Figure:
     """Each agent's command over time: color and height of a strip show its highest behavior.
 
     Below the agents a grey strip shows how many switches the team made in each second. One episode fills one column of text;
-    several are panels, two per row, with one scale for all grey strips.
+    several are panels, two per row, with one scale for all grey strips. The legend is above them, or in the last panel where
+    their number is odd.
     """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
-    margins = pl.Margins(left=0.52, right=0.52, top=0.4 if columns == 1 else 0.46, across=0.98, between=0.3)
+    odd = columns == 2 and len(episodes) % 2 == 1
+    margins = pl.Margins(left=0.52, right=0.52, top=0.4 if columns == 1 else 0.24 if odd else 0.46, across=0.98, between=0.3)
     width = pl.SINGLE if columns == 1 else pl.DOUBLE
     lanes = episodes[0].scenario.agents + 1
     each = 0.28 * lanes if columns == 1 else 0.17 * lanes
@@ -48,11 +50,14 @@ def priorities(episodes: Sequence[Trajectory]) -> Figure:
         _draw_switch_rate(axes, episode, most)
         if columns > 1:
             pl.panel_label(axes, source_of(episode.supervisor).display)
-    _hide_rest(panels, len(episodes))
+    _label_time(panels, len(episodes))
     handles = {h.get_label(): h for h in pl.command_handles(episodes[0].scenario.orders.commands, 4)}
     shown = [handles[head] for head in _heads(episodes[0])]
-    shown.append(Line2D([], [], color=pl.GREY, linewidth=4, label=f"switches per s of the team (full height: {most})"))
-    pl.legend_above(figure, shown)
+    shown.append(Line2D([], [], color=pl.GREY, linewidth=4, label=f"the team's switches per second (full height: {most})"))
+    if odd:
+        pl.legend_in(panels.flat[-1], shown)
+    else:
+        pl.legend_above(figure, shown)
     return figure
 
 
@@ -70,10 +75,8 @@ def _draw_switch_rate(axes: Axes, trajectory: Trajectory, most: int) -> None:
     axes.annotate(f"{rate.max()}/s", (1, -_LANE + 0.35), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
 
 
-def _hide_rest(panels: np.ndarray, used: int) -> None:
-    """Hide the panels beyond ``used``, and label the time axis of the lowest visible one in every column."""
-    for axes in panels.flat[used:]:
-        axes.set_visible(False)
+def _label_time(panels: np.ndarray, used: int) -> None:
+    """Label the time axis of the lowest panel in every column, of those that are ``used``."""
     for column in range(panels.shape[1]):
         axes = panels[(used - 1 - column) // panels.shape[1], column]
         axes.set_xlabel("time [s]")
@@ -236,7 +239,7 @@ def weight_norms(trajectory: Trajectory) -> Figure:
 def weight_errors(trajectory: Trajectory) -> Figure:
     """Frobenius norms of the distance of SORLC's weights from their values at the end.
 
-    The paper subtracts ideal weights instead, which are unknown.
+    The publication subtracts ideal weights instead, which are unknown.
 
     Raises:
         ValueError: the controller's state is not SORLC's.
@@ -270,9 +273,18 @@ def _scale_norms(axes: Axes, time: np.ndarray, norms: np.ndarray) -> None:
     low, high = float(positive.min()), float(norms.max())
     if high > 30.0 * low:
         axes.set(yscale="log", ylim=(0.7 * low, 1.5 * high))
+        _name_hidden(axes, norms[time <= end].max(axis=0) < 0.7 * low, 0.7 * low)
     else:
         room = 0.08 * (high - low) or 0.1 * high
         axes.set_ylim(low - room, high + room)
+
+
+def _name_hidden(axes: Axes, hidden: np.ndarray, least: float) -> None:
+    """Say which agents (N,) are below the axis throughout."""
+    agents = [str(i + 1) for i in np.flatnonzero(hidden)]
+    if agents:
+        text = f"{'agents' if len(agents) > 1 else 'agent'} {', '.join(agents)}: < {least:.0e}"
+        axes.annotate(text, (0.02, 0.02), xycoords="axes fraction", fontsize=7, color=pl.GREY)
 
 
 def network_weights(trajectory: Trajectory) -> Weights:
@@ -293,7 +305,7 @@ def has_weights(trajectory: Trajectory) -> bool:
 
 
 def flat_after(trajectory: Trajectory) -> float:
-    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they always do."""
+    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they never stop."""
     read, last = network_weights(trajectory), 0
     for matrix in (read.actor, read.critic):
         norms = np.linalg.norm(matrix, axis=(-2, -1))

@@ -1,5 +1,6 @@
 """The figures that a run allows, numbered as in the paper where it has them, and how they are written."""
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import NamedTuple
 from matplotlib.figure import Figure
 
 from marlbc_mj.episode import Trajectory
+from marlbc_mj.report import paper_values
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.arena import trajectories
 from marlbc_mj.report.curves import (
@@ -20,9 +22,8 @@ from marlbc_mj.report.curves import (
     weight_errors,
     weight_norms,
 )
-from marlbc_mj.report.formats import listed
 from marlbc_mj.report.paper_tables import one_per_controller, one_per_supervisor
-from marlbc_mj.report.pareto import coincident, pareto
+from marlbc_mj.report.pareto import pareto
 from marlbc_mj.results.summary import Result
 from marlbc_mj.util.method_names import source_of
 
@@ -30,19 +31,19 @@ FRAMEWORKS = ("sorlc", "finite-time", "fixed-time")
 """Controllers of the frameworks in Figures 8 and 9."""
 _AGENT = 3  # index of the agent in Figure 9
 
-_PATHS = "colored by the highest behavior in force; black casing: inside the safe distance."
+_PATHS = "colored by the highest behavior in force; casing: inside the safe distance."
 _STRIPS = (
     "color and height of a strip show the highest behavior in force (OA: avoid the obstacle, FM: keep the formation, FR: form "
-    "the column); beside it the number of switches. Grey: switches of the whole team in each second, and the most of them."
+    "the column); beside it the number of switches. Grey: the team's switches in each second, with their maximum."
 )
 _FORCES = (
     "Applied force. Left and middle: light, everything the force reaches within a pixel column; dark, its mean. "
     "Right: both axes in the two seconds in which the forces change most."
 )
 _PARETO = (
-    "Control cost against what it buys. Colors are supervisors, shapes are controllers. Formation error: mean distance of an "
-    "agent from its slot in the first formation, relative to the centroid [m]. Dashed: LQR, whose gains minimise the cost of the "
-    "paper in regulation."
+    "Control cost against what it buys. Colors are supervisors, shapes are controllers. A mark that would cover another "
+    "stands aside; a thin line leads to its place. Formation error: mean distance of an agent from its slot in "
+    "the first formation, relative to the centroid. Dashed: LQR, whose gains minimize this cost in regulation."
 )
 _CONTROL = (
     "with each framework's controller, below around the largest of them all. One scale: linear up to SORLC's limit (dashed), "
@@ -63,11 +64,19 @@ class Plot(NamedTuple):
 def plots(results: Sequence[Result]) -> list[Plot]:
     """Every figure that these results allow: the paper's, the comparison, then those of each method.
 
-    Paths and priorities belong to a supervisor and are drawn once for each, with SORLC where it ran. Tracking errors and forces
-    are drawn for every method, weights where they keep changing.
+    Only on the paper's own scenario do captions have its numbers. Paths and priorities belong to a supervisor and are drawn once
+    for each, with SORLC where it ran. Tracking errors and forces are drawn for every method, weights where they keep changing.
     """
     ran = [result for result in results if result.metrics is not None]
-    return _paper(ran) + _comparison(ran) + _methods(ran)
+    found = _paper(ran) + _comparison(ran) + _methods(ran)
+    of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in ran)
+    return found if of_paper else [plot._replace(caption=_without_number(plot.caption)) for plot in found]
+
+
+def _without_number(caption: str) -> str:
+    """A caption without the paper's figure number."""
+    text = re.sub(r"^Figure \d+: ", "", caption)
+    return text[:1].upper() + text[1:]
 
 
 def _paper(results: Sequence[Result]) -> list[Plot]:
@@ -97,8 +106,8 @@ def _controller_figures(laws: Mapping[str, Trajectory], supervisor: str) -> list
         own = laws["sorlc"]
         found.append(Plot("figure4_weights_sorlc", f"Figure 4: {weights_caption(own)}", partial(weight_norms, own)))
         text = (
-            "Figure 5: distance of SORLC's weights from their values at the end (Frobenius norm). The paper subtracts ideal "
-            "weights, which nobody knows."
+            "Figure 5: distance of SORLC's weights from their values at the end (Frobenius norm), in place of ideal weights, "
+            "which nobody knows."
         )
         found.append(Plot("figure5_weight_errors_sorlc", text, partial(weight_errors, own)))
     for number, name in ((6, "sorlc"), (7, "rlc")):
@@ -126,8 +135,7 @@ def _framework_figures(laws: Mapping[str, Trajectory]) -> list[Plot]:
 def _comparison(results: Sequence[Result]) -> list[Plot]:
     if len(results) < 2:
         return []
-    same = "".join(f" Marks of {listed(names)} coincide." for names in coincident(results))
-    return [Plot("pareto_all", _PARETO + same, lambda: pareto(results))]
+    return [Plot("pareto_all", _PARETO, lambda: pareto(results))]
 
 
 def _methods(results: Sequence[Result]) -> list[Plot]:

@@ -1,4 +1,4 @@
-"""What a run says about the paper's comparisons: which published orders hold, and what the same actuator changes."""
+"""Findings of a run: which published orders hold, and what an equal actuator changes."""
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
@@ -107,7 +107,9 @@ def same_actuator(results: Sequence[Result]) -> str:
         return ""
     ours = costs["sorlc"]
     first = f"With supervisor {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
-    return first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours) + _conclusion(costs, limited, ours)
+    found = first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours)
+    of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in chosen.values())
+    return found + _conclusion(costs, limited, ours) if of_paper else found.rstrip()
 
 
 def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
@@ -125,7 +127,7 @@ def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: fl
 
 
 def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float) -> str:
-    """What LQR costs, and how safe it is."""
+    """Cost and safety of LQR."""
     metrics = chosen["lqr"].metrics if "lqr" in chosen else None
     if metrics is None:
         return ""
@@ -136,7 +138,7 @@ def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float
 
 
 def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: float) -> str:
-    """What that does to the published conclusion, for the published rivals."""
+    """Whether the published conclusion still holds for the published rivals."""
     rivals = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
     reversed_for = [name for name in rivals if limited[name] < ours < costs[name]]
     before = [name for name in rivals if limited[name] < ours and costs[name] <= ours]
@@ -209,7 +211,7 @@ def convergence(results: Sequence[Result]) -> Table | None:
         "Time after which the norm of the velocity error stays below 2 % of its largest value in the first 15 s; "
         f"supervisor: {display_name(supervisor)}.",
     )
-    caption = "Convergence of the velocity error at the start [s] (Figures 6c and 7c of the paper)"
+    caption = f"Convergence of the velocity error at the start [s]{' (Figures 6c and 7c of the paper)' if of_paper else ''}"
     return Table("convergence", caption, tuple(columns), rows, notes)
 
 

@@ -29,7 +29,7 @@ _REFERENCE_NOTE = f"Reference: {display_name(SUPERVISOR_REFERENCE)} under the nu
 LEADING = 3
 """Columns that every table begins with; in text they have their intervals."""
 MOST_COLUMNS = 12
-"""That a table on paper has."""
+"""Columns of a table that still fits a printed page."""
 
 
 class Board(NamedTuple):
@@ -60,7 +60,7 @@ class Failure(NamedTuple):
 
 
 class Look(NamedTuple):
-    """A layout worth a look."""
+    """A layout worth watching."""
 
     track: str
     kind: str  # ``worst`` or ``median``
@@ -71,7 +71,7 @@ class Look(NamedTuple):
 
 
 class Detail(NamedTuple):
-    """What is one click away of a method."""
+    """Details of one method, shown after a click."""
 
     name: Name
     facts: str
@@ -251,7 +251,7 @@ def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[
 
 
 def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
-    """Failures and layouts worth a look, method by method."""
+    """Failures and layouts worth watching, method by method."""
     notable = notable_layouts(groups)
     details = []
     for method in dict.fromkeys(each.method for each in groups):

@@ -19,7 +19,7 @@ class MethodGroup(Generic[MethodT]):
 
     @property
     def words(self) -> str:
-        """What all have in common, for the end of a caption."""
+        """The part that all methods share, for the end of a caption."""
         return f"{'with' if self.kind == 'supervisor' else 'with supervisor'} {display_name(self.other)}"
 
     @property

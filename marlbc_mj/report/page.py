@@ -10,6 +10,8 @@ from urllib.parse import quote
 
 from PIL import Image
 
+from marlbc_mj.recording.encoding import poster
+from marlbc_mj.recording.video import VideoStyle
 from marlbc_mj.report import paper_values
 from marlbc_mj.report.figures import Plot, plots
 from marlbc_mj.report.formats import score_cell
@@ -18,8 +20,11 @@ from marlbc_mj.report.templates import render
 from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.titles import mission_title
 
 LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]
+POSTER_AT = 0.57
+"""Share of a video at which its poster is taken: in the gate of the case study."""
 _SINGLE_PIXELS = 1200  # PNGs narrower than this fill one column only
 
 
@@ -44,6 +49,7 @@ class EmbeddedVideo(NamedTuple):
     """An mp4: its data URL, or for a large one a link."""
 
     source: str
+    poster: str  # data URL of a frame, shown until it is played; empty: none
     link: Link
     megabytes: int
 
@@ -96,16 +102,17 @@ def write_benchmark_page(
         path,
         "page.html",
         links,
-        title=f"Behavioral control benchmark: {scenario.name}",
+        title=f"Behavioral control benchmark: {mission_title(scenario.name)}",
         lead=_lead(results, scenario),
         facts=facts,
         command=config["command"],
         failures=failed,
         tables=tables,
         of_paper=scenario.name == paper_values.SCENARIO,
+        has_details=True,
         paragraph=paragraph,
         pictures=_pictures(figures, [p for p in drawn if p.method is None]),
-        video=_video(video, path.parent) if video else None,
+        video=_video(video, path.parent, POSTER_AT * scenario.duration / VideoStyle().speed) if video else None,
         awaited=awaited,
         methods=[_method(result, [p for p in drawn if p.method == result.key], figures) for result in results],
     )
@@ -118,6 +125,7 @@ def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -
         links=[_link(link, path.parent) for link in links],
         errata=paper_values.ERRATA.items(),
         citation=paper_values.CITATION,
+        details_title="Beside the paper" if values["of_paper"] else "Tables of single quantities",
         doi=paper_values.DOI,
         **values,
     )
@@ -126,7 +134,7 @@ def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -
 
 
 def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
-    """What a page says about a scenario, by name."""
+    """Facts about a scenario for the page, by name."""
     return [
         ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
         ("Composition", scenario.composition),
@@ -141,7 +149,7 @@ def origin_facts(config: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
-    """What lies beside the page and is worth a link."""
+    """Files beside the page, to be linked."""
     names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
     files = [folder / name for name in names if (folder / name).exists()]
     figures = [folder / "figures"] if (folder / "figures").is_dir() else []
@@ -187,10 +195,14 @@ def _method(result: Result, own: Sequence[Plot], figures: Path) -> MethodSection
     return MethodSection(result.display, facts, narrow=narrow, wide=wide)
 
 
-def _video(video: Path, folder: Path) -> EmbeddedVideo:
+def _video(video: Path, folder: Path, moment: float) -> EmbeddedVideo:
+    """A video whose poster is its frame at ``moment`` [s]."""
     size = video.stat().st_size
-    source = _data_url("video/mp4", video.read_bytes()) if size < LARGEST_VIDEO else ""
-    return EmbeddedVideo(source, _link(video, folder), round(size / 1e6))
+    if size >= LARGEST_VIDEO:
+        return EmbeddedVideo("", "", _link(video, folder), round(size / 1e6))
+    still = poster(video, moment)
+    frame = _data_url("image/jpeg", still) if still else ""
+    return EmbeddedVideo(_data_url("video/mp4", video.read_bytes()), frame, _link(video, folder), round(size / 1e6))
 
 
 def _link(target: Path, folder: Path) -> Link:

@@ -68,7 +68,7 @@ def switches(chosen: Mapping[str, Result], published: bool) -> Table:
     """Table 3: how often every agent's behavior priority changes."""
     return _table(
         "switches",
-        "Number of behavior priority switches of each mission supervisor (Table 3 of the paper)",
+        f"Number of behavior priority switches of each mission supervisor{_table_number(3, published)}",
         "supervisor",
         _Comparison(chosen, (SWITCHES,), paper_values.PAPER_SUPERVISORS if published else {}),
         ("Orders that command the same motion count as equal.", "Controller: SORLC, or the one in brackets."),
@@ -79,11 +79,11 @@ def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool)
     """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
     return _table(
         "control-cost",
-        f"Maximum and total control cost of each controller with supervisor {display_name(supervisor)} (Table 5 of the paper)",
+        _controller_caption("cost", supervisor, 5, published),
         "controller",
         _Comparison(chosen, (COST_MAX, COST_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
-            "Cost: ‖e_p‖² + ‖e_v‖² + ‖u‖². Total: its integral over the mission step, a sum over samples as in Table 6.",
+            "Cost: ‖e_p‖² + ‖e_v‖² + ‖u‖². Total: its integral over the mission step, a sum over samples.",
             *((f"† Erratum 16: {paper_values.ERRATA[16]}",) if published else ()),
         ),
     )
@@ -93,7 +93,7 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
     """Table 6: maximum and total control input; blocks as in Table 5."""
     return _table(
         "control-input",
-        f"Maximum and total control input of each controller with supervisor {display_name(supervisor)} (Table 6 of the paper)",
+        _controller_caption("input", supervisor, 6, published),
         "controller",
         _Comparison(chosen, (INPUT_MAX, INPUT_TOTAL), paper_values.PAPER_CONTROLLERS if published else {}),
         (
@@ -101,6 +101,17 @@ def control_input(chosen: Mapping[str, Result], supervisor: str, published: bool
             "Total: integral of the Euclidean norm over the mission step, a sum over samples.",
         ),
     )
+
+
+def _controller_caption(quantity: str, supervisor: str, number: int, published: bool) -> str:
+    """The caption of Table 5 or 6."""
+    given = f"with supervisor {display_name(supervisor)}"
+    return f"Maximum and total control {quantity} of each controller {given}{_table_number(number, published)}"
+
+
+def _table_number(number: int, published: bool) -> str:
+    """The number of the corresponding table of the paper, for a caption."""
+    return f" (Table {number} of the paper)" if published else ""
 
 
 @dataclass(frozen=True)
@@ -158,7 +169,7 @@ class _Comparison:
         return (SAME_ORDER, *marks, *([""] if self.relative else []))
 
     def notes(self) -> list[str]:
-        """What the columns are, what is published but did not run here, and what failed."""
+        """Notes on columns, on published methods that did not run here, and on failures."""
         told = [n for n in TOLD if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
         notes = (
             [f"Told the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
@@ -222,14 +233,15 @@ def decision_time(chosen: Mapping[str, Result], published: bool) -> Table:
         (display_name(name), *_measured(r, shares), *(_beside(source.get(name), medians.get(name)) if sums else []))
         for name, r in chosen.items()
     ]
-    notes = ["Here: one call that decides for all agents, every method in the same process. Published: on another machine."]
+    notes = ["Here: one call that decides for all agents, every method in the same process."]
+    notes += ["Published: on another machine."] if sums else []
     notes += ["Orders are not compared: they would depend on the machine and on the hour."] if sums else []
     if shares:
         notes.append("Network or solver: its share of the decision time, where the supervisor measures it.")
     quantity = Quantity(4, "", paper_values.PUBLISHED_DECISION_MS, lambda agent: 0.0, 1)
     notes += _missing(chosen, (quantity,), paper_values.PAPER_SUPERVISORS if published else {})
     notes += map(failure_note, failures(chosen.values()))
-    caption = "Time for one decision of each mission supervisor (Table 4 of the paper)"
+    caption = f"Time for one decision of each mission supervisor{_table_number(4, published)}"
     return Table("decision-time", caption, tuple(columns), tuple(rows), tuple(notes))
 
 
@@ -244,14 +256,14 @@ def _decision_columns(shares: bool, published: bool) -> list[Column]:
 
 
 def _measured(result: Result, shares: bool) -> list[str]:
-    """What this run took: median, 99th percentile and, with ``shares``, the share of the network or solver."""
+    """Times of this run: median, 99th percentile and, with ``shares``, the share of the network or solver."""
     team, share = (result.metrics["team"] if result.metrics else None), result.solver_share
     cells = [significant(team["decision_ms_median"]), significant(team["decision_ms_p99"])] if team else [FAILED, DASH]
     return cells + ([DASH if share is None else fixed(100 * share, 0)] if shares else [])
 
 
 def _beside(values: Sequence[float] | None, median: float | None) -> list[str]:
-    """What the paper's four agents took, and their sum over our median."""
+    """Published times of the four agents, and their sum over our median."""
     if values is None:
         return [DASH] * 5
     return [*(f"{value:.1f}" for value in values), significant(sum(values) / median, 2) if median else DASH]

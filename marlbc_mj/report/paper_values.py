@@ -1,4 +1,4 @@
-"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and the errata that one needs to read them."""
+"""Numbers published in Tables 3 to 6 of Zhang, Huang and Pan (FITEE 2024), and the errata that are needed to read them."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -71,7 +71,7 @@ ERRATA = {
     "over samples differ by a factor of 20. Totals of cost are compared by their order only.",
     17: "The input limit is published in N m; it acts on a point mass and is read as N.",
 }
-"""Errata that change how these tables read, by the number used in code and README."""
+"""Errata that change how these tables read, by the number used in code and documentation."""
 
 
 def order_matches(ours: Mapping[str, float], published: Mapping[str, float]) -> tuple[int, int]:

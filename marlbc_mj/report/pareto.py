@@ -1,12 +1,13 @@
 """Figure of control cost against what it buys: return, safety and formation error."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.transforms import ScaledTranslation
 
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.paper_tables import LIMITED, one_per_controller, one_per_supervisor
@@ -14,20 +15,20 @@ from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result
 from marlbc_mj.util.method_names import source_of
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.palette import METHOD_COLORS
 
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
-_COLORS = (*AGENT_COLORS[:7], "#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD")
 
 _INK, _PAPER = "#1A1A1A", "#FFFFFF"
-_COST_UNIT = "[s, SI squared]"  # the paper adds m^2, (m/s)^2 and N^2
-_TOGETHER = 0.01  # marks closer than this share of every axis are one
+_COST_UNIT = "[(SI units)² s]"  # it adds m^2, (m/s)^2 and N^2
+_MARK = 5.0  # size of a mark [pt]
+_APART = 6.5  # marks stand at least about this far apart [pt]
 _PANELS = {
     "return": "upper left is better",
     "violation_time_worst": "lower left is better",
     "formation_error_mean": "lower left is better",
 }
-"""Scores on the ordinates, and where the better methods are."""
+"""Scores on the ordinates, and the corner in which better methods are."""
 
 
 class Group(NamedTuple):
@@ -43,6 +44,7 @@ def pareto(results: Sequence[Result]) -> Figure:
 
     Where the methods are supervisors with one controller and controllers under one supervisor, each of the two kinds has its own
     row, since their ranges differ; else all share one row. A law with and without force limit has one marker, open without.
+    A mark that would cover another stands aside, and a thin line leads to its place.
     """
     ran = [result for result in results if result.metrics is not None]
     groups = _groups(ran)
@@ -63,22 +65,6 @@ def pareto(results: Sequence[Result]) -> Figure:
     return figure
 
 
-def coincident(results: Sequence[Result]) -> list[list[str]]:
-    """Methods whose marks a reader cannot tell apart in any panel, named by their controllers where these are enough."""
-    found = []
-    for group in _groups([result for result in results if result.metrics is not None]):
-        named = len({result.supervisor for result in group.results}) == 1
-        points = np.array([[np.log10(_cost(r)), *(SCORES[name].read(_metrics(r)) for name in _PANELS)] for r in group.results])
-        close = _TOGETHER * np.maximum(np.ptp(points, axis=0), 1e-12)
-        rest = list(range(len(points)))
-        while rest:
-            together = [k for k in rest if (np.abs(points[k] - points[rest[0]]) <= close).all()]
-            if len(together) > 1:
-                found.append([group.results[k].controller if named else group.results[k].key for k in together])
-            rest = [k for k in rest if k not in together]
-    return found
-
-
 def _groups(ran: Sequence[Result]) -> list[Group]:
     supervisors, controllers = list(one_per_supervisor(ran).values()), list(one_per_controller(ran)[0].values())
     laws = list(dict.fromkeys(map(_law, ran)))
@@ -87,13 +73,12 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
     supervisor_names = list(dict.fromkeys(result.supervisor for result in ran))
 
     def of_supervisor(result: Result) -> dict[str, Any]:
-        k = supervisor_names.index(result.supervisor)
-        return {**_style(k, 0, False), "markersize": _sizes(len(supervisor_names))[k]}
+        return _style(supervisor_names.index(result.supervisor), 0, False)
 
     def of_law(result: Result) -> dict[str, Any]:  # without color, which means a supervisor
         k = laws.index(_law(result))
         face = _PAPER if result.controller in twins else _INK
-        return {**_style(0, k, False), "markerfacecolor": face, "markersize": _sizes(len(laws))[k], "alpha": 0.75}
+        return {**_style(0, k, False), "markerfacecolor": face}
 
     def of_both(result: Result) -> dict[str, Any]:
         return _style(supervisor_names.index(result.supervisor), laws.index(_law(result)), result.controller in twins)
@@ -113,11 +98,6 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
     return [Group(ran, title[0] + named + title[1] + plain + limit, of_both)]
 
 
-def _sizes(count: int) -> np.ndarray:
-    """Sizes of marks from the first, drawn below, to the last, drawn above: those that coincide stay visible as rings."""
-    return np.linspace(8.0, 4.0, count)
-
-
 def _draw_group(row: np.ndarray, group: Group) -> None:
     costs = [_cost(result) for result in group.results]
     limits = min(costs) / 1.6, max(costs) * 1.6
@@ -126,15 +106,40 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
     cost = SCORES["cost_integral_sum"]
     floor = [_cost(result) for result in group.results if result.controller == "lqr"]
     for axes, (name, better) in zip(row, _PANELS.items(), strict=True):
-        for result in group.results:
-            axes.plot(_cost(result), SCORES[name].read(_metrics(result)), linestyle="none", clip_on=False, **group.style(result))
+        values = np.array([SCORES[name].read(_metrics(result)) for result in group.results])
+        room = 0.12 * (float(np.ptp(values)) or 1.0)
         axes.set(xscale="log", xlim=limits, xlabel=f"{cost.quantity}, {cost.aggregation} {_COST_UNIT}", ylabel=SCORES[name].label)
+        axes.set_ylim(values.min() - room, values.max() + room)
         axes.set_title(better, loc="left", fontsize=7, color=pl.GREY)
-        axes.margins(y=0.12)
+        _draw_marks(axes, np.column_stack([costs, values]), [group.style(result) for result in group.results])
         axes.grid(color="#E4E4E4", linewidth=0.4)
         axes.set_axisbelow(True)
         if floor:
             _draw_floor(axes, min(floor))
+
+
+def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, Any]]) -> None:
+    """Marks at points (P, 2) of axes whose limits are set; one that would cover another stands aside, on a thin line."""
+    inch = axes.figure.dpi_scale_trans
+    shifts = _asides(72.0 * inch.inverted().transform(axes.transData.transform(points)))
+    for point, shift, style in zip(points, shifts, styles, strict=True):
+        aside = axes.transData + ScaledTranslation(shift[0] / 72.0, shift[1] / 72.0, inch)
+        if shift.any():
+            line = {"arrowstyle": "-", "linewidth": 0.5, "color": pl.GREY, "shrinkA": 0.0, "shrinkB": 0.0}
+            axes.annotate("", point, tuple(shift), textcoords="offset points", arrowprops=line, annotation_clip=False)
+        axes.plot(*point, linestyle="none", clip_on=False, transform=aside, **style)
+
+
+def _asides(places: np.ndarray) -> np.ndarray:
+    """How far marks at places (P, 2) stand aside, (P, 2), all in pt: as little as leaves all of them ``_APART``."""
+    rings = [(k, 6 * k) for k in range(1, 1 + len(places))]
+    turns = [(_APART * k, 0.5 * np.pi + 2.0 * np.pi * j / count) for k, count in rings for j in range(count)]
+    offsets = np.array([(0.0, 0.0), *((r * np.cos(angle), r * np.sin(angle)) for r, angle in turns)])
+    shown: list[np.ndarray] = []
+    for place in places:
+        free = [o for o in offsets if all(np.hypot(*(place + o - other)) > 0.97 * _APART for other in shown)]
+        shown.append(place + free[0])
+    return np.asarray(np.array(shown) - places)
 
 
 def _draw_floor(axes: Axes, cost: float) -> None:
@@ -166,13 +171,13 @@ def _law(result: Result) -> str:
 
 
 def _style(supervisor: int, law: int, hollow: bool) -> dict[str, Any]:
-    color = _COLORS[supervisor % len(_COLORS)]
+    color = METHOD_COLORS[supervisor % len(METHOD_COLORS)]
     return {
         "marker": _MARKERS[law % len(_MARKERS)],
         "markerfacecolor": "white" if hollow else color,
         "markeredgecolor": color if hollow else _INK,
         "markeredgewidth": 0.9 if hollow else 0.4,
-        "markersize": 5,
+        "markersize": _MARK,
         "zorder": 3,
     }
 

@@ -18,7 +18,7 @@ SINGLE = 3.5  # width of a column [in]
 DOUBLE = 7.16  # width of two columns and the gap between them [in]
 GREY = "#6E6E6E"
 LINE_STYLES = ("-", (0, (5, 1.2)), (0, (3, 1, 1, 1)), (0, (1.2, 1)))
-BINS = 500  # per curve: more than a printed column resolves
+BINS = 500  # per curve: more than a column in print resolves
 
 _STYLE: Any = {
     "font.family": "sans-serif",
@@ -93,6 +93,12 @@ def legend_above(figure: Figure, handles: Sequence[Artist], **options: Any) -> N
     """One row of legend at the figure's top edge."""
     options = {"ncols": len(handles), "columnspacing": 1.3, "borderaxespad": 0.25, "borderpad": 0.2, **options}
     figure.legend(handles=list(handles), loc="upper center", **options)
+
+
+def legend_in(axes: Axes, handles: Sequence[Artist]) -> None:
+    """A legend in a panel that shows nothing else, one entry per line."""
+    axes.set_axis_off()
+    axes.legend(handles=list(handles), loc="center left", borderaxespad=0.0, labelspacing=0.6)
 
 
 def agent_line(agent: int) -> dict[str, Any]:

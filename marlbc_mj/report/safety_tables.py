@@ -51,7 +51,7 @@ def _overview(rows: Sequence[CellScores], name: str, shield: bool) -> Table:
     """One rate of every supervisor on every mission, in per cent; a dash where nothing was flown."""
     missions = list(dict.fromkeys(row.cell.mission for row in rows))
     shown = {
-        (row.cell.supervisor, row.cell.composition, row.cell.mission): interval(percent(getattr(row, name)), 0)
+        (row.cell.supervisor, row.cell.composition, row.cell.mission): interval(percent(getattr(row, name)), 1)
         for row in rows
         if row.cell.shield == shield and not row.refused
     }

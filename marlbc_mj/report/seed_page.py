@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
+from marlbc_mj.report import paper_values
 from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.figures import save_figure
 from marlbc_mj.report.formats import loose_interval, score_interval, spans
@@ -19,8 +20,9 @@ from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seed_statistics import MethodStatistics, analyse
 from marlbc_mj.results.seeds import SeedResults
 from marlbc_mj.results.summary import AGENT_KEYS
+from marlbc_mj.scenarios.titles import mission_title
 from marlbc_mj.util.files import write_json
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.palette import METHOD_COLORS
 from marlbc_mj.util.progress import Progress
 
 FIGURE = "intervals"
@@ -36,7 +38,7 @@ def intervals(methods: Sequence[MethodStatistics]) -> Figure:
     supervisors = list(dict.fromkeys(s.runs.supervisor for s in methods))
     for axes, name in zip(panels[0], names, strict=True):
         for k, s in enumerate(methods):
-            color = AGENT_COLORS[supervisors.index(s.runs.supervisor) % len(AGENT_COLORS)]
+            color = METHOD_COLORS[supervisors.index(s.runs.supervisor) % len(METHOD_COLORS)]
             estimate = s.medians[name]
             axes.plot([estimate.low, estimate.high], [k, k], color=color, linewidth=2.0, alpha=0.45)
             axes.plot(estimate.value, k, "o", color=color, markersize=3.5)
@@ -95,6 +97,7 @@ def _write_page(
     path: Path, results: SeedResults, methods: Sequence[MethodStatistics], tables: Sequence[Table], config: Mapping[str, Any]
 ) -> Path:
     scenario, draws = results.scenario, len(results.seeds)
+    of_paper = scenario.name == paper_values.SCENARIO
     failed = sum(len(s.runs.failed) for s in methods)
     caption = f"Median and 95 % interval of each method over draws{caution(draws)}."
     figure = picture(path.parent / "figures" / f"{FIGURE}.png", caption)
@@ -102,7 +105,7 @@ def _write_page(
         path,
         "seed_page.html",
         files_beside(path.parent),
-        title=f"Behavioral control benchmark: {scenario.name}, {draws} draws",
+        title=f"Behavioral control benchmark: {mission_title(scenario.name)}, {draws} draws",
         lead=f"{len(methods)} methods on the same {draws} draws around {scenario.description or scenario.name}.",
         facts=[
             *scenario_facts(scenario),
@@ -112,7 +115,8 @@ def _write_page(
         ],
         command=str(config["command"]),
         tables=tables,
-        of_paper=scenario.layout is None,
+        of_paper=of_paper,
+        has_details=of_paper,
         pictures=[figure] if figure else [],
         video=None,
         methods=list(map(_method_section, methods)),

@@ -104,7 +104,7 @@ def pipe_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def to_latex(table: Table) -> str:
-    """A ``table*`` for a document that loads booktabs."""
+    """A ``table*`` for a document that loads booktabs and graphicx; a table wider than the text is scaled down to its width."""
     count = len(table.columns)
     body = [_latex_row(row) for row in table.rows]
     for at in sorted(table.rules, reverse=True):
@@ -117,14 +117,16 @@ def to_latex(table: Table) -> str:
             rf"\caption{{{latex(table.caption)}}}",
             rf"\label{{tab:{table.name}}}",
             r"\footnotesize" if count <= 9 else r"\scriptsize",
-            r"\setlength{\tabcolsep}{" + ("6pt" if count <= 9 else "3pt" if count <= 11 else "1pt") + "}",
+            r"\setlength{\tabcolsep}{" + ("6pt" if count <= 9 else "4pt") + "}",
+            r"\par\smallskip",
+            r"\resizebox{\ifdim\width>\textwidth\textwidth\else\width\fi}{!}{%",
             rf"\begin{{tabular}}{{@{{}}l{'r' * (count - 1)}@{{}}}}",
             r"\toprule",
             *_latex_header(table),
             r"\midrule",
             *body,
             r"\bottomrule",
-            r"\end{tabular}",
+            r"\end{tabular}}",
             *([rf"\par\smallskip\begin{{minipage}}{{\linewidth}}\scriptsize {notes}\end{{minipage}}"] if notes else []),
             r"\end{table*}",
         ]
@@ -169,4 +171,5 @@ def _latex_header(table: Table) -> list[str]:
 
 
 def _latex_row(cells: Iterable[str]) -> str:
-    return " & ".join(map(latex, cells)) + r" \\"
+    text = " & ".join(map(latex, cells))
+    return ("{}" if text.startswith("[") else "") + text + r" \\"  # a bracket behind a line break would be its length

@@ -39,8 +39,8 @@ def markdown(tables: Sequence[Table], paragraph: str = "") -> str:
 
 
 def latex_document(tables: Sequence[Table], paragraph: str = "") -> str:
-    r"""The content of tables.tex, for ``\input`` in a document that loads booktabs."""
-    parts = ["% needs \\usepackage{booktabs}", *([latex(paragraph)] if paragraph else []), *map(to_latex, tables)]
+    r"""The content of tables.tex, for ``\input`` in a document that loads booktabs and graphicx."""
+    parts = ["% needs \\usepackage{booktabs,graphicx}", *([latex(paragraph)] if paragraph else []), *map(to_latex, tables)]
     return "\n\n".join(parts) + "\n"
 
 

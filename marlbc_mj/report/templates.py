@@ -23,7 +23,7 @@ def render(template: str, package: str = _HOME, **values: Any) -> str:
     Args:
         template: name of an ``.html`` file in the folder of ``package``, or else of this one.
         package: where the template is.
-        values: what the template names.
+        values: variables of the template.
 
     Raises:
         jinja2.UndefinedError: the template names a value that is not given.

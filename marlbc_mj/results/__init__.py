@@ -1,1 +1,1 @@
-"""What an episode or a study came to: metrics, outcomes, statistics, summaries."""
+"""Results of episodes and studies: metrics, outcomes, statistics, summaries."""

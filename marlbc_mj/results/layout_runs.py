@@ -23,7 +23,7 @@ LAYOUT_SCORES = (
 
 
 class Method(NamedTuple):
-    """What flies a mission: who decides, which law drives, how orders are composed, and whether a shield watches."""
+    """What flies a mission: who decides, which law drives, how orders are composed, and whether there is a shield."""
 
     supervisor: str
     controller: str

@@ -1,4 +1,4 @@
-"""Many layouts of many missions: the few numbers that are kept of each layout, and what they say of a supervisor there.
+"""Results on many layouts: the few numbers kept per layout, and the scores made from them.
 
 A *cell* is one supervisor on one mission, under one composition, with a shield or without.
 """
@@ -25,7 +25,7 @@ class MissionCell(NamedTuple):
 
 
 class LayoutMark(NamedTuple):
-    """What is kept of one layout."""
+    """The numbers kept of one layout."""
 
     seed: int
     outcome: MissionOutcome
@@ -37,7 +37,7 @@ class LayoutMark(NamedTuple):
 
 
 def mark(run: SeedRun, scenario: Scenario) -> LayoutMark:
-    """What is kept of one layout."""
+    """The numbers kept of one layout."""
     ended, metrics = outcome(run.metrics, scenario), run.metrics
     if metrics is None:
         return LayoutMark(run.seed, ended, False, failure=str(run.failure))

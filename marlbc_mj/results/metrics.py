@@ -56,7 +56,7 @@ class Metrics(TypedDict):
 
 @dataclass(frozen=True)
 class _Flown:
-    """What metrics read of an episode: T substeps, M mission steps, N agents; fields as in :class:`Trajectory`."""
+    """The data of an episode that metrics need: T substeps, M mission steps, N agents; fields as in :class:`Trajectory`."""
 
     course: Course
     position: np.ndarray  # (T + 1, N, 2)
@@ -190,7 +190,9 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
 
 
 def _end_error(flown: _Flown) -> float:
-    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: was the mission accomplished?"""
+    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: whether the mission was
+    accomplished.
+    """
     course = flown.course
     end = len(flown.force) * course.substep
     centroid = np.array(course.path_origin) + end * np.array(course.path_velocity)

@@ -17,7 +17,7 @@ _Read = Callable[[AgentMetrics], float]
 
 
 class Score(NamedTuple):
-    """What a number is, how agents are aggregated to it, and how it is shown."""
+    """One number per episode: what it measures, how it aggregates agents, and how it is shown."""
 
     quantity: str  # first line of a heading
     aggregation: str  # second line

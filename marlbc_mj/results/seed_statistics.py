@@ -17,7 +17,7 @@ _GROUP_SCORES = ("return", "violation_time_worst")
 
 @dataclass(frozen=True)
 class MethodStatistics:
-    """What tables, files and figure say about one method; estimates are over the runs that finished."""
+    """Statistics of one method for tables, files and the figure; estimates are over the runs that finished."""
 
     runs: MethodRuns
     agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS

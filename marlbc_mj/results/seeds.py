@@ -1,4 +1,4 @@
-"""Every method on the same draws around a scenario, as results: scalars only, so memory stays flat."""
+"""Every method on the same draws around a scenario, as scalars only, so that memory stays small."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -75,14 +75,20 @@ class SeedResults:
     reference: str  # the method that others are compared with
 
 
+MOST_SEEDS = 10_000_000
+"""More seeds than one run's memory holds results for."""
+
+
 def seed_range(count: int, first: int = 0) -> tuple[int, ...]:
     """``count`` seeds from ``first`` on.
 
     Raises:
-        ConfigurationError: fewer than one, or a negative seed.
+        ConfigurationError: fewer than one or more than :data:`MOST_SEEDS`, or a negative seed.
     """
     if count < 1:
         raise ConfigurationError(f"seeds must be at least 1, got {count}")
+    if count > MOST_SEEDS:
+        raise ConfigurationError(f"seeds must be at most {MOST_SEEDS} in one run, got {count}")
     if first < 0:
         raise ConfigurationError(f"seed must not be negative, got {first}")
     return tuple(range(first, first + count))

@@ -15,7 +15,7 @@ from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, 
 from marlbc_mj.util.errors import ConfigurationError
 
 WORTH_OF_SUCCESS = 1e12
-"""What success is worth in a merit: more than any return or cost."""
+"""Value of success in a merit: more than any return or cost."""
 Merit = Callable[[LayoutRun], float]
 """One number of a run, by whose order runs are compared: larger is better."""
 
@@ -31,7 +31,7 @@ def by_cost(run: LayoutRun) -> float:
 
 
 OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened")
-"""What may be true of a run."""
+"""Outcomes of a run by name."""
 
 
 class MissionSummary(NamedTuple):
@@ -257,7 +257,7 @@ def behind(x: np.ndarray, y: np.ndarray) -> bool:
 
 
 class Notable(NamedTuple):
-    """One layout of a method that is worth a look."""
+    """One layout of a method that is worth watching."""
 
     track: str
     mission: str

@@ -26,7 +26,7 @@ _loaded: dict[str, tuple[Stamp, Robot]] = {}
 
 
 def _load(name: str) -> Robot:
-    """The robot of a user's file; anew after an edit there, and where another current folder makes the name another file's."""
+    """The robot of a user's file; loaded again after an edit, or when the name means another file."""
     stamp = stamp_of(name)
     if name not in _loaded or _loaded[name][0] != stamp:
         _loaded[name] = stamp, load(name)
@@ -48,7 +48,7 @@ def make_robot(name: str) -> Robot:
 
 
 def register(robot: Robot) -> Robot:
-    """Give a robot of one's own a name that scenarios can use, for this process.
+    """Register a user's robot under a name that scenarios can use, for this process.
 
     Raises:
         ConfigurationError: the name is taken.

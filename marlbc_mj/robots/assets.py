@@ -4,7 +4,7 @@ import mujoco
 import numpy as np
 
 MOST_VERTICES = 4000
-"""A mesh with more is carried as its convex hull's bounding box: a log is not the place for a million triangles."""
+"""A mesh with more is carried as its convex hull's bounding box: a million triangles do not belong in a log."""
 
 
 def embed(spec: mujoco.MjSpec) -> None:

@@ -1,4 +1,4 @@
-"""What an MJCF of a stranger may bring along: regular files in its own folder, of sizes and counts that a robot can have.
+"""Checks of a stranger's MJCF: regular files in its own folder, of sizes and counts that a robot can have.
 
 MuJoCo opens includes, models and assets while it parses, so the text is read here first, without opening any of them blindly.
 """
@@ -122,7 +122,7 @@ def _strict(text: str) -> str:
 
 
 def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:
-    """The file that is meant; every place where MuJoCo might look for it counts.
+    """The file that is meant; every place where MuJoCo might look for it is checked.
 
     Raises:
         ConfigurationError: one of them is outside the folder, or none is there.

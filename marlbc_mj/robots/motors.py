@@ -1,4 +1,4 @@
-"""What actuators push: plain motors along x and y of a base, found by their effect, with every limit between control and base."""
+"""The motors that push a base along x and y, found by their effect, with every limit between control and base."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -116,7 +116,7 @@ def _on_tendon(model: mujoco.MjModel, u: int) -> bool:
 
 
 def largest_force(motors: tuple[Motor, Motor]) -> float:
-    """What both motors can give in every direction [N].
+    """The largest force that both motors can give in every direction [N].
 
     Raises:
         ConfigurationError: a motor without a limit, or one that cannot push both ways.

@@ -1,4 +1,4 @@
-"""Where an MJCF's planar motion is and what pushes it, found by what joints and actuators do, not by their names or order.
+"""The planar motion of an MJCF and the actuators that push it, found by their effect, not by names or order.
 
 A direct robot gets its planar force as control, and its p and v are its joints' own. :func:`straighten` brings any base on two
 slides and any motors, whatever their gear, sense, reference and place, into this form without a change of the motion.
@@ -22,7 +22,7 @@ _PARALLEL = 1e-6
 
 
 class Base(NamedTuple):
-    """What moves in the plane: the body that carries the rest, and its joints along x and y, or its free joint."""
+    """The part that moves in the plane: the body that carries the rest, and its joints along x and y, or its free joint."""
 
     body: int
     joints: tuple[str, ...]
@@ -116,7 +116,7 @@ def _copied(value: Any) -> Any:
 
 
 def moved_masses(model: mujoco.MjModel, base: Base) -> tuple[float, float]:
-    """What a force along x and one along y accelerate: all that the joint carries, and its own ``armature`` [kg]."""
+    """The masses that a force along x and one along y accelerate: all that the joint carries, and its own ``armature`` [kg]."""
     matrix = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, posed(model), matrix)
     along_x, along_y = (float(matrix[dof, dof]) for dof in base.dofs)

@@ -1,4 +1,4 @@
-"""The numbers of a rotorcraft's laws, read from its MJCF: shares of the rotors are the pseudo-inverse of what they do."""
+"""The numbers of a rotorcraft's laws, read from its MJCF: shares of the rotors are the pseudo-inverse of their effect."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ class Attitude(NamedTuple):
 
 
 class RotorNumbers(NamedTuple):
-    """What the two laws need to know of a robot, and its mass."""
+    """Gains and state of the two laws, and the robot's mass."""
 
     params: dict[str, Any]
     state: dict[str, Any]

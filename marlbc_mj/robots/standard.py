@@ -45,7 +45,7 @@ for _ in range(2):
 
 
 def standard_text(path: Path) -> str:
-    """The MJCF of a user's file in standard form; it is read again where a file in its folder has changed.
+    """The MJCF of a user's file in standard form; it is read again after a change in its folder.
 
     Raises:
         ConfigurationError: what is wrong with the file, in one line.

@@ -1,4 +1,4 @@
-"""Robots from a user's file: a Python file that makes one, or any MJCF whose way of driving can be told from its actuators.
+"""Robots from a user's file: a Python file that makes one, or any MJCF whose actuators show how it is driven.
 
 A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one;
 ``file.py:NAME`` takes another name from it. An MJCF is taken as it is: two slide joints or a free joint with motors along x and y
@@ -61,7 +61,7 @@ Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
 
 
 def stamp_of(name: str) -> Stamp:
-    """Which file a name means now, and in which state it and what it may use are: another value after an edit.
+    """The file that a name means now, and the state of that file and its neighbors; another value after an edit.
 
     Raises:
         ConfigurationError: there is no such file.
@@ -193,7 +193,7 @@ def _moving_root(path: Path, model: mujoco.MjModel) -> int:
 
 
 def _slides_first(spec: mujoco.MjSpec) -> None:
-    """What a robot from its MJCF alone needs beyond the standard form."""
+    """The further preparation of a robot that is given by its MJCF alone."""
     slides_first(spec)
 
 

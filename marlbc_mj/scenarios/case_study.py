@@ -7,7 +7,7 @@ from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behavi
 STARTS = ((-2.0, 8.0), (-2.0, -8.0), (-7.0, 14.0), (-7.0, -14.0))
 SLOTS = ((2.5, 6.0), (2.5, -6.0), (-2.5, 12.0), (-2.5, -12.0))
 COLUMN = ((4.5, 0.0), (1.5, 0.0), (-1.5, 0.0), (-4.5, 0.0))
-"""Gamma_i p_c_i with Gamma_3 and Gamma_4 positive; the printed signs put two pairs of agents in one place (erratum 4)."""
+"""Gamma_i p_c_i with Gamma_3 and Gamma_4 positive; the published signs put two pairs of agents in one place (erratum 4)."""
 OBSTACLES = (
     Obstacle(20, 5),
     Obstacle(40, -11),
@@ -25,7 +25,7 @@ SCHEDULE = (
 
 
 def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
-    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the printed OA (erratum 6).
+    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the published OA (erratum 6).
 
     OA keeps the ``safe_distance`` that violations are judged by.
     """

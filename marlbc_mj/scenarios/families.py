@@ -1,6 +1,5 @@
-"""Families of missions of one's own: what is in the way makes the family, and every seed places it anew.
-
-What all share is in :mod:`marlbc_mj.scenarios.family`. A family is used by name, from a TOML file, or as a Python object:
+"""Families of missions, which differ in their obstacles; every seed draws new places. Their base is in
+:mod:`marlbc_mj.scenarios.family`. A family is used by name, from a TOML file, or as a Python object:
 ``Field(agents=9, formation="grid").build()``.
 """
 
@@ -46,7 +45,7 @@ class Field(Family):
     radius: Range = (0.5, 2.0)  # [m]
     margin: float = 3.0  # by which the field is wider than the formation, on either side [m]
     gap: float = 3.0  # between two discs' surfaces [m]
-    summary: ClassVar[str] = "a field of discs, placed anew by every seed"
+    summary: ClassVar[str] = "a field of discs, drawn by the seed"
     cluttered: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -59,7 +58,7 @@ class Field(Family):
             )
 
     def check_discs(self, count: int, radius: Range) -> None:
-        """Raise ConfigurationError for a number or a range of radii that cannot be."""
+        """Raise ConfigurationError for an invalid number or range of radii."""
         if count < 1:
             raise self.infeasible(f"obstacles must be at least 1, got {count}; the family 'open' has none")
         if not (np.isfinite(radius).all() and 0 <= radius[0] <= radius[1]):
@@ -91,7 +90,7 @@ class Forest(Field):
     radius: Range = (0.15, 0.4)
     safe_distance: float = 0.75
     gap: float = 2.5
-    summary: ClassVar[str] = "a forest of thin trunks, planted anew by every seed"
+    summary: ClassVar[str] = "a forest of thin trunks, drawn by the seed"
 
     def check(self) -> None:
         if not (np.isfinite(self.density) and self.density > 0):
@@ -121,7 +120,7 @@ class Gates(Family):
     shift: float = 0.75  # the middle of an opening is drawn within this distance of the path [m]
     post: float = 1.5  # radius of the discs that make a wall [m]
     depth: float = 0.0  # length of the passage behind an opening [m]
-    summary: ClassVar[str] = "walls across the way, an opening in each where the seed puts it"
+    summary: ClassVar[str] = "walls across the way, each with an opening at a drawn place"
     cluttered: ClassVar[bool] = True
 
     def check(self) -> None:
@@ -194,7 +193,7 @@ class Crossing(Family):
     obstacle_speed: Range = (0.3, 1.0)  # [m/s]
     swing: Range = (2.0, 5.0)  # amplitude [m]
     gap: float = 3.0  # between two of them, at any time [m]
-    summary: ClassVar[str] = "obstacles that cross the way or swing to and fro"
+    summary: ClassVar[str] = "obstacles that cross the way or swing across it"
     cluttered: ClassVar[bool] = True
 
     def check(self) -> None:

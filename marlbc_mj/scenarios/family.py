@@ -1,4 +1,4 @@
-"""What all families of missions share: a team, its formation and its way. A frozen dataclass that builds a scenario.
+"""The base of all families of missions: a team, its formation and its way. A frozen dataclass that builds a scenario.
 
 A team in formation at rest at the origin travels ``length`` along +x at ``speed``, and reforms into a column (FR) where its
 supervisor says so. Every length, speed, gain and limit is a field, so a family fits robots of any size; what cannot be flown is
@@ -28,7 +28,7 @@ NOMINAL = 0
 
 @dataclass(frozen=True, kw_only=True)
 class Mission:
-    """What has nothing to do with where a mission leads: its clocks, its robots and how its agents avoid and keep formation."""
+    """The part of a mission that does not depend on its way: clocks, robots, avoidance and formation."""
 
     name: str
     safe_distance: float = 1.0  # to obstacles: d_OA [m]
@@ -74,7 +74,7 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Mission):
-    """What all families share; alone, it is a mission with nothing in the way.
+    """The base of all families; by itself, a mission with nothing in the way.
 
     Raises:
         ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
@@ -89,7 +89,7 @@ class Family(Mission):
     column_spacing: float = 3.0  # between neighbors in the column [m]
     length: float = 60.0  # of the way [m]
     speed: float = 1.0  # [m/s]
-    two_sided: bool = False  # OA as the printed equality (erratum 6)
+    two_sided: bool = False  # OA as the published equality (erratum 6)
     split: Literal["train", "test"] = "train"  # whose layouts are drawn; the held-out ones are "test"
     summary: ClassVar[str] = "nothing in the way"
     cluttered: ClassVar[bool] = False  # whether the way must have room for obstacles

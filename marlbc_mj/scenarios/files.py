@@ -105,6 +105,8 @@ def _read(path: Path) -> dict[str, Any]:
         if _depth(text) > MOST_DEPTH:
             raise ConfigurationError(f"{path} is nested more than {MOST_DEPTH} deep; that is no scenario file")
         return tomllib.loads(text)
+    except ConfigurationError:
+        raise
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or a number of thousands of digits

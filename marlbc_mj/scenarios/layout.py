@@ -1,4 +1,4 @@
-"""Where obstacles are and how they move: the parts of a scenario that a seed may draw as a whole."""
+"""Places and motions of obstacles, which a seed may draw as a whole."""
 
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -8,7 +8,7 @@ from marlbc_mj.core.motion import NUMBERS
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 SPLITS = ("train", "test")
-"""Whose layouts a scenario draws. A layout has a number: even ones are for training, odd ones are held out."""
+"""Layout splits to draw from. A layout has a number: even ones are for training, odd ones are held out."""
 
 
 class Motion(NamedTuple):

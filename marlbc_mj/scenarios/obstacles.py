@@ -57,12 +57,14 @@ class Scatter:
 
     def _first_free(self, places: np.ndarray, radius: float, discs: np.ndarray) -> int:
         """Index of the first of ``places`` (P, 2) with room for a disc among ``discs`` (k, 3); -1 if there is none."""
-        for first in range(0, len(places), 20):  # a few at a time: most discs find room soon
-            some = places[first : first + 20]
+        first = 0
+        while first < len(places):  # one place, then more and more at a time: most discs find room soon, also among thousands
+            some = places[first : 2 * first + 1]
             room = np.linalg.norm(some[:, None] - discs[None, :, :2], axis=-1) - discs[:, 2] - radius
             free = np.flatnonzero((room >= self.gap).all(axis=1))
             if len(free):
                 return first + int(free[0])
+            first += len(some)
         return -1
 
     def _reason(self, what: str) -> str:
@@ -86,12 +88,12 @@ class Walls:
     reach: float  # walls across reach at least this far from the path [m]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """All passages, every opening where chance puts it."""
+        """All passages, every opening at a random place."""
         walls = [self._passage(*ends, float(rng.uniform(-self.shift, self.shift))) for ends in self.passages]
         return Sample(np.concatenate(walls), np.zeros((0, NUMBERS)))
 
     def _passage(self, first: float, last: float, middle: float) -> np.ndarray:
-        """(k, 3) discs; as many whatever the opening."""
+        """(k, 3) discs; the same number for every opening."""
         side = 0.5 * self.width + self.radius
         across = side + 2.0 * self.radius * np.arange(int(np.ceil((self.reach + self.shift - side) / (2.0 * self.radius))) + 1)
         along = np.linspace(first, last, int(np.ceil((last - first) / (2.0 * self.radius))) + 1)[1:]

@@ -22,7 +22,7 @@ AIR_DRAG = 0.0147  # of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/
 
 
 def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
-    """Four robots round a point obstacle and through the gate; ``changes`` replace any field.
+    """Four robots around a point obstacle and through the gate; ``changes`` replace any field.
 
     Raises:
         ConfigurationError: unknown robot, or one without limits of speed and acceleration to scale by.
@@ -47,7 +47,7 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
         "duration": 0.05 * steps,
         "disturbance": LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
         "schedule": _schedule(unit / speed),
-        "description": "a point obstacle and a gate for four real robots, scaled to --robot",
+        "description": "a point obstacle and a gate for four robots, scaled to --robot",
         "speed_limit": top,
         "acceleration_limit": brake,
         **body.scale(),
@@ -56,7 +56,9 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
 
 
 def _schedule(unit_time: float) -> tuple[Window, ...]:
-    """Agent 1 round the point, then everybody through the gate in a column; ``unit_time`` [s] is one length unit of the path."""
+    """Agent 1 around the point, then the whole team through the gate in a column; ``unit_time`` [s] is one length unit of the
+    path.
+    """
     return (
         Window(unit_time * (POINT[0] - ORIGIN), unit_time * (POINT[1] - ORIGIN), 0, "OA>FM"),
         Window(unit_time * (COLUMN_IN - ORIGIN), unit_time * (COLUMN_OUT - ORIGIN), -1, "FR"),

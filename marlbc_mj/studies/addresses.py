@@ -21,7 +21,7 @@ from marlbc_mj.util.modules import split_name
 from marlbc_mj.util.provenance import versions
 
 COMPUTING = ("python", "marlbc-mj", "mujoco", "numpy", "numba")
-"""Whose versions count."""
+"""Packages whose versions count."""
 _PACKAGE = __name__.partition(".")[0]
 _ROOT = Path(__file__).resolve().parents[1]
 _SHOWING = ("cli", "report")

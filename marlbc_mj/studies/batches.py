@@ -1,8 +1,8 @@
-"""Many draws of a scenario side by side in one World: flown together, measured one by one, and let go.
+"""Many draws of a scenario side by side in one World: flown together and measured one by one.
 
 Worlds and teams do not interact. So what comes of a draw, its metrics or the reason why there are none, is to the bit what
-:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only the time of a decision is another: that of all teams
-together, shared out evenly.
+:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only decision times differ: that of all teams together is
+shared out evenly.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ RECORD_BYTES = 128e6
 """Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
 
 
-class Entry(NamedTuple):
-    """What is flown on every draw."""
+class Flown(NamedTuple):
+    """The method that flies every draw."""
 
     scenario: Scenario
     supervisor: Supervisor
@@ -71,7 +71,7 @@ def evaluate_batch(
     """
     changes: dict[str, Any] = {} if composition is None else {"composition": composition}
     scenario = replace(scenario, **changes)
-    entry = Entry(
+    entry = Flown(
         scenario, make_supervisor(supervisor, controller), make_controller(controller), (supervisor, controller), shield
     )
     try:
@@ -93,7 +93,7 @@ def draws_together(scenario: Scenario) -> int:
     return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
 
 
-def fly_side_by_side(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
+def fly_side_by_side(entry: Flown, seeds: Sequence[int]) -> list[SeedRun]:
     """One run per seed, all flown at once.
 
     A supervisor that raises does not say on which draw. Then the draws are flown in halves, until it is known.
@@ -121,7 +121,7 @@ class JointFlight:
         ConfigurationError: a setting that cannot be run.
     """
 
-    def __init__(self, entry: Entry, seeds: Sequence[int]) -> None:
+    def __init__(self, entry: Flown, seeds: Sequence[int]) -> None:
         scenario, count = entry.scenario, len(seeds)
         self.entry = entry
         self.seeds = seeds
@@ -181,7 +181,7 @@ class JointFlight:
         self.reward[:, m], self.shield = step.reward, step.shield
 
     def _drop_diverged(self) -> bool:
-        """Whether worlds diverged; they have failed, and begin an episode that nobody looks at, since others go on."""
+        """Whether worlds diverged; they have failed, and begin an episode that is not recorded, since the others continue."""
         world, state = self.world, self.world.state
         diverged = np.flatnonzero(state.status).tolist()
         for b in diverged:

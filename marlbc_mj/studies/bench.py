@@ -28,7 +28,7 @@ from marlbc_mj.util.progress import Progress, note, silent
 from marlbc_mj.util.provenance import provenance
 
 SO_FAR = "so_far"
-"""Folder, among what an unfinished run keeps, of its page."""
+"""Folder of the page of an unfinished run, among its other files."""
 REWRITE_AFTER = 1.0  # least time between two versions of that page [s]
 
 

@@ -1,4 +1,4 @@
-"""Where the velocity gains of the finite- and fixed-time rivals come from: Table 6's published maxima, inverted by a search.
+"""Source of the velocity gains of the finite- and fixed-time rivals: Table 6's published maxima, inverted by a search.
 
 Their largest force occurs in the first substep of the column (FR), and again in the first one after it, when v_r jumps; it is
 nearly proportional to the velocity gain. So one gain cannot fit four published maxima: the search fits the largest of them, and
@@ -140,7 +140,7 @@ def calibration_lines(results: Sequence[Calibration]) -> list[str]:
         "|---|---:|---:|---:|",
     ]
     for result in results:
-        lines.append(f"| {result.controller}, printed | – | {_slashed(result.printed, 'g')} | – |")
+        lines.append(f"| {result.controller}, published | – | {_slashed(result.printed, 'g')} | – |")
         rows = (
             ("found", result.found, result.at_found, result.errors),
             ("shipped", result.shipped, result.at_shipped, result.shipped_errors),
@@ -159,7 +159,7 @@ def _root(function: Callable[[float], float], low: float, high: float, tolerance
     """Where an increasing function is within ``tolerance`` of zero: false position, halving the weight of an end that stays."""
     at_low, at_high = function(low), function(high)
     if at_low > 0.0 or at_high < 0.0:
-        raise SimulationError(f"no gain from {low:g} to {high:g} /s gives the printed maximum")
+        raise SimulationError(f"no gain from {low:g} to {high:g} /s gives the published maximum")
     for _ in range(MOST_EPISODES - 2):
         middle = (low * at_high - high * at_low) / (at_high - at_low)
         value = function(middle)

@@ -1,6 +1,6 @@
 """Jobs and results as bytes, and back: no pickle, no constructor runs, and every number comes back bit for bit.
 
-A record is a JSON text, what is nested in it marked by type, followed by the arrays' bytes. Equal values of equal types give
+A record is a JSON text, whose nested values are marked by type, followed by the arrays' bytes. Equal values of equal types give
 equal bytes, so that the bytes of a job are its canonical form.
 """
 

@@ -1,4 +1,4 @@
-"""What communication costs a distributed supervisor, and how long agents take to agree."""
+"""Costs of communication for a distributed supervisor, and the time that agents take to agree."""
 
 import csv
 from collections.abc import Sequence

@@ -28,7 +28,7 @@ A slot of the case study passes its points at 1 m and the gate is 8 m wide, so 0
 whether the mission can be done. A schedule fixed in time may violate then; that is an outcome.
 """
 SEEDS_PER_JOB = 100
-"""So that a study has more jobs than workers, and a job is soon done again."""
+"""Few enough that a study has more jobs than workers, and that repeating a job is quick."""
 
 
 class DrawsJob(NamedTuple):

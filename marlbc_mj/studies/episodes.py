@@ -1,4 +1,4 @@
-"""One episode of one method: made ready, flown, logged, and checked for a law that never left its force limit."""
+"""One episode of one method: prepared, flown, logged, and checked for a law that stays at its force limit."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -128,7 +128,7 @@ def fly_or_fail(job: EpisodeJob, folder: Path | None, progress: Progress = silen
 
 
 def _frame_observer(job: EpisodeJob, log: LogWriter | None, progress: Progress) -> Callable[[Frame], None]:
-    """What is done with every frame: it goes into the log, and now and then its time to who watches."""
+    """What is done with every frame: it goes into the log, and its time is reported now and then."""
 
     def observe(frame: Frame) -> None:
         if log is not None:

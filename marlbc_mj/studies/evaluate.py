@@ -1,4 +1,4 @@
-"""Supervisors on held-out layouts of a scenario family: how often the mission succeeds, and what goes wrong where it does not."""
+"""Supervisors on held-out layouts of a scenario family: how often the mission succeeds, and why it fails otherwise."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.cells import spacing
 from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
@@ -79,7 +80,7 @@ class GoalShares(NamedTuple):
 
 
 def draw_goals(rng: np.random.Generator) -> GoalDraw:
-    """Rectangles anywhere in the square, then starts and goals where there is room."""
+    """Random rectangles in the square, then starts and goals in the remaining room."""
     middles, angles = rng.uniform(0.0, SIDE, (BOXES, 2)), rng.uniform(0.0, 2.0 * np.pi, BOXES)
     halves = 0.5 * rng.uniform(*SIDES, (BOXES, 2))
     boxes = tuple(Box(*each) for each in zip(middles, halves, angles.tolist(), strict=True))
@@ -120,15 +121,16 @@ def goal_scenario(drawn: GoalDraw) -> Scenario:
 
 
 def fly_to_goals(seed: int, supervisor: str = "fixed", *, shield: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """When each agent of a draw first had its goal and first touched something, (N,) mission steps each; infinite: never."""
+    """When each agent of a draw first had its goal, and at which substep it first touched something: (N,) mission steps each;
+    infinite: never.
+    """
     drawn = draw_goals(np.random.default_rng(seed))
     world = World(goal_scenario(drawn), record=True, shield=shield)
-    at = run_episode(world, make_supervisor(supervisor)).position[:: world.scenario.substeps]
-    near = np.linalg.norm(at - drawn.goals, axis=-1) < 2.0 * AGENT_RADIUS
+    at, substeps = run_episode(world, make_supervisor(supervisor)).position, world.scenario.substeps
+    near = np.linalg.norm(at[::substeps] - drawn.goals, axis=-1) < 2.0 * AGENT_RADIUS
     touched = np.min([box.distance(at) for box in drawn.boxes], axis=0) < AGENT_RADIUS
-    between = np.linalg.norm(at[:, :, None] - at[:, None], axis=-1) + np.diag(np.full(AGENTS, np.inf))
-    touched |= (between < 2.0 * AGENT_RADIUS).any(axis=-1)
-    return _first(near), _first(touched)
+    touched |= spacing(at) < 2.0 * AGENT_RADIUS
+    return _first(near), _first(touched) / substeps
 
 
 def _first(events: np.ndarray) -> np.ndarray:

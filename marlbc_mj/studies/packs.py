@@ -25,7 +25,7 @@ _PREFIX, PACK_SUFFIX = "results-", ".pack"
 
 
 class Packed(NamedTuple):
-    """Where a record's payload is."""
+    """Place of a record's payload."""
 
     key: str
     """64 hexadecimal digits."""

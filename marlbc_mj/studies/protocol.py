@@ -1,4 +1,4 @@
-"""What a study is: independent jobs, each a pure function of its configuration, and a report made from their results.
+"""Studies: independent jobs, each a pure function of its configuration, and a report made from their results.
 
 A job is data: everything that its result depends on, so that it can run in this process, in another one or on another machine, in
 any order, and so that a result that is there already is found again. A result is data too. Data are None, numbers, texts, paths,
@@ -25,12 +25,12 @@ class Stopped(Exception):
 
 
 def never() -> bool:
-    """What a job is told that nobody will ask to stop."""
+    """The stop request of a job that nobody will stop."""
     return False
 
 
 class Watch(NamedTuple):
-    """What a job may use besides its configuration; its result depends on none of it."""
+    """Services for a job besides its configuration; its result does not depend on them."""
 
     progress: Progress = silent
     stopping: Callable[[], bool] = never
@@ -40,14 +40,14 @@ class Watch(NamedTuple):
 
 
 class Report(NamedTuple):
-    """What a study says of itself."""
+    """The text and data that a study reports."""
 
     text: str = ""
     """For the terminal."""
     document: Any = None
     """The same as data, of the kinds that results are made of."""
     problems: tuple[str, ...] = ()
-    """What could not be written, a video without GL for example; one line each."""
+    """Outputs that could not be written, a video without GL for example; one line each."""
 
 
 class Study(Protocol[JobT, ResultT]):

@@ -1,4 +1,4 @@
-"""The checklist for a robot: what a mission will ask of it, tried one by one on the robot itself."""
+"""The checklist for a robot: each requirement of a mission, tried on the robot itself."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -42,7 +42,7 @@ class Item(NamedTuple):
 
 
 def checklist(name: str) -> Iterator[Item]:
-    """Check a robot by name or path; stops at what makes the rest meaningless."""
+    """Check a robot by name or path; stops at a failure that makes the rest meaningless."""
     try:
         robot = make_robot(name)
         robot.spec()
@@ -104,7 +104,7 @@ def _limits(robot: Robot) -> Item:
 
 
 def _options(robot: Robot) -> Item:
-    """What of the file's options a team's world takes over, and what it cannot."""
+    """The file's options that a team's world takes over, and those that it cannot."""
     given, usual = robot.spec().option, mujoco.MjSpec().option
     kept = [
         f"{name} {_shown(name, getattr(given, name))}"
@@ -204,7 +204,7 @@ def _step_test(robot: Robot) -> Iterator[Item]:
 
 
 def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
-    """What may be behind a step that is not followed, from forces and velocities (T, N, 2)."""
+    """Possible causes of a step that is not followed, from forces and velocities (T, N, 2)."""
     if float((force * v).sum()) < 0.0:
         return ": it moves against its force; are axes exchanged or reversed in its drive or its reading?"
     share = float((np.abs(force) > 0.99 * scenario.force_limit).any(axis=-1).mean())

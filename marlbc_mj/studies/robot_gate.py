@@ -34,7 +34,7 @@ GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
-"""The benchmark's, with their lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
+"""Supervisors of the benchmark, with lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
 
 GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
@@ -42,7 +42,7 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
         position_error_gain=robot.gains[0], velocity_error_gain=robot.gains[1], identifier_rate=10.0 * robot.gains[1] / 16.0
     ),
 }
-"""With the robot's gains per unit mass."""
+"""Controllers with the robot's gains per unit mass."""
 
 STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
 CLIP = (0.10, 0.66)  # shares of the mission
@@ -246,8 +246,7 @@ def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str
         folder / f"{name}.mp4",
         VideoStyle(
             speed=float(max(1, round((end - start) / 10.0))),
-            width=960,
-            height=540,
+            size=(960, 540),
             camera="close",
             start=start,
             end=end,

@@ -38,7 +38,7 @@ from marlbc_mj.util.progress import Progress, note, silent
 
 
 class Conclusion(NamedTuple, Generic[ResultT]):
-    """What is left of a study that ran to its end."""
+    """Results and report of a study that ran to its end."""
 
     results: list[ResultT]
     """One per job, in the order of the jobs."""
@@ -46,7 +46,7 @@ class Conclusion(NamedTuple, Generic[ResultT]):
 
 
 class Means(NamedTuple):
-    """What runs the jobs; no result depends on it."""
+    """Engine and workers; no result depends on them."""
 
     workers: int = 1
     """Processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array."""
@@ -203,7 +203,7 @@ class _Count:
 
 
 def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Path, overwrite: bool) -> None:
-    """Say what of an unfinished run is used and what is not.
+    """Report which results of an unfinished run are used and which are not.
 
     Raises:
         ConfigurationError: nothing of it is of use here, and it may not be removed.

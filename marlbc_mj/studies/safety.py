@@ -1,11 +1,12 @@
-"""How safe and how good supervisors are where nobody tuned them: families of missions under both compositions, shield on and off.
+"""Safety and performance of supervisors on missions that they were not tuned for: families of missions under both compositions,
+shield on and off.
 
 Of every layout few numbers are kept, see :mod:`marlbc_mj.results.layouts`.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import groupby
+from itertools import chain, groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,8 +14,8 @@ import numpy as np
 
 from marlbc_mj.report.safety_tables import safety_tables, write_cells
 from marlbc_mj.report.table import to_markdown
-from marlbc_mj.results.layouts import CellScores, Marks, MissionCell, mark
-from marlbc_mj.results.seeds import SeedRun
+from marlbc_mj.results.layouts import CellScores, LayoutMark, Marks, MissionCell, mark
+from marlbc_mj.results.seeds import SeedRun, seed_range
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
 from marlbc_mj.studies.batches import evaluate_batch
@@ -43,21 +44,23 @@ ORDER_GIVERS = (
     "lookahead-distributed",
     "mpcms",
     "rollout",
+    "marlms",
+    "marlms-general",
 )
-"""Supervisors whose orders are composed, under either composition."""
+"""Supervisors whose orders are composed, under either composition; the last one refuses all but the set-based one."""
 VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 """Supervisors that give velocities, so that the composition does not matter."""
 SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
 OWN = "own"
-"""In the place of a composition: the supervisor's own velocities."""
-FIRST_SEED = 70_000
+"""Stands for a composition where a supervisor gives its own velocities."""
+FIRST_SEED = 80_000
 
 
 class SafetyJob(NamedTuple):
-    """A cell on some seeds."""
+    """The cells of one supervisor on some layouts of one mission, under one composition: they differ in the shield."""
 
-    cell: MissionCell
+    cells: tuple[MissionCell, ...]
     controller: str
     seeds: tuple[int, ...]
 
@@ -110,9 +113,10 @@ class SafetyStudy:
 
     def jobs(self) -> list[SafetyJob]:
         return [
-            SafetyJob(cell, self.controller, seeds[first : first + SEEDS_PER_JOB])
-            for cell in self.cells()
-            for seeds in [self._seeds(cell)]
+            SafetyJob(tuple(cells), self.controller, seeds[first : first + SEEDS_PER_JOB])
+            for _, group in groupby(self.cells(), lambda cell: cell._replace(shield=False))
+            for cells in [list(group)]
+            for seeds in [self._seeds(cells[0])]
             for first in range(0, len(seeds), SEEDS_PER_JOB)
         ]
 
@@ -121,36 +125,50 @@ class SafetyStudy:
         first = self.seed
         if cell.mission in DRAG_DRAWS:
             count, first = min(count, DRAWS_EACH), DRAG_DRAWS[cell.mission][1]
-        return tuple(range(first, first + count))
+        return seed_range(count, first)
 
-    def run(self, job: SafetyJob, watch: Watch) -> Marks:
-        scenario, cell = ground(job.cell.mission), job.cell
-        composition = None if cell.composition == OWN else cell.composition
-        label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", display_name(cell.supervisor)))
+    def run(self, job: SafetyJob, watch: Watch) -> tuple[Marks, ...]:
+        """Marks of every cell. A shield that changes nothing is as good as none, to the bit: such a layout is flown once."""
+        first = job.cells[0]
+        alone = fly_cell(first, job.controller, job.seeds[:1], silent)[0]
+        decision_ms = np.nan if alone.metrics is None else float(alone.metrics["team"]["decision_ms_median"])
+        untouched: dict[int, LayoutMark] = {}
+        marks: dict[MissionCell, Marks] = {}
+        for cell in sorted(job.cells, key=lambda cell: not cell.shield):
+            rest = [seed for seed in job.seeds if seed not in untouched]
+            runs = fly_cell(cell, job.controller, rest, watch.progress)
+            flown = {run.seed: mark(run, ground(cell.mission)) for run in runs}
+            marks[cell] = Marks(cell, tuple((flown | untouched)[seed] for seed in job.seeds), decision_ms)
+            untouched = {seed: one for seed, one in flown.items() if not (one.intervened or one.failure)}
+        return tuple(marks[cell] for cell in job.cells)
 
-        def fly(seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
-            return evaluate_batch(
-                scenario,
-                seeds,
-                cell.supervisor,
-                job.controller,
-                composition=composition,
-                shield=cell.shield,
-                progress=lambda _, done, of: progress(label, done, of),
-            )
-
-        (alone,), runs = fly(job.seeds[:1], silent), fly(job.seeds, watch.progress)
-        decision_ms = np.nan if alone.metrics is None else alone.metrics["team"]["decision_ms_median"]
-        return Marks(cell, tuple(mark(run, scenario) for run in runs), float(decision_ms))
-
-    def report(self, results: Sequence[Marks], out: Path | None, progress: Progress = silent) -> Report:
-        rows = [CellScores.of(cell, list(parts)) for cell, parts in groupby(results, lambda marks: marks.cell)]
+    def report(self, results: Sequence[tuple[Marks, ...]], out: Path | None, progress: Progress = silent) -> Report:
+        parts: dict[MissionCell, list[Marks]] = {}
+        for marks in chain.from_iterable(results):
+            parts.setdefault(marks.cell, []).append(marks)
+        rows = [CellScores.of(cell, each) for cell, each in parts.items()]
         text = "\n".join(map(to_markdown, safety_tables(rows)))
         if out is not None:
             write_json(out / "config.json", {**provenance(), "study": self})
             write_cells(rows, out / "safety.csv")
             (out / "safety.md").write_text(text, encoding="utf-8")
         return Report(text, rows)
+
+
+def fly_cell(cell: MissionCell, controller: str, seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
+    """Some layouts of a cell; none where there are no seeds."""
+    if not seeds:
+        return ()
+    label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", display_name(cell.supervisor)))
+    return evaluate_batch(
+        ground(cell.mission),
+        seeds,
+        cell.supervisor,
+        controller,
+        composition=None if cell.composition == OWN else cell.composition,
+        shield=cell.shield,
+        progress=lambda _, done, of: progress(label, done, of),
+    )
 
 
 def ground(name: str) -> Scenario:

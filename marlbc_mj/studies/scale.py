@@ -1,4 +1,4 @@
-"""What teams of any size cost: time per agent and mission step, and memory of a world, from 4 to 256 agents.
+"""Cost of teams from 4 to 256 agents: time per agent and mission step, and memory of a world.
 
 Every size runs the same mission: a grid formation among discs, as many per agent at every size, each agent under OA>AA>FM, so
 that every mission step asks for the nearest obstacle and the nearest neighbor of everybody. Sizes take turns within one process,
@@ -194,7 +194,7 @@ def resident() -> int:
 
 
 def scale_table(figures: dict[str, Any]) -> Table:
-    """One row a size."""
+    """One row per size."""
     columns = (
         Column("", "agents"),
         Column("mission step", "µs per agent"),

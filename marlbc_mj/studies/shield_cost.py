@@ -1,7 +1,8 @@
-"""What shield and set-based composition cost in time: ratios of a mission step at 4, 16 and 64 agents, in turns in one process.
+"""Time cost of shield and set-based composition: ratios of a mission step at 4, 16 and 64 agents, in turns in one process.
 
 ``python -m marlbc_mj.studies.shield_cost [ROUNDS]``. Every agent flies OA>AA>FM in a grid formation among as many discs. *Far*
-has no obstacle and a formation so wide that nothing is ever within reach: what the shield's early exit costs.
+has no obstacle and a formation so wide that nothing is ever within reach: what the shield's early exit costs. Times are those of
+the processor, on one thread, so that other programs change them little.
 """
 
 import sys
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from statistics import median
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -75,7 +77,7 @@ def measure_costs(rounds: int, sizes: tuple[int, ...] = COST_SIZES) -> dict[int,
         far = {name: CostTeam(far_mission(agents), COST_VARIANTS[name][1]) for name in ("plain", "shield")}
         teams = {**near, **{f"far, {name}": team for name, team in far.items()}}
         actions: dict[Any, Callable[[], None]] = {name: partial(team.advance) for name, team in teams.items()}
-        taken = interleaved(actions, rounds)
+        taken = interleaved(actions, rounds, process_time)
         ratios = {name: ratio(taken[name], taken["plain"]) for name in COST_VARIANTS}
         ratios["far, shield"] = ratio(taken["far, shield"], taken["far, plain"])
         team = near["plain"]

@@ -1,4 +1,4 @@
-"""Does a shield ever fail in a mission? Many missions of every family and size, under supervisors that mean harm.
+"""Does a shield ever fail in a mission? Many missions of every family and size, under hostile supervisors.
 
 ``python -m marlbc_mj.studies.shield_missions [--missions N] [--seconds S] [--agents 2,4,8] [--families field,forest] [--seed K]``
 draws layouts that no training seed draws. In every other mission all agents are sent against an obstacle or another agent at
@@ -32,7 +32,7 @@ CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
 
 @dataclass
 class ShieldedMission:
-    """What happened in the missions of one family and size."""
+    """Outcomes of the missions of one family and size."""
 
     missions: int = 0
     violations: int = 0  # missions
@@ -70,19 +70,19 @@ def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Shiel
     scenario, shape = world.scenario, (world.worlds, world.scenario.agents)
     things = len(scenario.obstacles) + scenario.agents
     violated, touched = np.zeros((2, world.worlds), dtype=bool)
-    orders = np.zeros(shape, dtype=np.int64)
-    for step in range(scenario.mission_steps):
-        if step % CHANGE == 0:
-            orders, targets = rng.integers(0, len(scenario.orders), shape), rng.integers(0, things, shape)
-        velocity = hostile_velocities(world, targets) if attack else None
-        if attack:
-            world.state.reference[:] = world.state.position  # no memory of where it could not go
-        record = world.step(orders, velocity).record
-        assert record is not None
-        at = np.concatenate([record.position[:, 1:], world.state.position[:, None]], axis=1)
-        for b in range(world.worlds):
-            violated[b] |= bool(violates(_clearances(world, b, step, at[b]), scenario.safe_distance).any())
-        touched |= (spacing(at) <= 2.0 * world.plan.robot.radius).any(axis=(1, 2))
+    for first in range(0, scenario.mission_steps, CHANGE):
+        orders, targets = rng.integers(0, len(scenario.orders), shape), rng.integers(0, things, shape)
+        at = []  # (B, substeps, N, 2) of every mission step
+        for _ in range(min(CHANGE, scenario.mission_steps - first)):
+            velocity = hostile_velocities(world, targets) if attack else None
+            if attack:
+                world.state.reference[:] = world.state.position  # no memory of where it could not go
+            record = world.step(orders, velocity).record
+            assert record is not None
+            at += [record.position[:, 1:], world.state.position[:, None].copy()]
+        flown = np.concatenate(at, axis=1)
+        violated |= _violations(world, first, flown)
+        touched |= (spacing(flown) <= 2.0 * world.plan.robot.radius).any(axis=(1, 2))
     cell.missions += world.worlds
     cell.violations += int(violated.sum())
     cell.touches += int((touched & ~violated).sum())
@@ -92,12 +92,18 @@ def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Shiel
         cell.breaches += world.state.breaches.sum(axis=(0, 1))
 
 
-def _clearances(world: World, b: int, step: int, at: np.ndarray) -> np.ndarray:
-    """(substeps, N) clearances [m] of agents that are ``at`` (substeps, N, 2) after every substep of a mission step."""
-    if not world.scenario.moving:
-        return clearances(at, world.state.obstacles[b])
-    times = step * world.scenario.mission_step + (1 + np.arange(len(at))) * world.scenario.substep
-    return clearances_among(at, moved(times, world.state.anchors[b], world.state.motions[b]))
+def _violations(world: World, first: int, at: np.ndarray) -> np.ndarray:
+    """(B,) whether anyone was too near to an obstacle ``at`` (B, T, N, 2), after each substep from mission step ``first`` on."""
+    scenario, state = world.scenario, world.state
+    times = first * scenario.mission_step + (1 + np.arange(at.shape[1])) * scenario.substep
+    found = np.zeros(len(at), dtype=bool)
+    for b, places in enumerate(at):
+        if scenario.moving:
+            clear = clearances_among(places, moved(times, state.anchors[b], state.motions[b]))
+        else:
+            clear = clearances(places, state.obstacles[b])
+        found[b] = violates(clear, scenario.safe_distance).any()
+    return found
 
 
 def mission_of(family: str, agents: int, seconds: float) -> Scenario:
@@ -111,7 +117,7 @@ def mission_of(family: str, agents: int, seconds: float) -> Scenario:
 
 def report_missions(arguments: Sequence[str] | None = None) -> None:
     """Print a row per family and size, and what all together say."""
-    parser = argparse.ArgumentParser(description="Missions with a shield, under supervisors that mean harm.")
+    parser = argparse.ArgumentParser(description="Missions with a shield, under hostile supervisors.")
     parser.add_argument("--missions", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=1e9)
     parser.add_argument("--agents", default="2,4,8,16,32,64")

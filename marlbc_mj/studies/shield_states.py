@@ -1,4 +1,4 @@
-"""Does any force lead out of the shield's safe set? Random states on its edge, hostile wishes, and f where it hurts most.
+"""Does any force lead out of the shield's safe set? Random states on its edge, hostile forces, and f in the worst direction.
 
 ``python -m marlbc_mj.studies.shield_states [STATES]`` tries 10^7 states by default, and two shields that are wrong on purpose.
 """

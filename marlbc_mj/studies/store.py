@@ -22,7 +22,7 @@ from typing import Any
 from marlbc_mj.studies import codec
 from marlbc_mj.studies.packs import PackWriter, entries, next_pack, packs
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import JOBS_FOLDER, check_folder, duplicate, remove_orphans, write_json, writing
+from marlbc_mj.util.files import JOBS_FOLDER, busy, check_folder, duplicate, remove_orphans, write_json, writing
 from marlbc_mj.util.locks import held_alone
 
 STORE_SCHEMA = 1
@@ -72,7 +72,7 @@ class RunStore:
             self._writer = None
 
     def begin(self, about: Mapping[str, Any]) -> None:
-        """Write what this run is, and remove what killed workers left."""
+        """Write the description of this run, and remove files of killed workers."""
         with writing(self.folder):
             self.files.mkdir(exist_ok=True)
             for path in self.files.glob(f"{_BEGUN}*"):
@@ -80,7 +80,7 @@ class RunStore:
         write_json(self.folder / _RUN, {"schema": STORE_SCHEMA, **about})
 
     def about(self) -> dict[str, Any]:
-        """What the last run here was; empty where none has begun.
+        """Description of the last run in this folder; empty where none has begun.
 
         Raises:
             ConfigurationError: the folder was written by something else, or by another version.
@@ -140,7 +140,7 @@ def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
     folder, made = out / JOBS_FOLDER, not out.exists()
     with writing(out):
         folder.mkdir(parents=True, exist_ok=True)
-    with held_alone(folder / _LOCK, f"{out} is being written by another process; wait for it or choose another folder"):
+    with held_alone(folder / _LOCK, busy(out)):
         store = RunStore(folder)
         try:
             yield store

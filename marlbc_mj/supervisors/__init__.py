@@ -33,16 +33,16 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
         lambda: FSAMS(hysteresis=0.3, dwell=0.5),
         "the same with 0.3 m hysteresis and 0.5 s dwell: the fair baseline",
     ),
-    "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known that never violates"),
+    "oracle": (Oracle, "switch times found by search on the simulator, cached: the best known schedule without violations"),
     "oracle-schedule": (
         partial(Oracle, unperturbed=True),
-        "the oracle's switch times, played on any draw around the scenario: what foresight for one is worth elsewhere",
+        "the oracle's switch times, found for the nominal mission and played on any draw around it",
     ),
     "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
     "mpcms": (MPCMS, "model predictive: the cheapest order sequence over a 2 s horizon of the kinematic reference"),
     "mpcms-mujoco": (
         lambda: MPCMS(prediction="mujoco", horizon=120),
-        "the same over 6 s of simulated candidates, which sees the agents lag; minutes an episode",
+        "the same over 6 s of simulated candidates, which includes the agents' lag; takes minutes per episode",
     ),
     "marlms": (
         lambda: Learned.load(shipped("marlms")),
@@ -50,7 +50,7 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
     ),
     "rlms": (
         lambda: Learned.load(shipped("rlms")),
-        "RLMS: the shipped checkpoint of single-agent Q-networks side by side, formation with or without avoidance",
+        "RLMS: the shipped checkpoint of Q-networks that learn alone, formation with or without avoidance",
     ),
     "marlms-general": (
         lambda: General.load(shipped("marlms-general")),
@@ -59,7 +59,7 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
     "layered": (Layered, "subsumption (Brooks): the highest active of OA, FR and FM alone, nothing composed"),
     "motor-schema": (MotorSchema, "weighted sum of all behaviors' bounded velocities (Arkin), obstacles felt within 4 m"),
     "fuzzy-blend": (FuzzyBlend, "mean of the behaviors' velocities weighted by the fuzzy sets of fms (Vadakkepat)"),
-    "fixed": (FixedPriority, "one priority order for ever, FM (classic null-space control, Antonelli & Chiaverini)"),
+    "fixed": (FixedPriority, "one constant priority order, FM (classic null-space control, Antonelli & Chiaverini)"),
     "set-based-rule": (SetBasedRule, "avoidance on top only while the formation would break the safe distance; per agent"),
     "lookahead": (LookAhead, "the same, and the column while two lanes of the formation are blocked within 8 s"),
     "lookahead-distributed": (DistributedLookAhead, "the same without a center: agents tell each other which lanes are blocked"),

@@ -1,4 +1,6 @@
-"""What a mission supervisor is: observations of B teams in, orders out, with velocities or without, at every mission step."""
+"""The interface of mission supervisors: observations of B teams in, orders out, with or without velocities, at every mission
+step.
+"""
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 

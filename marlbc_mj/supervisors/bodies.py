@@ -1,7 +1,7 @@
-"""What ORCA and the barrier function share: the velocity that an agent wishes for, and which bodies it has to keep away from.
+"""The common part of ORCA and CBF-QP: an agent's desired velocity, and the bodies that it has to avoid.
 
 Both move the reference itself (a :class:`~marlbc_mj.supervisors.base.Blend`), so both see bodies from where behaviors are
-evaluated: p_r in ``virtual`` mode. The wish is the velocity v_c of one formation behavior, FM by default, of bounded length.
+evaluated: p_r in ``virtual`` mode. The desired velocity is v_c of one formation behavior, FM by default, of bounded length.
 """
 
 from typing import NamedTuple
@@ -19,7 +19,7 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
 class Bodies(NamedTuple):
-    """What there is to keep away from in a scenario, and how far."""
+    """Bodies of a scenario that agents avoid, and the distances that they keep."""
 
     agents: float  # wanted between the middles of two agents [m]
     obstacles: float  # wanted clearance [m]
@@ -93,7 +93,7 @@ def give(velocity: np.ndarray, memory: Cruise) -> tuple[Blend, Cruise]:
 
 
 def wish_of(observation: Observation, memory: Cruise) -> Wish:
-    """Where all agents are, how they move and how they would like to."""
+    """Positions, velocities and desired velocities of all agents."""
     velocity = observation.velocity if memory.velocity is None else memory.velocity
     wanted = behavior_velocities(observation, memory.motion)[0]
     length = np.linalg.norm(wanted, axis=-1, keepdims=True)

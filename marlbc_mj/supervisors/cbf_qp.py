@@ -14,8 +14,8 @@ the least greatest violation where they exclude each other.
 
 What this means here: a supervisor gives reference *velocities*, not forces. The acceleration is integrated over the mission step,
 v_r = v + dt a, and v is the reference velocity that was given last, so the double integrator that is kept safe is the reference,
-a virtual agent, with the law held for dt. The measured agent is safe as far as it tracks: the margin is what it may lag. The
-controller below is whatever runs. As with ORCA nobody switches, and a closed way is waited at.
+a virtual agent, with the law held for dt. The measured agent is safe as far as it tracks: the margin is for its lag. Any
+controller may run below. As with ORCA there are no switches, and agents wait where the way is closed.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The communication layer: what every agent of B teams has heard of every other, one mission step after the other.
+"""The communication layer: the messages that every agent of B teams has heard from every other, step by step.
 
 A supervisor that decides agent by agent says at every mission step what each agent has to say, a short *message* of M numbers.
 The layer of the scenario (:class:`~marlbc_mj.core.communication.Communication`) carries it, by one of two protocols:
@@ -13,7 +13,7 @@ The layer of the scenario (:class:`~marlbc_mj.core.communication.Communication`)
   estimate, whoever j is: means and sums can be read from it, least and greatest entries cannot.
 
 While a team is in parts, each part has what its members say and what was heard of the others before; the time stamps tell how old
-that is. What to make of it is the supervisor's business.
+that is. The supervisor decides how to use it.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ _NOT_YET = -1
 
 
 class Knowledge(NamedTuple):
-    """What agents know of each other."""
+    """Messages and stamps that agents have of each other."""
 
     heard: np.ndarray  # (B, N, N, M) row i: what agent i last heard of each agent, itself included; zeros where never
     stamp: np.ndarray  # (B, N, N) when the author sent that [s]; NEVER_HEARD
@@ -100,7 +100,7 @@ def make_layer(scenario: Scenario) -> Layer:
 
 @dataclass(frozen=True)
 class Radio:
-    """What both protocols share: who can hear whom, and whose messages are lost."""
+    """The common part of both protocols: links and losses."""
 
     communication: Communication
     agents: int

@@ -1,4 +1,4 @@
-"""Classic null-space-based control (Antonelli & Chiaverini 2006): one priority order for the whole mission, nobody decides."""
+"""Classic null-space-based control (Antonelli & Chiaverini 2006): one priority order for the whole mission."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from marlbc_mj.scenarios import Scenario
 
 @dataclass(frozen=True)
 class FixedPriority:
-    """The same ``order`` for every agent, for ever.
+    """The same constant ``order`` for every agent.
 
     FM alone ignores obstacles under (12). OA>FM forbids every motion along the line to the nearest obstacle, however far that one
-    is (erratum 6): the team stops. Both are why somebody has to decide.
+    is (erratum 6): the team stops. Both show why decisions are needed.
     """
 
     order: str = "FM"  # a priority order, or the command it gives

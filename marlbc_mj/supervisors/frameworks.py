@@ -5,7 +5,7 @@ else at the measured p), by each agent's measured clearance d; every agent decid
 velocity is the order of the behavior that weighs most: OA>FM for OA, FR, FM. So a switch is a change of the dominant behavior;
 the velocity may change, even jump, without one, and no label says that its composition (12) is what moves the agent.
 
-Their sources describe other robots and other behaviors. What is read into them here is said at each class.
+Their sources describe other robots and other behaviors. Each class says how its source is read here.
 """
 
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ _LABELS = {"OA": "OA>FM", "AA": "AA>FM"}
 
 
 class Repertoire(NamedTuple):
-    """What a framework blends, fixed for an episode; M behaviors: FM, FR, OA and perhaps AA."""
+    """The behaviors that a framework blends, fixed for an episode; M behaviors: FM, FR, OA and perhaps AA."""
 
     alone: Behaviors  # of the scenario; order j is behavior j alone
     orders: np.ndarray  # (M,) the order that labels each behavior

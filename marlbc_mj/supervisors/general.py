@@ -1,8 +1,8 @@
 """``marlms-general``: one learned policy for every agent of every team, distributed (project).
 
 Every agent senses its own lanes, sends what it sensed and decides by itself between formation and column, from what it sensed
-and what it heard of the others; see :mod:`marlbc_mj.policies.general`. Avoidance is the composition's business: only the
-set-based one will do.
+and what it heard of the others; see :mod:`marlbc_mj.policies.general`. Avoidance is left to the composition, which must be the
+set-based one.
 
 The communication layer of the scenario carries what is sent, at every mission step. With ideal communication everybody hears
 everybody at once, and nothing is exchanged between decisions. An agent that is cut off goes on by what it senses and by what it

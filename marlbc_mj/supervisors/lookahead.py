@@ -2,7 +2,7 @@
 
 A *lane* is the way of a slot along the path. It is blocked while the slot, moved along the path from ``behind`` ago until
 ``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the
-column while at least ``blocked`` lanes of the formation are blocked: one agent can go around, several cannot at once.
+column while at least ``blocked`` lanes of the formation are blocked: one agent can go around an obstacle, several at once cannot.
 
 That says nothing of the column, nor of the way back from it: beside the walls of a passage, and behind its end, lanes are free
 while agents are still between the walls. Under the set-based composition these wait there. Under (12) they cross, and violate

@@ -63,7 +63,7 @@ class Candidates(NamedTuple):
 
 
 class Forecast(NamedTuple):
-    """What MPCMS keeps of B teams between mission steps."""
+    """State of MPCMS for B teams between mission steps."""
 
     scenario: Scenario
     behaviors: Behaviors  # of the scenario

@@ -18,7 +18,7 @@ REACH = 1.5
 
 
 class GiveWay(NamedTuple):
-    """What it takes to give way in one scenario."""
+    """Orders and distances for giving way in one scenario."""
 
     distance: float  # d_AA [m]; 0 without AA
     lifted: np.ndarray  # (orders,) index of the same order with AA on top

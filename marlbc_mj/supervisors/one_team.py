@@ -1,4 +1,4 @@
-"""Supervisors that decide for one team, made to decide for B: one memory per team, one call per team."""
+"""Supervisors of one team, wrapped to decide for B teams: one memory per team, one call per team."""
 
 import inspect
 from dataclasses import dataclass

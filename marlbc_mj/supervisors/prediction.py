@@ -1,4 +1,4 @@
-"""What candidate order sequences lead to: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
+"""Predictions of candidate order sequences: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
 
 A *pair* is a team and one of its candidates; C counts the pairs of all B teams. Both predictions fill the same *trails*
 (C, H, N, 2): the position of every agent at the end of every predicted mission step, for each pair. One cost judges them. Pairs
@@ -33,7 +33,7 @@ class CostWeights(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What a prediction asks of the mission; flat, for compiled code."""
+    """The mission's numbers for a prediction; flat, for compiled code."""
 
     mission_step: float  # [s]
     formations: np.ndarray  # (2, N, 2) slots of FM, then of FR [m]
@@ -62,7 +62,7 @@ class Pairs(NamedTuple):
 
 
 class Scratch(NamedTuple):
-    """What a pair needs room for."""
+    """Scratch arrays of a pair."""
 
     rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.plan.workspace_rows
     velocity: np.ndarray  # (C, 2, N, 2) v_r now and before

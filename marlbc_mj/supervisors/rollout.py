@@ -70,7 +70,7 @@ class One(NamedTuple):
 
 
 class Tracks(NamedTuple):
-    """What is predicted before every step k = 0 to H, along the last plan of each level; (3, H + 1, N, 2) each."""
+    """Predictions before every step k = 0 to H, along the last plan of each level; (3, H + 1, N, 2) each."""
 
     reference: np.ndarray  # p_r [m]
     position: np.ndarray  # p [m]
@@ -90,7 +90,7 @@ class Room(NamedTuple):
 
 
 class Search(NamedTuple):
-    """What stays the same over an episode."""
+    """Data that stay the same over an episode."""
 
     rule: LocalRule
     plans: Plans

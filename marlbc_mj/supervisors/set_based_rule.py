@@ -1,4 +1,4 @@
-"""The set-based rule: avoidance goes on top only while the formation's wish would break the safe distance (project).
+"""The set-based rule: avoidance goes on top only while the formation's velocity would break the safe distance (project).
 
 It is the idea of set-based tasks (Moe et al. 2016), an inequality that is active only where it is about to be broken, said in
 priority orders and so under the published composition (12). Each agent decides for itself, at its own reference p_r, without any
@@ -33,7 +33,7 @@ IN_FORMATION, IN_COLUMN = 0, 1
 
 
 class LocalRule(NamedTuple):
-    """What the rule needs of a scenario, fixed for an episode."""
+    """The scenario's data for the rule, fixed for an episode."""
 
     behaviors: Behaviors
     free: np.ndarray  # (2,) order of each motion without avoidance

@@ -1,1 +1,1 @@
-"""Errors, files, provenance and colors: what every other package may use, and what knows none of them."""
+"""Errors, files, provenance and colors: the helpers that every other package may use."""

@@ -29,6 +29,7 @@ def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "")
     Raises:
         ConfigurationError: no such field, or a value of the wrong kind.
     """
+    changes: dict[str, Any] = {}
     for setting in settings:
         name, equals, text = setting.partition("=")
         if not equals:
@@ -38,8 +39,7 @@ def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "")
         if outer not in hints or (dot and not is_dataclass(hints[outer])):
             raise unknown("setting", prefix + (outer if outer not in hints else name), (prefix + hint for hint in hints))
         if dot:
-            value = with_settings(getattr(config, outer), (f"{inner}={text}",), f"{outer}.")
+            changes[outer] = with_settings(changes.get(outer, getattr(config, outer)), (f"{inner}={text}",), f"{outer}.")
         else:
-            value = convert(_TEXTS, text, hints[outer], f"setting {prefix}{outer}")
-        config = replace(config, **{outer: value})
-    return config
+            changes[outer] = convert(_TEXTS, text, hints[outer], f"setting {prefix}{outer}")
+    return replace(config, **changes)

@@ -1,6 +1,7 @@
-"""The two ways in which this package refuses to go on; every message names the value and the valid ones."""
+"""The errors that this package raises on purpose; every message names the value and the valid ones."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 from marlbc_mj.util.text import nearest_word
 
@@ -22,7 +23,7 @@ class SimulationError(MarlbcError, RuntimeError):
 
 
 class NoSpaceError(ConfigurationError):
-    """An output that the disk has no room for: the command was right, what it was to leave is missing. Exit status 3."""
+    """An output that the disk has no room for; the command itself was right. Exit status 3."""
 
     exit_status = 3
 
@@ -33,3 +34,18 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError
     like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"
     return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")
+
+
+@contextmanager
+def enough_memory(what: str) -> Iterator[None]:
+    """Turn a lack of memory inside the block, Python's, NumPy's or torch's, into one line about ``what``.
+
+    Raises:
+        ConfigurationError: memory was asked for that is not there.
+    """
+    try:
+        yield
+    except (MemoryError, RuntimeError) as error:
+        if isinstance(error, MarlbcError) or not (isinstance(error, MemoryError) or "allocate memory" in str(error)):
+            raise
+        raise ConfigurationError(f"{what} need more memory than there is") from error

@@ -1,4 +1,4 @@
-"""Output folders and files, which appear whole or not at all, and never in the place of what somebody else wrote."""
+"""Output folders and files, which appear whole or not at all, and never replace files of others."""
 
 import errno
 import json
@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError, NoSpaceError
-from marlbc_mj.util.locks import held, is_held
+from marlbc_mj.util.locks import held, held_alone, is_held
 from marlbc_mj.util.provenance import plain_data
 
 PARTIAL = ".partial-"
@@ -64,8 +64,36 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
             raise ConfigurationError(f"output folder {out} is not empty; choose another or add --overwrite")
 
 
+@contextmanager
+def alone_in(out: Path, *, overwrite: bool) -> Iterator[None]:
+    """Write into ``out``, which is made, as the only process of this program that does.
+
+    What was made is removed, with its parents, if no file is left there.
+
+    Raises:
+        ConfigurationError: another process is at it; ``out`` holds something (and ``overwrite`` is off), or cannot be written.
+    """
+    check_folder(out, overwrite=overwrite)
+    made = [folder for folder in (out, *out.parents) if not folder.exists()]
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+    with held_alone(out, busy(out)):
+        check_folder(out, overwrite=overwrite)  # a process that has ended meanwhile may have filled it
+        try:
+            yield
+        finally:
+            for folder in made:
+                with suppress(OSError):  # there is something in it
+                    folder.rmdir()
+
+
+def busy(out: Path) -> str:
+    """What is said where another process writes into ``out``."""
+    return f"{out} is being written by another process; wait for it or choose another folder"
+
+
 def _counts_not(name: str) -> bool:
-    """Whether what has this name in an output folder is something unfinished of this program's."""
+    """Whether a name in an output folder belongs to an unfinished output of this program."""
     return PARTIAL in name or name == JOBS_FOLDER
 
 

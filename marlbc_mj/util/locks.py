@@ -53,7 +53,7 @@ def is_held(path: Path) -> bool:
 
 @contextmanager
 def held_alone(path: Path, otherwise: str) -> Iterator[None]:
-    """Hold the lock of a file, which is made, during the block; nothing where the system has none.
+    """Hold the lock of a folder, or of a file, which is made, during the block; nothing where the system has none.
 
     Raises:
         ConfigurationError: ``otherwise``; another process holds it, or has removed the file meanwhile.
@@ -62,7 +62,7 @@ def held_alone(path: Path, otherwise: str) -> Iterator[None]:
         yield
         return
     try:
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        descriptor = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR | os.O_CREAT, 0o666)
     except FileNotFoundError:
         raise ConfigurationError(otherwise) from None
     try:

@@ -7,7 +7,7 @@ _PAPER = "Zhang et al. 2024"
 
 
 class Source(NamedTuple):
-    """How a method is called in print, and who is to be cited for it."""
+    """Display name of a method, and its citation."""
 
     display: str
     citation: str = ""  # empty: a user's own
@@ -46,7 +46,7 @@ NAMES = {
     "terminal-sliding": Source("Terminal sliding mode", "Feng et al. 2002"),
     "predefined-time": Source("Predefined-time", "Sánchez-Torres et al. 2018"),
 }
-"""By the name of the command line."""
+"""Sources by command-line name."""
 LIMITED_SUFFIX = "-limited"
 
 
@@ -59,7 +59,7 @@ def short_name(name: str) -> str:
 
 
 def source_of(name: str) -> Source:
-    """Of a supervisor or controller; one that is not listed has its short name."""
+    """The source of a supervisor or controller; one that is not listed has its short name."""
     if name in NAMES:
         return NAMES[name]
     if name.endswith(LIMITED_SUFFIX) and name.removesuffix(LIMITED_SUFFIX) in NAMES:
@@ -69,16 +69,16 @@ def source_of(name: str) -> Source:
 
 
 def display_name(name: str) -> str:
-    """Of a supervisor or controller, for people."""
+    """Display name of a supervisor or controller."""
     return source_of(name).display
 
 
 def display_key(key: str) -> str:
-    """Of a method by its key, ``mpcms+sorlc``, for people; any other text as it is."""
+    """Display name of a method by its key, ``mpcms+sorlc``; any other text as it is."""
     supervisor, plus, controller = key.partition("+")
     return display_method(supervisor, controller) if plus and " " not in key else key
 
 
 def display_method(supervisor: str, controller: str) -> str:
-    """Of a supervisor together with a controller, for people: ``MPCMS + SORLC``."""
+    """Display name of a supervisor with a controller: ``MPCMS + SORLC``."""
     return f"{display_name(supervisor)} + {display_name(controller)}"

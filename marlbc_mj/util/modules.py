@@ -1,4 +1,6 @@
-"""A user's Python file as a module: the same one in every process, whatever the current folder is, and anew after an edit."""
+"""A user's Python file as a module: the same one in every process, whatever the current folder is, and run again after an
+edit.
+"""
 
 import importlib.util
 import os
@@ -140,7 +142,7 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
 
 
 def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:
-    """What a user's code returns.
+    """The return value of a user's code.
 
     Args:
         call: the user's code.

@@ -1,10 +1,16 @@
-"""Colors of agents and behaviors: the same in the model, the figures, the video and the page (color-blind safe)."""
+"""Colors of agents, behaviors and methods: the same in the model, the figures, the video and the page (color-blind safe)."""
 
-AGENT_COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7A5195", "#4D4D4D")
+AGENT_COLORS = ("#12645F", "#D05FA0", "#86B84F", "#A5714B", "#E8A9CB", "#5B3A1E", "#8FCFC0", "#4D4D4D")
+"""Colors of agents; none is near a behavior's, since a video shows both on one agent."""
 BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000", "AA": "#7A3E9D"}
 LINK_COLOR = "#1B1F26"
 SAFE_DISTANCE_COLOR = "#B4505E"
 SHIELD_COLOR = "#12B5CB"
+METHOD_COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#7A5195"),
+    *("#8C564B", "#17BECF", "#B5BD00", "#000000", "#A0A0A0", "#1B9E77", "#9467BD"),
+)
+"""Colors of supervisors in figures that compare them."""
 _OTHER_BEHAVIORS = ("#6A3D9A", "#33A02C", "#8C564B", "#17BECF")
 
 

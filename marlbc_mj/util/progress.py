@@ -1,15 +1,15 @@
-"""How work that takes long tells how far it is: one shape for bars, lines and tests."""
+"""Progress of long work: one callback type for bars, lines and tests."""
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Progress = Callable[[str, float, float], None]
-"""Called with what is being done, how much of it is done and how much there is."""
+"""Called with the stage, the amount done and the total."""
 
 
 def silent(what: str, done: float, total: float) -> None:
-    """The progress that nobody watches."""
+    """A progress callback that does nothing."""
 
 
 def note(line: str) -> None:

@@ -64,7 +64,7 @@ def cpu() -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """What the config.json of every run and every log say beside their configuration."""
+    """Facts that every config.json and every log hold beside their configuration."""
     return {"versions": versions(), "git_revision": git_revision(), "cpu": cpu(), "platform": platform.platform()}
 
 

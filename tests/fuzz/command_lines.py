@@ -37,12 +37,13 @@ SHORT: tuple[tuple[str, ...], ...] = (
     ("bench", "paper", "--supervisors", "fsams", "--seeds", "1", "--controllers", "pd", "--no-figures", *QUICK, "--out", "out"),
     ("evaluate", "field", "--supervisors", "fsams", "--seeds", "1", "--controller", "pd", *QUICK, "--out", "out"),
     ("train", "marlms", "--budget", "20", "--set", *TINY),
+    ("train", "marlms-general", "--budget", "0"),
     ("train", "--resume", "run"),
     ("study", "--from", "."),
     ("study", "lenient", "--seeds", "0"),
     ("ship", "run", "mine"),
     ("export", "p.safetensors", "p.onnx"),
-    ("video", "torn.mcap", "--width", "64", "--height", "64"),
+    ("video", "torn.mcap", "--size", "64x64"),
     ("view", "torn.mcap"),
     ("log", "info", "a.mcap"),
     ("log", "recover", "torn.mcap", "b.mcap"),
@@ -52,6 +53,10 @@ SHORT: tuple[tuple[str, ...], ...] = (
     ("perf", "--rounds", "0"),
     ("perf", "--out", "cell.toml"),
     ("scale", "--rounds", "0"),
+    ("suite", "--layouts", "0"),
+    ("suite", "--page", "--from", "run"),
+    ("safety", "field", "--layouts", "0"),
+    ("communication", "gates", "--supervisor", "nothing"),
     ("ablation", "--study", "nothing"),
     ("calibrate", "--controllers", "nothing"),
     ("oracle", "--budget", "0"),
@@ -59,11 +64,17 @@ SHORT: tuple[tuple[str, ...], ...] = (
     (),
 )
 """Commands that take moments."""
-LONG = ("duration", "seeds", "budget", "rounds", "workers", "threads", "agents", "width", "height", "fps", "substep", "samples")
+LONG = (
+    *("duration", "seeds", "layouts", "searched", "budget", "rounds", "workers", "threads", "agents", "width", "height", "fps"),
+    *("substep", "samples"),
+)
 """Options with which a command may rightly take minutes."""
 REFUSED = ("0", "-1", "nan", "inf", "1e300", "9223372036854775808", "1" + "0" * 30, "x", "", "0.3", "1e-320")
 """Values that no such option may take, or that cost nothing."""
-SPARED = ("perf", "scale", "ablation", "calibrate", "oracle", "gate", "view", "study")
+SPARED = (
+    *("perf", "scale", "ablation", "calibrate", "oracle", "gate", "view", "study"),
+    *("suite", "safety", "communication", "marlms-general"),
+)
 """Commands that take minutes once nothing is wrong with them: only parts are taken away or made wrong."""
 PATHS = (
     *(

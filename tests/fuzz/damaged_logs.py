@@ -17,7 +17,7 @@ def make(rng: Random, bases: Bases) -> Case:
 
 def reading(rng: Random) -> list[str]:
     """A command that reads ``a.mcap``."""
-    tiny = ["--width", "64", "--height", "64", "--fps", "1", "--speed", "100", "--samples", "0", "--out", "a.mp4"]
+    tiny = ["--size", "64x64", "--fps", "1", "--speed", "100", "--samples", "0", "--out", "a.mp4"]
     match rng.randrange(20):
         case 0:
             return ["video", "a.mcap", *tiny, "--camera", rng.choice(("top", "track", "close", "x"))]

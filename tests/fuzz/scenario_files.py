@@ -60,7 +60,7 @@ def text(rng: Random) -> str:
     if rng.random() < 0.1:
         del lines[rng.choice(list(lines))]
     written = [f"{name} = {entry}" for name, entry in lines.items()]
-    if rng.random() < 0.05:
+    if rng.random() < 0.05 and written:
         written.append(rng.choice(written))
     return "\n".join([*written, *tables(rng), ""])
 

@@ -1,4 +1,4 @@
-"""What a training run of the general policy is: one frozen dataclass, and what learner and exploration take of it."""
+"""Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -110,6 +110,8 @@ class GeneralConfig:
 
     evaluate_every: Annotated[int, AT_LEAST_ONE] = 400_000
     """Mission steps between evaluations on held-out layouts."""
+    save_every: Annotated[float, NOT_NEGATIVE] = 120.0
+    """Time between saves for --resume [s]; a save of the default buffer takes 0.4 GB."""
     layouts: Annotated[int, AT_LEAST_ONE] = 10
     """Held-out layouts of each family per evaluation."""
     threads: Annotated[int, AT_LEAST_ONE] = 1
@@ -165,7 +167,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
-    """What learner and exploration take of a configuration, under the names that they know."""
+    """The parts of a configuration that learner and exploration use, under their names."""
     return make_config(
         "fast",
         **{"method": "marlms" if config.learner == "lenient" else {"hysteretic": "hysteretic", "plain": "iql"}[config.learner]},

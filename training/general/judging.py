@@ -1,4 +1,4 @@
-"""How a policy does on held-out layouts while it is learned: success rate and median return of each family."""
+"""Evaluation of a policy on held-out layouts during training: success rate and median return of each family."""
 
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ VALIDATION_SEED = 50_000
 
 
 class Verdict(NamedTuple):
-    """What became of B missions, measured at mission steps."""
+    """Outcomes of B missions, measured at mission steps."""
 
     total: np.ndarray  # (B,) return
     reached: np.ndarray  # (B,) bool, everybody ended within the tolerance of its slot

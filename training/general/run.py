@@ -1,27 +1,42 @@
 """A training run of the general policy on disk: evaluations on held-out layouts, learning curve, best and last checkpoints."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from time import monotonic, process_time
 from typing import Any
 
+from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.run import CHECKPOINT, Interrupted, TrainingScores, begin_folder, stopper, write_table
-from marlbc_mj.util.files import check_folder
+from marlbc_mj.training.run import (
+    CHECKPOINT,
+    COUNTED,
+    MEMORY_SETTINGS,
+    RESUME,
+    Interrupted,
+    TrainingScores,
+    begin_folder,
+    saved_run,
+    stopper,
+    write_table,
+)
+from marlbc_mj.training.saved import CONFIG_FILE, check_origin, restore_trainer, saved_config, saved_rows
+from marlbc_mj.util.errors import enough_memory
+from marlbc_mj.util.files import alone_in, remove_leftovers
 from marlbc_mj.util.provenance import provenance
 
 CURVE = "eval.csv"
 GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
-"""What a run calls after every decision, with its last evaluation."""
+"""Callback of a run after every decision, with its last evaluation."""
 
 
 def train_general(
     config: GeneralConfig, out: Path, *, overwrite: bool = False, progress: GeneralProgress | None = None
 ) -> Interrupted | list[TrainingScores]:
-    """Train from scratch; returns the evaluations, or what interrupted the run, which then leaves its last policy.
+    """Train from scratch; returns the evaluations, or what interrupted the run.
 
     Args:
         config: configuration of the run.
@@ -30,13 +45,51 @@ def train_general(
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: a setting that cannot be run, or ``out`` is not empty.
+        ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    check_folder(out, overwrite=overwrite)
-    run = GeneralRun(config, out)
-    begin_folder(out, run.origin, config)
-    return run.go(progress)
+    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
+        run = GeneralRun(config, out)
+        begin_folder(out, run.origin, config)
+        return run.go(progress)
+
+
+def resume_general(out: Path, *, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
+    """Continue a run where it was last saved, bit for bit; returns the evaluations, or what interrupted the run.
+
+    Args:
+        out: folder of the run.
+        progress: called after every decision.
+
+    Raises:
+        ConfigurationError: as :func:`marlbc_mj.training.run.resume`.
+        SimulationError: a world diverged.
+    """
+    path = saved_run(out)
+    with alone_in(out, overwrite=True), enough_memory(MEMORY_SETTINGS):
+        return _restored(path).go(progress)
+
+
+def _restored(path: Path) -> "GeneralRun":
+    """The run that was saved in a file, in the file's folder, without what a killed process left there."""
+    arrays, description = read_arrays(path)
+    check_origin(path, description)
+    run = GeneralRun(saved_config(path, description["train"], GeneralConfig), path.parent)
+    restore_trainer(path, run.trainer, arrays, description["scalars"])
+    if description["evaluations"]:
+        run.evaluations = saved_rows(path, description["evaluations"], (*COUNTED, "cpu_s"))
+    times = saved_rows(path, [{name: description.get(name) for name in ("wall_s", "cpu_s")}], ())[0]
+    run.wall, run.cpu = times["wall_s"], times["cpu_s"]
+    remove_leftovers(run.out)
+    return run
+
+
+def is_general_run(out: Path) -> bool:
+    """Whether a folder says that the general policy is trained in it."""
+    try:
+        return bool(json.loads((out / CONFIG_FILE).read_text())["train"]["type"] == GeneralConfig.__name__)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 class GeneralRun:
@@ -58,20 +111,32 @@ class GeneralRun:
         self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]
 
     def go(self, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
-        """Train to the end of the budget, or until a signal arrives."""
-        trainer = self.trainer
+        """Train to the end of the budget, or until a signal arrives; then the run saves itself."""
+        trainer, saved = self.trainer, monotonic()
         with stopper() as stop:
             while not trainer.finished:
                 began, used = monotonic(), process_time()
                 trainer.advance()
                 self.wall, self.cpu = self.wall + monotonic() - began, self.cpu + process_time() - used
-                if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished or stop.signal:
+                if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished:
                     self.evaluate()
                 if progress and self.evaluations:
                     progress(trainer, self.evaluations[-1])
-                if stop.signal:
-                    return Interrupted(stop.signal)
+                number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
+                if number or monotonic() - saved > self.config.save_every:
+                    self.save()
+                    saved = monotonic()
+                if number:
+                    return Interrupted(number)
+        self.save()
         return self.evaluations
+
+    def save(self) -> None:
+        """Write the state that :func:`resume_general` continues from."""
+        arrays, scalars = self.trainer.snapshot()
+        times = {"wall_s": self.wall, "cpu_s": self.cpu}
+        rows = {"evaluations": self.evaluations, "curve": []}
+        write_arrays(self.out / RESUME, arrays, {**self.origin, "train": self.config, "scalars": scalars, **rows, **times})
 
     def evaluate(self) -> None:
         """Fly the held-out layouts; write the learning curve, the last checkpoint and perhaps the best."""

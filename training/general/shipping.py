@@ -1,4 +1,4 @@
-"""Making a run of the general policy the checkpoint that comes with the package, with its model card."""
+"""Copies a run of the general policy into the package, with its model card."""
 
 from pathlib import Path
 from typing import Any

@@ -1,6 +1,6 @@
-"""Squads: worlds of one family and team that learn together with others, each with what its agents have heard of each other."""
+"""Squads: worlds of one family and team that learn together with others, each with the messages that its agents have heard."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,6 +10,7 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import FORMATION, decision_steps, motion_orders
 from marlbc_mj.policies.general_inputs import join_inputs, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
+from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
 from marlbc_mj.training.general.config import GeneralConfig
@@ -17,7 +18,7 @@ from marlbc_mj.util.seeding import stream
 
 
 class SquadOutcome(NamedTuple):
-    """What a decision of W teams led to."""
+    """Outcome of one decision of W teams."""
 
     reward: np.ndarray  # (W, N) float32
     final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
@@ -86,6 +87,23 @@ class Squad:
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
         return SquadOutcome(reward.astype(np.float32), final, ended, self.interval * len(actions))
+
+    def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Everything that the squad needs to go on bit for bit: arrays, and the rest as JSON data."""
+        arrays = {name: getattr(owner, name) for owner, name in self._plain_arrays()}
+        return {**prefixed("world", self.world.snapshot()), **arrays}, {"rng": self.rng.bit_generator.state}
+
+    def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+        """Return to a :meth:`snapshot` of a squad with the same configuration."""
+        self.world.restore(unprefixed("world", arrays))
+        for owner, name in self._plain_arrays():
+            setattr(owner, name, arrays[name].copy())
+        self.rng.bit_generator.state = scalars["rng"]
+
+    def _plain_arrays(self) -> list[tuple[Any, str]]:
+        """Arrays that are attributes, as pairs of owner and name."""
+        own = ("last", "heard", "age", "loss", "end", "inputs")
+        return [*((self, name) for name in own), *((self.explore, name) for name in ("left", "held"))]
 
     def _restart(self, ended: np.ndarray) -> None:
         """New episodes on new layouts where ``ended`` (W,) is true."""

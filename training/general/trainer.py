@@ -2,13 +2,14 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
-from marlbc_mj.training.base import single_thread
+from marlbc_mj.training.base import prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner
@@ -119,6 +120,28 @@ class GeneralTrainer:
             self.error = self.learner.update(batch, rate)
         if not np.isfinite(self.error):
             raise ConfigurationError(f"the network diverged after {self.steps} mission steps; try a lower learning_rate")
+
+    def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        squads = [squad.snapshot() for squad in self.squads]
+        arrays = {**prefixed("learner", self.learner.snapshot()), **prefixed("replay", self.replay.arrays)}
+        for k, (own, _) in enumerate(squads):
+            arrays |= prefixed(f"squad{k}", own)
+        counts = {"rows": self.replay.count, "updates": self.learner.updates, "next_copy": self.learner.targets.next}
+        state = {"rng": self.rng.bit_generator.state, "steps": self.steps, "error": self.error}
+        return arrays, {"squads": [own for _, own in squads], **counts, **state}
+
+    def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        for k, (squad, own) in enumerate(zip(self.squads, scalars["squads"], strict=True)):
+            squad.restore(unprefixed(f"squad{k}", arrays), own)
+        self.learner.restore(unprefixed("learner", arrays))
+        for name, array in self.replay.arrays.items():
+            array[:] = arrays[f"replay.{name}"]
+        self.replay.count = scalars["rows"]
+        self.learner.updates, self.learner.targets.next = scalars["updates"], scalars["next_copy"]
+        self.rng.bit_generator.state = scalars["rng"]
+        self.steps, self.error = scalars["steps"], scalars["error"]
 
     def policy(self) -> GeneralPolicy:
         """The greedy policy of the running mean of the weights."""

@@ -15,7 +15,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
 class Case(NamedTuple):
-    """One row to be: what is set, and how to run it."""
+    """A row of the table before it is measured: its settings, and how to run it."""
 
     settings: tuple[str, ...]  # one value for each of the question's parameters
     scenario: Scenario
@@ -61,7 +61,7 @@ class Question:
 
 
 class Measured(NamedTuple):
-    """What a case came to: figures, or why there are none."""
+    """The result of a case: figures, or the reason why there are none."""
 
     figures: Figures | None
     failure: str = ""

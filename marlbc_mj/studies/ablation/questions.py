@@ -166,7 +166,7 @@ _QUESTIONS = (
     Question(
         "sorlc",
         "SORLC's basis and sign of the compensator on the case study",
-        "The sign is that of τ in (40): the printed one is −, the reading of erratum 2 is +.",
+        "The sign is that of τ in (40): the published one is −, the reading of erratum 2 is +.",
         ("drag scale", "basis", "sign of τ"),
         _sorlc_cases,
         MISSION,
@@ -183,7 +183,7 @@ _QUESTIONS = (
     ),
     Question(
         "avoidance",
-        "Obstacle avoidance one-sided or as the printed equality task, on the case study",
+        "Obstacle avoidance one-sided or as the published equality task, on the case study",
         "Two-sided avoidance also attracts (erratum 6) and holds an agent on the safe distance, where the reward punishes it.",
         ("avoidance",),
         _avoidance_cases,

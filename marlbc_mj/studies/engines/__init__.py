@@ -1,4 +1,4 @@
-"""Where the jobs of a study run: in processes of this machine, on a Ray cluster, or in an array of SLURM."""
+"""Engines, which run the jobs of a study: in processes of this machine, on a Ray cluster, or in an array of SLURM."""
 
 from collections.abc import Callable
 from typing import Literal

@@ -1,7 +1,7 @@
-"""What an engine is, and what one job is to it.
+"""Engines and their tasks.
 
 An engine only moves work: :meth:`Work.do` is the same call in every process and on every machine, so results are the same bits
-whatever the engine. It owns no state that outlives it. What has to survive is stored by the runner, result by result.
+whatever the engine. It owns no state that outlives it: the runner stores every result.
 """
 
 import traceback
@@ -18,7 +18,7 @@ from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.text import one_line
 
 MOST_TRIES = 4
-"""Of a job whose worker dies."""
+"""Tries of a job whose worker dies."""
 
 
 class StopRequest(Protocol):
@@ -41,7 +41,7 @@ class Task(NamedTuple):
 
 @dataclass(frozen=True)
 class Work(Generic[JobT, ResultT]):
-    """What workers need besides their tasks; picklable."""
+    """The data that workers need besides their tasks; picklable."""
 
     study: Study[JobT, ResultT]
     files: Path | None = None
@@ -94,7 +94,7 @@ def attempt(work: Work[Any, Any], task: Task) -> Outcome:
 
 @dataclass
 class Ears:
-    """What an engine tells the study's process, besides results, and what it asks it."""
+    """Callbacks of the study's process for an engine, besides results."""
 
     progress: Progress = silent
     stop: StopRequest | None = None

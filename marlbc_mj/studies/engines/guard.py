@@ -1,4 +1,4 @@
-"""Ends what a killed study leaves of a Ray that it has started: ``python -m marlbc_mj.studies.engines.guard TOKEN``.
+"""Ends what a killed study leaves of a Ray that it has started: ``python -I -S guard.py TOKEN``, which imports nothing else.
 
 Ray's agents outlive a raylet that was killed. All processes of that Ray have the token in their environment. This one, in a
 session of its own, waits until its standard input ends, which the study's process holds, and ends them.

@@ -146,7 +146,7 @@ def _pass_on(told: "SimpleQueue[Any]", progress: Progress) -> None:
 
 
 class _Worker(NamedTuple):
-    """What a worker process knows besides its jobs."""
+    """State of a worker process besides its jobs."""
 
     told: "SimpleQueue[Any]"
     stopping: Event  # shared by the study's process and all workers

@@ -109,7 +109,7 @@ class RayTasks:
 def _guarded() -> Iterator[None]:
     """A process that ends the Ray that is started in the block, should this one be killed."""
     token = secrets.token_hex(8)
-    command = [sys.executable, "-m", guard.__name__, token]
+    command = [sys.executable, "-I", "-S", guard.__file__, token]  # without this package: it is there at once
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as guarding:
         os.environ[guard.TOKEN] = token
         try:

@@ -19,14 +19,14 @@ from marlbc_mj.results.statistics import Estimate, Statistic, bootstrap, iqm, me
 from marlbc_mj.studies.learners.records import GOAL_SWITCHES, UNFINISHED, CsvLine
 from marlbc_mj.studies.learners.variants import VARIANTS
 from marlbc_mj.util.files import staged_file
-from marlbc_mj.util.palette import AGENT_COLORS
+from marlbc_mj.util.palette import METHOD_COLORS
 
 WIDE = 6
 """Variants of a group at most, and panels side by side in the figure."""
 REFERENCE_VARIANT = "marlms"
 """The variant that every panel shows beside its own."""
-COLOR, REFERENCE_COLOR, FAILED_COLOR = AGENT_COLORS[0], "#9A9A9A", "#C8102E"
-_GOAL: dict[str, Any] = {"color": AGENT_COLORS[1], "marker": "v", "markersize": 3, "linestyle": "none"}
+COLOR, REFERENCE_COLOR, FAILED_COLOR = METHOD_COLORS[0], "#9A9A9A", "#C8102E"
+_GOAL: dict[str, Any] = {"color": METHOD_COLORS[1], "marker": "v", "markersize": 3, "linestyle": "none"}
 _END: dict[str, Any] = {"color": FAILED_COLOR, "marker": "x", "markersize": 4, "linestyle": "none"}
 
 

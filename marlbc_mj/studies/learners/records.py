@@ -1,4 +1,4 @@
-"""What the runs of a study of learners came to, as lines of its two CSV files."""
+"""Results of the runs of a study of learners, as lines of its two CSV files."""
 
 import csv
 import json

@@ -1,4 +1,4 @@
-"""The study of learners: one training per variant and seed, in a folder of its own, where it goes on after a stop.
+"""The study of learners: one training per variant and seed, in a folder of its own, in which it resumes after a stop.
 
 A run that finished leaves ``DONE`` with the hash of its configuration, one that failed ``FAILED`` with its reason.
 """
@@ -21,7 +21,7 @@ from marlbc_mj.studies.runner import run_jobs
 from marlbc_mj.training import run as training
 from marlbc_mj.training.config import TrainConfig, from_json, make_config
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, unknown
-from marlbc_mj.util.files import write_json
+from marlbc_mj.util.files import alone_in, write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import config_hash
 from marlbc_mj.util.text import one_line
@@ -126,7 +126,7 @@ def train_learners(study: LearnerStudy, workers: int, progress: Progress = silen
         progress: called with a line per event, how many runs have ended, and how many there are.
 
     Raises:
-        ConfigurationError: fewer than one worker, a setting, or a folder that cannot be written.
+        ConfigurationError: fewer than one worker, a setting, or a folder that cannot be written or that another process is at.
         SimulationError: a worker died; what was saved goes on with the next call.
     """
     total, count = len(study.jobs()), 0
@@ -138,7 +138,8 @@ def train_learners(study: LearnerStudy, workers: int, progress: Progress = silen
 
     with training.stopper() as stop:
         try:
-            run_jobs(study, workers=workers, progress=progress, ended=ended, stop=stop)
+            with alone_in(study.out, overwrite=True):
+                run_jobs(study, workers=workers, progress=progress, ended=ended, stop=stop)
         except Stopped as stopped:
             return stopped.signal
     return 0

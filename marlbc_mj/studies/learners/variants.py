@@ -14,7 +14,7 @@ class Variant:
 
     line: str
     group: str
-    """What it is compared for: learner, preset or rival."""
+    """Group of the comparison: learner, preset or rival."""
     method: str = "marlms"
     preset: str = "fast"
     changes: Mapping[str, Any] = field(default_factory=dict)
@@ -32,7 +32,7 @@ VARIANTS: dict[str, Variant] = {
     "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
     "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
     "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
-    "no-risk": Variant("no learned risks: an own cost makes the policy careful", "learner", changes=CARE),
+    "no-risk": Variant("no learned risks: a cost of coming too close makes the policy careful", "learner", changes=CARE),
     "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
     "uniform-starts": Variant(
         "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
@@ -42,14 +42,14 @@ VARIANTS: dict[str, Variant] = {
         "preset",
         changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
     ),
-    "printed-state": Variant("the printed state", "preset", changes={"state": "printed"}),
+    "printed-state": Variant("the published state", "preset", changes={"state": "printed"}),
     "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
-    "paper": Variant("the printed hyper-parameters, state, reward and orders", "preset", preset="paper"),
+    "paper": Variant("the published hyper-parameters, state, reward and orders", "preset", preset="paper"),
     "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
     "vdn": Variant("value decomposition", "rival", "vdn"),
     "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
     "central": Variant("one network over joint orders", "rival", "central"),
-    "rlms": Variant("single agents side by side", "rival", "rlms"),
+    "rlms": Variant("agents that learn alone", "rival", "rlms"),
     "mappo": Variant("multi-agent PPO", "rival", "mappo"),
 }
 """Method, preset and changes by name."""

@@ -18,7 +18,7 @@ from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import MarlbcError
 from marlbc_mj.util.progress import Progress, silent
 
-CLIP_STYLE = VideoStyle(speed=8.0, width=640, height=360)
+CLIP_STYLE = VideoStyle(speed=8.0, size=(640, 360))
 
 
 def render_clips(

@@ -1,4 +1,4 @@
-"""Suite v1: which missions there are, on which layouts, and the hash that names it.
+"""Suite v1: its missions, their layouts, and the hash that names it.
 
 No number of any supervisor, controller or law was chosen on these layouts: seeds begin at 90000, and layouts are of the split
 that no training draws. A change of any mission, by a default of a scenario for example, changes the hash and is another suite.

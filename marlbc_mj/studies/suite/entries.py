@@ -1,4 +1,4 @@
-"""Which methods fly the suite: every supervisor under the composition that it is meant for, and every controller."""
+"""Methods that fly the suite: every supervisor under the composition that it is meant for, and every controller."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ FOR_SET_BASED = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed"
 
 
 class Choice(NamedTuple):
-    """What the command line chooses among the methods."""
+    """The selection of methods by the command line."""
 
     supervisors: tuple[str, ...] | None = None  # None: all that are not too slow
     controllers: tuple[str, ...] | None = None  # of the control track; None: all

@@ -1,4 +1,4 @@
-"""What a run of the suite leaves: suite.json, and a CSV file per track with a row per layout; and both read again."""
+"""Files of a run of the suite, written and read: suite.json, and a CSV file per track with a row per layout."""
 
 import json
 import sys
@@ -21,7 +21,7 @@ FORM = 1
 """Version of the form of suite.json."""
 SUITE_FILE = "suite.json"
 _OF_OTHERS = ("command", "date", "code", "git_revision", "cpu")
-"""What is kept of the facts of results that stand beside others."""
+"""Facts that are kept of results shown beside others."""
 
 
 class SuiteResults(NamedTuple):

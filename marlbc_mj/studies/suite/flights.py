@@ -1,4 +1,4 @@
-"""What a job of the suite is, one method on a block of layouts, and how it is flown."""
+"""Jobs of the suite: one method on a block of layouts, and how it is flown."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
