@@ -14,7 +14,7 @@ from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.seeds import SeedRun
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario, paper
 from marlbc_mj.scenarios.layout import Sample
-from marlbc_mj.studies.batches import MOST_TOGETHER, RECORD_BYTES, Entry, draws_together, evaluate_batch, fly_side_by_side
+from marlbc_mj.studies.batches import MOST_TOGETHER, RECORD_BYTES, Flown, draws_together, evaluate_batch, fly_side_by_side
 from marlbc_mj.studies.draws import perturbed
 from marlbc_mj.supervisors import Blend, FixedPriority, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -118,7 +118,7 @@ def test_a_draw_that_fails_leaves_the_others_as_they_are(trouble: str, reason: s
     world = World(scenario)
     world.reset(SEEDS[1])
     supervisor = Troubled(float(world.state.obstacles[0, 0, 0]), trouble)
-    entry = Entry(scenario, supervisor, make_controller(controller), ("troubled", controller), False)
+    entry = Flown(scenario, supervisor, make_controller(controller), ("troubled", controller), False)
     first, failed, last = fly_side_by_side(entry, SEEDS)
     with pytest.raises((ConfigurationError, SimulationError), match=reason) as raised:
         alone(scenario, supervisor, SEEDS[1], controller=controller)

@@ -21,7 +21,7 @@ from marlbc_mj.recording.schemas import COMMUNICATION, decode_hearing, encode_he
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.recording.writer import LogWriter
 from marlbc_mj.scenarios import Scenario, make_scenario
-from marlbc_mj.studies.batches import Entry, JointFlight
+from marlbc_mj.studies.batches import Flown, JointFlight
 from marlbc_mj.studies.communication import CASES, CommunicationStudy, NetworkCase, neighbor_distance, time_to_agree
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.supervisors import DistributedLookAhead, LookAhead, make_supervisor
@@ -184,7 +184,7 @@ def test_links_are_in_a_recording_of_rerun(flown, tmp_path):
 def test_episodes_flown_together_are_those_flown_alone(supervisor):
     """Every array that is kept of them, bit for bit, whatever is drawn with the seed; only the clock differs."""
     scenario = gates(duration=1.0, communication=POOR)
-    flight = JointFlight(Entry(scenario, supervisor, PD(), ("supervisor", "controller"), False), (4, 9))
+    flight = JointFlight(Flown(scenario, supervisor, PD(), ("supervisor", "controller"), False), (4, 9))
     flight.fly(supervisor)
     assert not flight.failures
     for b, seed in enumerate((4, 9)):

@@ -35,7 +35,7 @@ RECORD_BYTES = 128e6
 """Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
 
 
-class Entry(NamedTuple):
+class Flown(NamedTuple):
     """The method that flies every draw."""
 
     scenario: Scenario
@@ -71,7 +71,7 @@ def evaluate_batch(
     """
     changes: dict[str, Any] = {} if composition is None else {"composition": composition}
     scenario = replace(scenario, **changes)
-    entry = Entry(
+    entry = Flown(
         scenario, make_supervisor(supervisor, controller), make_controller(controller), (supervisor, controller), shield
     )
     try:
@@ -93,7 +93,7 @@ def draws_together(scenario: Scenario) -> int:
     return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
 
 
-def fly_side_by_side(entry: Entry, seeds: Sequence[int]) -> list[SeedRun]:
+def fly_side_by_side(entry: Flown, seeds: Sequence[int]) -> list[SeedRun]:
     """One run per seed, all flown at once.
 
     A supervisor that raises does not say on which draw. Then the draws are flown in halves, until it is known.
@@ -121,7 +121,7 @@ class JointFlight:
         ConfigurationError: a setting that cannot be run.
     """
 
-    def __init__(self, entry: Entry, seeds: Sequence[int]) -> None:
+    def __init__(self, entry: Flown, seeds: Sequence[int]) -> None:
         scenario, count = entry.scenario, len(seeds)
         self.entry = entry
         self.seeds = seeds
