@@ -4,10 +4,11 @@ import os
 import signal
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
 from typing import Any
 
 import pytest
-import torch._dynamo  # noqa: F401  # builds with CUDA bring triton, whose LLVM crashes if a software renderer's is loaded first
 from hypothesis import settings
 
 from marlbc_mj.controllers import make_controller
@@ -15,6 +16,9 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.scenarios import paper
 from marlbc_mj.supervisors import make_supervisor
+
+if find_spec("triton"):  # as builds of torch with CUDA have it; its LLVM crashes if a software renderer's is loaded first
+    import_module("torch._dynamo")
 
 settings.register_profile("marlbc", deadline=None, max_examples=60, derandomize=True)
 settings.load_profile("marlbc")
