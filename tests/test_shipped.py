@@ -1,14 +1,16 @@
 """Shipped checkpoints: what their cards say is what they do; and how a run becomes one."""
 
 import json
+import re
 
 import pytest
 
-from marlbc_mj import World, make_supervisor, measure, paper, run_episode
+from marlbc_mj import World, make_scenario, make_supervisor, measure, paper, run_episode
 from marlbc_mj.cli import main
 from marlbc_mj.policies.actions import ACTIONS
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.supervisors import LEARNED
+from marlbc_mj.supervisors.learned import Learned
 from marlbc_mj.training.config import make_config
 from marlbc_mj.training.run import episode_scores, train
 from marlbc_mj.training.ship import CHOICE, ship
@@ -23,6 +25,15 @@ def test_a_shipped_policy_does_what_its_card_says(name):
     assert did == {key: said[key] for key in did}
     assert f"return {said['return']:.0f}" in path.with_suffix(".md").read_text()
     assert path.stat().st_size < 1_000_000
+
+
+def test_a_message_names_a_shipped_checkpoint_without_its_place(tmp_path):
+    """Messages end up in results that are passed on; another checkpoint is named by its path."""
+    mine = tmp_path / "marlms.safetensors"
+    mine.write_bytes(shipped("marlms").read_bytes())
+    for supervisor, said in ((make_supervisor("marlms"), "checkpoint marlms.safetensors"), (Learned.load(mine), str(mine))):
+        with pytest.raises(ConfigurationError, match=re.escape(said)):
+            supervisor.start(make_scenario("field"), 1)
 
 
 def test_marlms_reaches_the_goal():

@@ -11,6 +11,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import check_policy, check_signature, read_policy
 from marlbc_mj.policies.greedy import Policy, greedy
+from marlbc_mj.policies.shipped import called
 from marlbc_mj.policies.states import State, make_state
 from marlbc_mj.scenarios import Scenario
 
@@ -57,10 +58,11 @@ class Learned:
             ConfigurationError: another team, other behaviors, slots, mission step or path, see
                 :func:`~marlbc_mj.policies.checkpoint.signature`; or networks that do not fit them.
         """
-        check_signature(self.path, self.signature, scenario)
+        path = called(self.path)
+        check_signature(path, self.signature, scenario)
         read = make_state(self.signature["state"], scenario)
         orders = order_of(scenario, self.signature["actions"])
-        check_policy(self.path, self.policy, scenario.agents, len(orders), read.size)
+        check_policy(path, self.policy, scenario.agents, len(orders), read.size)
         return LearnedMemory(read, orders, np.zeros((teams, scenario.agents), dtype=np.int64))
 
     def decide(self, observation: Observation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
