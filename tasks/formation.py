@@ -17,6 +17,7 @@ from marlbc_mj.controllers import SORLC, Controller
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.plan import Plan, find_indices, make_plan
+from marlbc_mj.engine.records import Arguments
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.seeding import stream
@@ -61,7 +62,7 @@ class FormationTask(composer.Task):
         self._arena = FormationArena(self.plan.xml)
         self._record = team.make_record(self.plan, worlds=1, recording=False)
         self._orders_alone = np.zeros((1, 0, 2))  # the orders make v_r
-        self._arguments: tuple[Any, ...] = ()  # what the loop takes in the present episode
+        self._present: Arguments  # what the loop takes; from initialize_episode on
         parts = (loop.start_compiled, loop.apply_compiled, loop.settle_compiled)
         self._start, self._apply, self._settle = parts if self.plan.native else (loop.start, loop.apply, loop.settle)
         self._substep = 0
@@ -101,7 +102,7 @@ class FormationTask(composer.Task):
         plant = self.plan.plant._replace(qpos_index=qpos_index, qvel_index=qvel_index, ctrl_index=ctrl_index)
         side = self.plan.compiled_side if self.plan.native else self.plan.python_side
         plan = replace(self.plan, plant=plant)
-        self._arguments = drivers.hand_over(plan, side([physics.data.ptr]), self.state, self._record, plan.native)
+        self._present = drivers.hand_over(plan, side([physics.data.ptr]), self.state, self._record, plan.native)
         seed = int(random_state.randint(2**31))
         starts = team.reset(self.plan, self.state, 0, stream(seed, 0))
         team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
@@ -113,26 +114,26 @@ class FormationTask(composer.Task):
             ConfigurationError: another shape, no whole numbers, or an index that is no order.
         """
         orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
-        self._start(0, orders, self._orders_alone, *self._arguments[1:-1])
+        a = self._present
+        self._start(0, orders, self._orders_alone, a.mission, a.behaviors, a.native, a.plant, a.team)
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
         """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
-        _, mission, _, native, plant, state, _ = self._arguments
-        failed = self._apply(0, self._substep, mission, native, plant, state)
+        a = self._present
+        failed = self._apply(0, self._substep, a.mission, a.native, a.plant, a.team)
         if failed:
             raise team.diverged(self.plan, self.state, 0, failed, int(self.state.steps[0]))
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Measure, and advance the reference position."""
-        _, mission, _, native, plant, state, record = self._arguments
-        self._settle(0, self._substep, mission, native, plant, state, record)
+        a = self._present
+        self._settle(0, self._substep, a.mission, a.native, a.plant, a.team, a.record)
         self._substep += 1
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
         """Clearances, formation identifier and reward."""
-        _, mission, _, _, _, state, _ = self._arguments
-        loop.finish(0, mission, state)
+        loop.finish(0, self._present.mission, self._present.team)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
         """r1 + r2 of (13)."""

@@ -41,7 +41,8 @@ def test_a_large_team_is_shielded_by_its_grids_as_by_trying_all_pairs():
     worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
     assert worlds[0].state.grid.shape[1] > 0
     worlds[1].state = worlds[1].state._replace(grid=np.zeros((1, 0)))
-    worlds[1]._arguments = worlds[1]._make_arguments()
+    worlds[1]._hand_over()
+    assert worlds[1]._loop.arguments.team.grid.shape[1] == 0  # the loop's own
     rng = np.random.default_rng(0)
     for _ in range(30):
         velocity = 15.0 * rng.normal(size=(1, 48, 2))

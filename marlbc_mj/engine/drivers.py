@@ -1,6 +1,6 @@
 """How the loop is called: what a World hands over is referred to once, and worlds are stepped in series or by threads."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -13,15 +13,25 @@ from marlbc_mj.engine.records import Arguments, MissionRules, Native, Plant, Rec
 from marlbc_mj.engine.references import call, entry, no_entry, refer
 
 
-def hand_over(plan: Plan, native: Native, team: Team, record: Record, compiled_loop: bool) -> Arguments:
+class Loop(NamedTuple):
+    """The compiled loop of one World: the mission step, and its arguments."""
+
+    step: Any  # entry of mission_step
+    arguments: Any
+
+
+def hand_over(plan: Plan, native: Native, team: Team, record: Record, for_compiled: bool) -> Arguments:
     """The parts as the loop takes them: referred to, with the entries of what this team needs if the loop is compiled."""
     mission, plant, team, record = map(refer, (plan.mission, plan.plant, team, record))
-    if not compiled_loop:
-        return Arguments(None, mission, plan.behaviors, native, plant, team, record)
-    native = refer(_with_shield(native, mission, plan.behaviors, plant, team))
+    if for_compiled:
+        native = refer(_with_shield(native, mission, plan.behaviors, plant, team))
+    return Arguments(mission, plan.behaviors, native, plant, team, record)
+
+
+def compiled_loop(arguments: Arguments) -> Any:
+    """A reference to the :class:`Loop` of what was handed over for compiled code."""
     orders, given = np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 2))
-    parts = mission, plan.behaviors, native, plant, team, record
-    return Arguments(entry(mission_step, 0, orders, given, *parts), *parts)
+    return refer(Loop(entry(mission_step, 0, orders, given, *arguments), refer(arguments)))
 
 
 def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team: Any) -> Native:
@@ -35,38 +45,38 @@ def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team:
 
 
 @compiled
-def play(b, sequence, given, a):
+def play(b, sequence, given, loop):
     """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
 
     Returns the sum of rewards, up to the step that failed if one did; ``team.status`` tells.
     """
-    total = 0.0
+    total, a = 0.0, loop.arguments
     for m in range(sequence.shape[0]):
-        if call(a.step, b, sequence[m], given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record):
+        if call(loop.step, b, sequence[m], given, a.mission, a.behaviors, a.native, a.plant, a.team, a.record):
             break
         total += a.team.reward[b]
     return total
 
 
 @threaded
-def _share_out(returns, sequence, given, a):
+def _share_out(returns, sequence, given, loop):
     for b in numba.prange(returns.shape[0]):
-        returns[b] = play(np.int64(b), sequence, given, a)
+        returns[b] = play(np.int64(b), sequence, given, loop)
 
 
 @compiled
-def play_parallel(returns, sequence, given, a):
+def play_parallel(returns, sequence, given, loop):
     """:func:`play` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series.
 
     Returns how many worlds failed.
     """
-    _share_out(returns, sequence, given, a)
-    return np.count_nonzero(a.team.status)
+    _share_out(returns, sequence, given, loop)
+    return np.count_nonzero(loop.arguments.team.status)
 
 
 @compiled
-def play_serial(returns, sequence, given, a):
+def play_serial(returns, sequence, given, loop):
     """:func:`play` of every world into ``returns`` (B,), one after the other. Returns how many worlds failed."""
     for b in range(returns.shape[0]):
-        returns[b] = play(b, sequence, given, a)
-    return np.count_nonzero(a.team.status)
+        returns[b] = play(b, sequence, given, loop)
+    return np.count_nonzero(loop.arguments.team.status)

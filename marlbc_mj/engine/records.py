@@ -110,7 +110,6 @@ class Arguments(NamedTuple):
     loop is compiled (behaviors always).
     """
 
-    step: Any  # entry of mission_step; unset for the Python path
     mission: Any
     behaviors: Any
     native: Any

@@ -23,7 +23,7 @@ from numba.core.typing.templates import AttributeTemplate
 from numba.experimental import structref
 from numba.extending import NativeValue, infer_getattr, intrinsic, register_model, unbox
 
-from marlbc_mj.core.compiling import Law, compiled, is_compiled
+from marlbc_mj.core.compiling import compiled, is_compiled
 
 
 @structref.register
@@ -199,7 +199,7 @@ def _call_at(typing_context, entry, *arguments):
     return types.int64(entry, given), codegen
 
 
-class _Call(_Intrinsic):  # type: ignore[misc]
+class _Call(_Intrinsic):  # type: ignore[misc]  # numba has no types
     """Call a function that returns a whole number: itself in Python, by its :class:`EntryPoint` in compiled code."""
 
     def __call__(self, function, *arguments):
@@ -210,15 +210,15 @@ call = _Call("call", _call_at)
 call._register()
 
 
-def entry(function: Law, *arguments: Any) -> Any:
+def entry(function: Any, *arguments: Any) -> Any:
     """What :func:`call` takes for a compiled ``function`` of such arguments; the function itself where numba is off."""
     if not is_compiled(function):
         return function
     given = [numba.typeof(argument) for argument in arguments]
     kinds = [_passed(kind) for kind in given]
     taken = tuple(own if isinstance(kind, RecordType) else kind for own, kind in zip(given, kinds, strict=True))
-    function.compile(taken)  # type: ignore[attr-defined]
-    found = function.overloads[taken]  # type: ignore[attr-defined]
+    function.compile(taken)
+    found = function.overloads[taken]
     if types.unliteral(found.signature.return_type) != types.int64:
         raise TypeError(f"{function} returns {found.signature.return_type}; called by address, it must return a whole number")
     return EntryPoint(int(found.library.get_pointer_to_function(found.fndesc.llvm_func_name)), tuple(kinds))

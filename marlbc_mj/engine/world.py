@@ -15,8 +15,7 @@ from marlbc_mj.engine import drivers, loop, team
 from marlbc_mj.engine.body import DIVERGED
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import make_plan
-from marlbc_mj.engine.records import Arguments, Record
-from marlbc_mj.engine.references import refer
+from marlbc_mj.engine.records import Record
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.modules import blame
@@ -86,8 +85,7 @@ class World:
         self._record = team.make_record(self.plan, worlds, record)
         self._orders_alone = np.zeros((worlds, 0, 2))  # no velocities are given: the orders make v_r
         self._returns = np.zeros(worlds)
-        self._arguments = self._make_arguments()
-        self._handed = refer(self._arguments) if self.native else None
+        self._hand_over()
         self.reset()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -101,11 +99,12 @@ class World:
         World.__init__(self, **state["settings"])
         self.restore(state["snapshot"])
 
-    def _make_arguments(self) -> Arguments:
-        """What the loop takes besides orders and velocities."""
+    def _hand_over(self) -> None:
+        """Give the loop, compiled or not, the very arrays of this World; again wherever they are other ones."""
         plan = self.plan
         self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
-        return drivers.hand_over(plan, self.side, self.state, self._record, self.native)
+        self._arguments = drivers.hand_over(plan, self.side, self.state, self._record, self.native)
+        self._loop = drivers.compiled_loop(self._arguments) if self.native else None
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
         """Start episodes anew: all of them, or those where ``mask`` (B,) is true.
@@ -242,7 +241,7 @@ class World:
         """
         run = drivers.play_serial if self.worlds == 1 or not threads_usable(self.threads) else drivers.play_parallel
         try:
-            return int(run(returns, sequence, given, self._handed))
+            return int(run(returns, sequence, given, self._loop))
         except Exception as error:
             raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 
@@ -260,7 +259,7 @@ class World:
         if self.native:
             return self._play(self._returns, orders[np.newaxis], given)
         mission_step = laws.plain(loop.mission_step)
-        return sum(mission_step(b, orders, given, *self._arguments[1:]) for b in range(self.worlds))
+        return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)
