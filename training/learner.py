@@ -2,14 +2,16 @@
 
 import copy
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.networks import NetworkSize, TargetRing, TeamNetwork, as_tensor, mask_risky, restore, saved, with_moments
-from marlbc_mj.training.replay import Batch
+from marlbc_mj.training.replay import Batch, Replay
 
 HYSTERESIS = 0.5
 """Weight of a negative TD error of a hysteretic learner (Omidshafiei et al. 2017)."""
@@ -183,6 +185,21 @@ class Learner:
     def tensor(self, array: np.ndarray) -> Tensor:
         """A float32 tensor of an array, on the device of the networks."""
         return as_tensor(array, self.config.device)
+
+
+def snapshot_learning(learner: Learner, replay: Replay) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """What a learner and its replay buffer need to go on bit for bit: arrays, and the rest as JSON data."""
+    arrays = {**prefixed("learner", learner.snapshot()), **prefixed("replay", replay.arrays)}
+    return arrays, {"rows": replay.count, "updates": learner.updates, "next_copy": learner.targets.next}
+
+
+def restore_learning(learner: Learner, replay: Replay, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
+    """Go back to a :func:`snapshot_learning`, which may stand among other arrays and numbers."""
+    learner.restore(unprefixed("learner", arrays))
+    for name, array in replay.arrays.items():
+        array[:] = arrays[f"replay.{name}"]
+    replay.count = scalars["rows"]
+    learner.updates, learner.targets.next = scalars["updates"], scalars["next_copy"]
 
 
 @torch.no_grad()

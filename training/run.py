@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic
 from types import FrameType
-from typing import Any
+from typing import Any, Protocol
 
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
@@ -71,6 +71,40 @@ def stopper() -> Iterator[Stopper]:
             signal.signal(number, handler)
 
 
+class SavedRun(Protocol):
+    """A training run that saves itself."""
+
+    trainer: Any
+    config: Any
+
+    def save(self) -> None:
+        """Write the state that the run can be resumed from."""
+
+
+def decide_and_save(run: SavedRun, decide: Callable[[], None]) -> Interrupted | None:
+    """Decide until the budget is spent or a signal arrives; the run is saved at intervals and at the end.
+
+    Args:
+        run: the training run.
+        decide: makes one decision in every world, and what follows from it.
+
+    Returns:
+        What interrupted the run, if anything did.
+    """
+    saved = monotonic()
+    with stopper() as stop:
+        while not run.trainer.finished:
+            decide()
+            number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
+            if number or monotonic() - saved > run.config.save_every:
+                run.save()
+                saved = monotonic()
+            if number:
+                return Interrupted(number)
+    run.save()
+    return None
+
+
 def make_trainer(config: TrainConfig) -> BaseTrainer:
     """The trainer of the configuration's method.
 
@@ -95,10 +129,17 @@ def train(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
+    with training_in(out, overwrite=overwrite):
         run = TrainingRun(make_trainer(config), out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
+
+
+@contextmanager
+def training_in(out: Path, *, overwrite: bool) -> Iterator[None]:
+    """A block that trains in a folder, as the only process that does; a lack of memory is one line."""
+    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
+        yield
 
 
 def begin_folder(out: Path, origin: Mapping[str, Any], config: Any) -> None:
@@ -131,7 +172,7 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
         SimulationError: a world diverged.
     """
     path = saved_run(out)
-    with alone_in(out, overwrite=True), enough_memory(MEMORY_SETTINGS):
+    with training_in(out, overwrite=True):
         return _restored(path).go(progress)
 
 
@@ -191,25 +232,21 @@ class TrainingRun:
 
     def go(self, progress: TrainingProgress | None = None) -> Interrupted | list[TrainingScores]:
         """Train to the end of the budget, or until a signal arrives."""
-        config, trainer = self.config, self.trainer
-        began, saved = monotonic() - self.wall, monotonic()
+        trainer, began = self.trainer, monotonic() - self.wall
         board = TensorBoard(self.out / TENSORBOARD)
-        with stopper() as stop:
-            while not trainer.finished:
-                trainer.advance()
-                self.wall = monotonic() - began
-                if trainer.steps // config.evaluate_every >= len(self.evaluations) or trainer.finished:
-                    self.evaluate()
-                    board.write(trainer.steps, {**self.curve[-1], **self.evaluations[-1]})
-                if progress:
-                    progress(trainer, self.evaluations[-1])
-                number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
-                if number or monotonic() - saved > config.save_every:
-                    self.save()
-                    saved = monotonic()
-                if number:
-                    return Interrupted(number)
-        self.save()
+
+        def decide() -> None:
+            trainer.advance()
+            self.wall = monotonic() - began
+            if trainer.steps // self.config.evaluate_every >= len(self.evaluations) or trainer.finished:
+                self.evaluate()
+                board.write(trainer.steps, {**self.curve[-1], **self.evaluations[-1]})
+            if progress:
+                progress(trainer, self.evaluations[-1])
+
+        interrupted = decide_and_save(self, decide)
+        if interrupted:
+            return interrupted
         board.close()
         return self.evaluations
 

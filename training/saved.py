@@ -23,7 +23,7 @@ SAVED_KINDS: dict[str, type | tuple[type, ...]] = {
     "curve": list,
     "wall_s": (int, float),
 }
-"""Types of the entries of a saved run's description."""
+"""Types of the entries in the description of a saved run for one team."""
 CONFIG_FILE = "config.json"
 
 Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
@@ -40,9 +40,15 @@ class Restorable(Protocol):
         """Return to a :meth:`snapshot` of a run with the same configuration."""
 
 
-def check_origin(path: Path, description: Mapping[str, Any]) -> None:
-    """Raise ConfigurationError if a description is not a saved run's, or of other versions or another revision of the code."""
-    for name, kind in SAVED_KINDS.items():
+def check_origin(path: Path, description: Mapping[str, Any], kinds: Mapping[str, Any] = SAVED_KINDS) -> None:
+    """Raise ConfigurationError if a description is not a saved run's, or of other versions or another revision of the code.
+
+    Args:
+        path: file of the saved run.
+        description: what it says.
+        kinds: types of the entries that it must have.
+    """
+    for name, kind in kinds.items():
         if not isinstance(description.get(name), kind):
             raise ConfigurationError(f"{path} is not a saved run: it says no {name}")
     here = provenance()

@@ -15,6 +15,7 @@ from marlbc_mj.training.base import BaseTrainer, prefixed, unprefixed
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
+from marlbc_mj.training.learner import restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import Temperatures, leniency
 from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.prioritised import PrioritisedReplay
@@ -165,25 +166,16 @@ class Trainer(BaseTrainer):
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
         arrays, scalars = super().snapshot()
-        arrays |= {
-            **prefixed("learner", self.learner.snapshot()),
-            **prefixed("replay", self.replay.arrays),
-            **prefixed("hash", self.hash.arrays),
-            "table": self.temperatures.table,
-        }
-        counts = {"rows": self.replay.count, "updates": self.updates, "next_copy": self.learner.targets.next}
-        return arrays, scalars | counts
+        arrays |= {**prefixed("hash", self.hash.arrays), "table": self.temperatures.table}
+        learnt, counts = snapshot_learning(self.learner, self.replay)
+        return arrays | learnt, scalars | counts
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
         """Return to a :meth:`snapshot` of a run with the same configuration."""
         super().restore(arrays, scalars)
-        self.learner.restore(unprefixed("learner", arrays))
-        for name, array in self.replay.arrays.items():
-            array[:] = arrays[f"replay.{name}"]
+        restore_learning(self.learner, self.replay, arrays, scalars)
         self.hash.arrays = {name: array.copy() for name, array in unprefixed("hash", arrays).items()}
         self.temperatures.table[:] = arrays["table"]
-        self.replay.count = scalars["rows"]
-        self.learner.updates, self.learner.targets.next = scalars["updates"], scalars["next_copy"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""

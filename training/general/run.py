@@ -14,21 +14,22 @@ from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.run import (
     CHECKPOINT,
     COUNTED,
-    MEMORY_SETTINGS,
     RESUME,
     Interrupted,
     TrainingScores,
     begin_folder,
+    decide_and_save,
     saved_run,
-    stopper,
+    training_in,
     write_table,
 )
-from marlbc_mj.training.saved import CONFIG_FILE, check_origin, restore_trainer, saved_config, saved_rows
-from marlbc_mj.util.errors import enough_memory
-from marlbc_mj.util.files import alone_in, remove_leftovers
+from marlbc_mj.training.saved import CONFIG_FILE, SAVED_KINDS, check_origin, restore_trainer, saved_config, saved_rows
+from marlbc_mj.util.files import remove_leftovers
 from marlbc_mj.util.provenance import provenance
 
 CURVE = "eval.csv"
+_SAVED = {**{name: kind for name, kind in SAVED_KINDS.items() if name != "curve"}, "cpu_s": (int, float)}
+"""Types of the entries in the description of a saved run."""
 GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
 """Callback of a run after every decision, with its last evaluation."""
 
@@ -48,7 +49,7 @@ def train_general(
         ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
         SimulationError: a world diverged.
     """
-    with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
+    with training_in(out, overwrite=overwrite):
         run = GeneralRun(config, out)
         begin_folder(out, run.origin, config)
         return run.go(progress)
@@ -66,19 +67,19 @@ def resume_general(out: Path, *, progress: GeneralProgress | None = None) -> Int
         SimulationError: a world diverged.
     """
     path = saved_run(out)
-    with alone_in(out, overwrite=True), enough_memory(MEMORY_SETTINGS):
+    with training_in(out, overwrite=True):
         return _restored(path).go(progress)
 
 
 def _restored(path: Path) -> "GeneralRun":
     """The run that was saved in a file, in the file's folder, without what a killed process left there."""
     arrays, description = read_arrays(path)
-    check_origin(path, description)
+    check_origin(path, description, _SAVED)
     run = GeneralRun(saved_config(path, description["train"], GeneralConfig), path.parent)
     restore_trainer(path, run.trainer, arrays, description["scalars"])
     if description["evaluations"]:
         run.evaluations = saved_rows(path, description["evaluations"], (*COUNTED, "cpu_s"))
-    times = saved_rows(path, [{name: description.get(name) for name in ("wall_s", "cpu_s")}], ())[0]
+    times = saved_rows(path, [{name: description[name] for name in ("wall_s", "cpu_s")}], ())[0]
     run.wall, run.cpu = times["wall_s"], times["cpu_s"]
     remove_leftovers(run.out)
     return run
@@ -112,31 +113,25 @@ class GeneralRun:
 
     def go(self, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
         """Train to the end of the budget, or until a signal arrives; then the run saves itself."""
-        trainer, saved = self.trainer, monotonic()
-        with stopper() as stop:
-            while not trainer.finished:
-                began, used = monotonic(), process_time()
-                trainer.advance()
-                self.wall, self.cpu = self.wall + monotonic() - began, self.cpu + process_time() - used
-                if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished:
-                    self.evaluate()
-                if progress and self.evaluations:
-                    progress(trainer, self.evaluations[-1])
-                number = stop.signal  # read once: a signal that arrives from here on waits for the next decision
-                if number or monotonic() - saved > self.config.save_every:
-                    self.save()
-                    saved = monotonic()
-                if number:
-                    return Interrupted(number)
-        self.save()
-        return self.evaluations
+        trainer = self.trainer
+
+        def decide() -> None:
+            began, used = monotonic(), process_time()
+            trainer.advance()
+            self.wall, self.cpu = self.wall + monotonic() - began, self.cpu + process_time() - used
+            if trainer.steps // self.config.evaluate_every > len(self.evaluations) or trainer.finished:
+                self.evaluate()
+            if progress and self.evaluations:
+                progress(trainer, self.evaluations[-1])
+
+        return decide_and_save(self, decide) or self.evaluations
 
     def save(self) -> None:
         """Write the state that :func:`resume_general` continues from."""
         arrays, scalars = self.trainer.snapshot()
         times = {"wall_s": self.wall, "cpu_s": self.cpu}
-        rows = {"evaluations": self.evaluations, "curve": []}
-        write_arrays(self.out / RESUME, arrays, {**self.origin, "train": self.config, "scalars": scalars, **rows, **times})
+        description = {**self.origin, "train": self.config, "scalars": scalars, "evaluations": self.evaluations, **times}
+        write_arrays(self.out / RESUME, arrays, description)
 
     def evaluate(self) -> None:
         """Fly the held-out layouts; write the learning curve, the last checkpoint and perhaps the best."""

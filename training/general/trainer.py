@@ -12,7 +12,7 @@ from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
 from marlbc_mj.training.general.squads import Squad
-from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
 from marlbc_mj.training.replay import Replay
 from marlbc_mj.util.errors import ConfigurationError
@@ -124,10 +124,9 @@ class GeneralTrainer:
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
         squads = [squad.snapshot() for squad in self.squads]
-        arrays = {**prefixed("learner", self.learner.snapshot()), **prefixed("replay", self.replay.arrays)}
+        arrays, counts = snapshot_learning(self.learner, self.replay)
         for k, (own, _) in enumerate(squads):
             arrays |= prefixed(f"squad{k}", own)
-        counts = {"rows": self.replay.count, "updates": self.learner.updates, "next_copy": self.learner.targets.next}
         state = {"rng": self.rng.bit_generator.state, "steps": self.steps, "error": self.error}
         return arrays, {"squads": [own for _, own in squads], **counts, **state}
 
@@ -135,11 +134,7 @@ class GeneralTrainer:
         """Return to a :meth:`snapshot` of a run with the same configuration."""
         for k, (squad, own) in enumerate(zip(self.squads, scalars["squads"], strict=True)):
             squad.restore(unprefixed(f"squad{k}", arrays), own)
-        self.learner.restore(unprefixed("learner", arrays))
-        for name, array in self.replay.arrays.items():
-            array[:] = arrays[f"replay.{name}"]
-        self.replay.count = scalars["rows"]
-        self.learner.updates, self.learner.targets.next = scalars["updates"], scalars["next_copy"]
+        restore_learning(self.learner, self.replay, arrays, scalars)
         self.rng.bit_generator.state = scalars["rng"]
         self.steps, self.error = scalars["steps"], scalars["error"]
 
