@@ -1,13 +1,14 @@
 """Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
-from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario
+from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.formations import FORMATIONS
+from marlbc_mj.scenarios.teams import team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
@@ -52,9 +53,11 @@ class GeneralConfig:
     """Temperature at the start, below 1 for a network that has learned before."""
     families: Annotated[tuple[str, ...], _NAMED] = DRAWN
     """Families that are trained on; one that is named twice counts twice."""
-    teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "wedge-8", "circle-8", "line-6", "grid-9")
+    teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "circle-8", "line-6", "grid-9", "wedge-16", "grid-16")
     """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
-    worlds: Annotated[int, AT_LEAST_ONE] = 4
+    long_way: Annotated[float, POSITIVE] = 80.0
+    """Way of teams whose column has several files [m]; evaluations have 120 m."""
+    worlds: Annotated[int, AT_LEAST_ONE] = 2
     """Worlds of every family and team, all stepped together."""
     controller: str = "pd"
     """Controller that tracks the references while learning; evaluations have sorlc."""
@@ -101,6 +104,8 @@ class GeneralConfig:
     """Share of explorations in which the whole team takes one random order."""
     least_exploration: Annotated[float, SHARE] = 0.02
     """Lower bound of the exploration."""
+    guided: Annotated[float, SHARE] = 0.25
+    """Share of episodes in which the team takes the actions of a look-ahead, where it does not explore."""
     switch_cost: Annotated[float, NOT_NEGATIVE] = 0.3
     """Cost of an agent's own switch; a decision in formation costs nothing, in column 0.5, in neither 1."""
     switching_margin: float = 0.05
@@ -148,11 +153,11 @@ def read_team(name: str) -> TeamName:
 def training_scenarios(config: GeneralConfig) -> list[Scenario]:
     """Every family with every team, under the set-based composition, with spread starts and drag."""
     spread = Perturbation(start_spread=config.start_spread, drag_scale=(0.0, config.most_drag))
-    teams = [read_team(name) for name in config.teams]
+    changes: dict[str, Any] = {"substep": config.substep, "composition": "set-based", "perturbation": spread}
     return [
-        make_scenario(family, **team._asdict(), substep=config.substep, composition="set-based", perturbation=spread)
+        team_mission(family, *team, long_way=config.long_way, **changes)
         for family in config.families
-        for team in teams
+        for team in map(read_team, config.teams)
     ]
 
 
@@ -160,7 +165,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
     """Held-out layouts of every family, whether it is trained on or not, for the first and the last team; by family and team."""
     names = dict.fromkeys((config.teams[0], config.teams[-1]))
     return {
-        f"{family}_{team}": make_scenario(family, **read_team(team)._asdict(), composition="set-based", split="test")
+        f"{family}_{team}": team_mission(family, *read_team(team), composition="set-based", split="test")
         for team in names
         for family in DRAWN
     }

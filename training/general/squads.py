@@ -7,14 +7,17 @@ import numpy as np
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
-from marlbc_mj.policies.general import FORMATION, decision_steps, motion_orders
-from marlbc_mj.policies.general_inputs import join_inputs, make_sight, sense_features
+from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, decision_steps, motion_orders
+from marlbc_mj.policies.general_inputs import LANE_BINS, LANES, join_inputs, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
 from marlbc_mj.training.general.config import GeneralConfig
 from marlbc_mj.util.seeding import stream
+
+NEAREST_SIGHT = 6
+"""Bins of a lane that a guided episode looks at, at least: 9 settling times ahead."""
 
 
 class SquadOutcome(NamedTuple):
@@ -48,6 +51,9 @@ class Squad:
         self.heard = np.zeros((config.worlds, scenario.agents, *self._sense().shape[1:]), dtype=np.float32)
         self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
         self.loss = np.zeros(config.worlds)  # share of messages missed
+        self.bins = np.zeros(
+            config.worlds, dtype=np.int64
+        )  # of lanes, that the look-ahead of a guided episode sees; 0: not guided
         self.end = np.full(config.worlds, scenario.mission_steps)  # mission step from which no decision is left
         self._restart(np.ones(config.worlds, dtype=bool))
         self.end = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that phases differ
@@ -74,6 +80,7 @@ class Squad:
 
     def step(self, greedy: np.ndarray, temperature: float) -> SquadOutcome:
         """One decision: ``greedy`` (W, N) actions, or what is explored instead; see :class:`Exploration` for the temperature."""
+        greedy = np.where(self.bins[:, None] > 0, look_ahead(self.inputs, self.last, self.bins)[:, None], greedy)
         actions = self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
         self.last = actions
@@ -102,7 +109,7 @@ class Squad:
 
     def _plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""
-        own = ("last", "heard", "age", "loss", "end", "inputs")
+        own = ("last", "heard", "age", "loss", "bins", "end", "inputs")
         return [*((self, name) for name in own), *((self.explore, name) for name in ("left", "held"))]
 
     def _restart(self, ended: np.ndarray) -> None:
@@ -115,3 +122,19 @@ class Squad:
         self.age[ended] = np.inf
         lossy = self.rng.random(count) < config.lossy
         self.loss[ended] = np.where(lossy, self.rng.uniform(0.0, config.most_loss, count), 0.0)
+        guided = self.rng.random(count) < config.guided
+        self.bins[ended] = np.where(guided, self.rng.integers(NEAREST_SIGHT, LANE_BINS, count, endpoint=True), 0)
+
+
+def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.ndarray:
+    """(W,) one action per team: the column while two lanes of the formation are blocked, or the way back is for anybody.
+
+    Args:
+        inputs: (W, N, S) of all agents.
+        last: (W, N) actions in force.
+        bins: (W,) first bins of the lanes that are looked at.
+    """
+    seen = np.arange(LANE_BINS) < bins[:, None, None]
+    blocked = (np.where(seen, inputs[..., :LANE_BINS], np.inf) < 0.0).any(axis=-1)
+    back = (last == COLUMN_ACTION).any(axis=1) & (inputs[..., LANES] < 0.0).any(axis=1)
+    return np.where((blocked.sum(axis=1) >= 2) | back, COLUMN_ACTION, FORMATION)

@@ -16,8 +16,8 @@ from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Perturbation, Scenario, held_out, make_scenario, standard_behaviors
 from marlbc_mj.scenarios.base import YOUNG
-from marlbc_mj.scenarios.families import Field
 from marlbc_mj.scenarios.robot_gate import AIR_DRAG
+from marlbc_mj.scenarios.teams import team_mission
 from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.provenance import plain_data
@@ -41,12 +41,6 @@ HASH_DIGITS = 9
 SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
 SUITE_TEAMS = (("circle", 8), ("line", 6), ("grid", 9), ("wedge", 16), ("grid", 32))
 TEAM_FAMILIES = ("field", "forest", "gates")
-ROOM: dict[int, dict[str, Any]] = {16: {"length": 120.0, "files": 2}, 32: {"length": 120.0, "files": 4}}
-"""A longer way and a shorter column for large teams: in one file they would never be through before the end."""
-OPENING = {16: 8.0, 32: 14.0}
-"""Width of the gates that a column of several files passes [m]."""
-DISC_DENSITY = 12 / 912.0
-"""Discs per square metre, as in the field of four agents."""
 SUITE_ROBOTS = ("disc", "omni", "diff_drive", "crazyflie")
 
 
@@ -94,22 +88,15 @@ def _families() -> list[SuiteMission]:
 
 def _teams() -> list[SuiteMission]:
     return [
-        SuiteMission("teams", f"{formation}{agents}-{family}", _team(family, formation, agents), seed_range(200, SUITE_SEED))
+        SuiteMission(
+            "teams",
+            f"{formation}{agents}-{family}",
+            _unseen(team_mission(family, formation, agents)),
+            seed_range(200, SUITE_SEED),
+        )
         for formation, agents in SUITE_TEAMS
         for family in TEAM_FAMILIES
     ]
-
-
-def _team(family: str, formation: str, agents: int) -> Scenario:
-    """A family for a team of this size, with as many discs on a square metre as the team of four has."""
-    changes = {"agents": agents, "formation": formation, **ROOM.get(agents, {})}
-    if family == "field":
-        wide = Field(**changes)
-        area = (wide.way[1] - wide.way[0]) * 2.0 * (wide.reach + wide.margin)
-        changes["obstacles"] = round(DISC_DENSITY * area)
-    if family == "gates" and agents in OPENING:
-        changes["width"] = OPENING[agents]
-    return _unseen(make_scenario(family, **changes))
 
 
 def _robots() -> list[SuiteMission]:

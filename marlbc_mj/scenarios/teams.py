@@ -1,0 +1,48 @@
+"""Missions for a team of any size: large teams have a longer way, a column of several files and wider openings, and a field has
+as many discs on a square metre as the field of four agents.
+"""
+
+from typing import Any
+
+from marlbc_mj.scenarios.base import Scenario
+from marlbc_mj.scenarios.families import FAMILIES, Field, Gates
+
+AGENTS_IN_A_FILE = 8
+"""Agents that a file of the column has, about."""
+LONG_WAY = 120.0
+"""Way of a team whose column has several files [m]."""
+DISC_DENSITY = 12 / 912.0
+"""Discs per square metre, as in the field of four agents."""
+
+
+def files_of(agents: int) -> int:
+    """Files of a team's column."""
+    return max(1, (agents + AGENTS_IN_A_FILE // 2) // AGENTS_IN_A_FILE)
+
+
+def team_settings(family: str, formation: str, agents: int, long_way: float = LONG_WAY) -> dict[str, Any]:
+    """Fields of a family for a team of this size.
+
+    In one file, a large team would never be through before the end. The opening of gates and corridors is wider by the width of
+    the column. ``long_way`` [m] is the way of a team whose column has several files.
+    """
+    files = files_of(agents)
+    changes: dict[str, Any] = {"agents": agents, "formation": formation}
+    if files > 1:
+        changes |= {"length": long_way, "files": files}
+    mission = FAMILIES[family](**changes)
+    if isinstance(mission, Gates):
+        changes["width"] = mission.width + (files - 1) * mission.column_spacing
+    if type(mission) is Field:
+        area = (mission.way[1] - mission.way[0]) * 2.0 * (mission.reach + mission.margin)
+        changes["obstacles"] = round(DISC_DENSITY * area)
+    return changes
+
+
+def team_mission(family: str, formation: str, agents: int, *, long_way: float = LONG_WAY, **changes: Any) -> Scenario:
+    """A family for a team of this size, see :func:`team_settings`; ``changes`` are other fields.
+
+    Raises:
+        ConfigurationError: what the family cannot fly.
+    """
+    return FAMILIES[family]().build(**{**team_settings(family, formation, agents, long_way), **changes})
