@@ -65,6 +65,8 @@ class ScenarioOptions:
     """Size of the team, 2 to 256, for scenarios that are made for any."""
     formation: SomeFormation = None
     """Formation of the team, for the same scenarios."""
+    room: bool = False
+    """Give a team the room that it needs: from 12 agents on a longer way, a column of several files and wider openings."""
     split: SomeSplit = None
     """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
     set: ScenarioSettings = ()
@@ -77,10 +79,13 @@ class ScenarioOptions:
         """The named scenario with these changes."""
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
+        from marlbc_mj.scenarios.teams import room_for
         from marlbc_mj.util.changes import with_settings
 
         keys = ("substep", "reference", "composition", "force_limit", "duration", "agents", "formation", "split")
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
+        if self.room:
+            changes = {**room_for(name, self.formation, self.agents), **changes}
         if self.two_sided:
             changes["two_sided"] = True
         if self.disturbance is not None or self.drag_scale is not None:

@@ -6,6 +6,7 @@ from typing import Any
 
 from marlbc_mj.scenarios.base import Scenario
 from marlbc_mj.scenarios.families import FAMILIES, Field, Gates
+from marlbc_mj.util.errors import unknown
 
 AGENTS_IN_A_FILE = 8
 """Agents that a file of the column has, about."""
@@ -37,6 +38,18 @@ def team_settings(family: str, formation: str, agents: int, long_way: float = LO
         area = (mission.way[1] - mission.way[0]) * 2.0 * (mission.reach + mission.margin)
         changes["obstacles"] = round(DISC_DENSITY * area)
     return changes
+
+
+def room_for(family: str, formation: str | None, agents: int | None) -> dict[str, Any]:
+    """:func:`team_settings` of a family's own team, or of another formation or size.
+
+    Raises:
+        ConfigurationError: no such family.
+    """
+    if family not in FAMILIES:
+        raise unknown("family that can make room for a team", family, FAMILIES)
+    own = FAMILIES[family]()
+    return team_settings(family, formation or own.formation, agents or own.agents)
 
 
 def team_mission(family: str, formation: str, agents: int, *, long_way: float = LONG_WAY, **changes: Any) -> Scenario:
