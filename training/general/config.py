@@ -51,13 +51,13 @@ class GeneralConfig:
     """Checkpoint of a general policy whose network learning begins with; a random one by default."""
     first_temperature: Annotated[float, POSITIVE] = 1.0
     """Temperature at the start, below 1 for a network that has learned before."""
-    families: Annotated[tuple[str, ...], _NAMED] = DRAWN
+    families: Annotated[tuple[str, ...], _NAMED] = (*DRAWN, "field", "gates", "corridor")
     """Families that are trained on; one that is named twice counts twice."""
     teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "circle-8", "line-6", "grid-9", "wedge-16", "grid-16")
     """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
     long_way: Annotated[float, POSITIVE] = 80.0
     """Way of teams whose column has several files [m]; evaluations have 120 m."""
-    worlds: Annotated[int, AT_LEAST_ONE] = 2
+    worlds: Annotated[int, AT_LEAST_ONE] = 1
     """Worlds of every family and team, all stepped together."""
     controller: str = "pd"
     """Controller that tracks the references while learning; evaluations have sorlc."""

@@ -8,7 +8,7 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, decision_steps, motion_orders
-from marlbc_mj.policies.general_inputs import LANE_BINS, LANES, join_inputs, make_sight, sense_features
+from marlbc_mj.policies.general_inputs import COARSE, LANE_BINS, LANES, WAYS, join_inputs, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
@@ -20,12 +20,19 @@ NEAREST_SIGHT = 6
 """Bins of a lane that a guided episode looks at, at least: 9 settling times ahead."""
 
 
+LOST_AFTER = 6
+"""Decisions for which an agent is shut out until it is lost."""
+LOST_BEYOND = 8.0
+"""Distance from both slots beyond which an agent is far [d_OA]."""
+
+
 class SquadOutcome(NamedTuple):
     """Outcome of one decision of W teams."""
 
     reward: np.ndarray  # (W, N) float32
     final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
     ended: np.ndarray  # (W,) bool, a new episode has begun
+    lost: np.ndarray  # (W,) bool, because an agent was lost: the reward has the cost of the time after that, too
     steps: int  # mission steps made, over all worlds
 
 
@@ -54,6 +61,7 @@ class Squad:
         self.bins = np.zeros(
             config.worlds, dtype=np.int64
         )  # of lanes, that the look-ahead of a guided episode sees; 0: not guided
+        self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
         self.end = np.full(config.worlds, scenario.mission_steps)  # mission step from which no decision is left
         self._restart(np.ones(config.worlds, dtype=bool))
         self.end = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that phases differ
@@ -88,12 +96,21 @@ class Squad:
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         reward = team[:, None] - self.config.switch_cost * switched
         final = self._exchange()
-        ended = self.world.state.steps >= self.end
+        lost = self._lost(final)
+        reward[lost] = -1.0 / (1.0 - self.config.gamma)
+        ended = lost | (self.world.state.steps >= self.end)
         self.inputs = final
         if ended.any():
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
-        return SquadOutcome(reward.astype(np.float32), final, ended, self.interval * len(actions))
+        return SquadOutcome(reward.astype(np.float32), final, ended, lost, self.interval * len(actions))
+
+    def _lost(self, inputs: np.ndarray) -> np.ndarray:
+        """(W,) bool: an agent has been shut out for LOST_AFTER decisions. Obstacles that move let it in again."""
+        if self.scenario.motions:
+            return self.astray > LOST_AFTER
+        self.astray = np.where(shut_out(inputs).any(axis=1), self.astray + 1, 0)
+        return self.astray >= LOST_AFTER
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """Everything that the squad needs to go on bit for bit: arrays, and the rest as JSON data."""
@@ -109,7 +126,7 @@ class Squad:
 
     def _plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""
-        own = ("last", "heard", "age", "loss", "bins", "end", "inputs")
+        own = ("last", "heard", "age", "loss", "bins", "astray", "end", "inputs")
         return [*((self, name) for name in own), *((self.explore, name) for name in ("left", "held"))]
 
     def _restart(self, ended: np.ndarray) -> None:
@@ -120,10 +137,17 @@ class Squad:
         self.last[ended] = FORMATION
         self.end[ended] = self.scenario.mission_steps - self.interval + 1
         self.age[ended] = np.inf
+        self.astray[ended] = 0
         lossy = self.rng.random(count) < config.lossy
         self.loss[ended] = np.where(lossy, self.rng.uniform(0.0, config.most_loss, count), 0.0)
         guided = self.rng.random(count) < config.guided
         self.bins[ended] = np.where(guided, self.rng.integers(NEAREST_SIGHT, LANE_BINS, count, endpoint=True), 0)
+
+
+def shut_out(inputs: np.ndarray) -> np.ndarray:
+    """(W, N) bool: agents far from both slots whose ways to both are blocked; ``inputs`` (W, N, S)."""
+    far = np.tanh(LOST_BEYOND / COARSE)
+    return (inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & (inputs[..., WAYS + 1] > far) & (inputs[..., WAYS + 3] > far)
 
 
 def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.ndarray:
