@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION
-from marlbc_mj.policies.general_inputs import INPUTS, LANES
+from marlbc_mj.policies.general_inputs import INPUTS, LANES, WAYS
 from marlbc_mj.scenarios import FAMILIES
 from marlbc_mj.scenarios.teams import files_of, room_for, team_mission
-from marlbc_mj.training.general.squads import look_ahead
+from marlbc_mj.training.general.config import GeneralConfig, learner_config
+from marlbc_mj.training.general.squads import LOST_AFTER, Squad, look_ahead, shut_out
 from marlbc_mj.util.errors import ConfigurationError
 
 TEAMS = [("wedge", 4), ("circle", 8), ("line", 6), ("grid", 9), ("circle", 12), ("wedge", 16), ("grid", 16), ("grid", 32)]
@@ -43,3 +44,27 @@ def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
     assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, FORMATION]
     last[3, 2] = COLUMN_ACTION
     assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, COLUMN_ACTION]
+
+
+def test_shut_out_is_far_from_both_slots_with_both_ways_blocked() -> None:
+    inputs = np.zeros((1, 4, INPUTS))
+    inputs[..., LANES:WAYS] = -1.0
+    inputs[..., [WAYS + 1, WAYS + 3]] = 0.99
+    inputs[0, 1, LANES + 1] = 0.1
+    inputs[0, 2, WAYS + 3] = 0.5
+    inputs[0, 3, LANES] = 0.0
+    assert shut_out(inputs).tolist() == [[True, False, False, False]]
+
+
+def test_an_episode_ends_where_an_agent_is_lost() -> None:
+    """A team that never leaves its formation is lost at a gate; the cost of all time to come is in the last reward."""
+    config = GeneralConfig(families=("gates",), teams=("line-6",), lossy=0.0, guided=0.0, least_exploration=0.0)
+    squad = Squad(team_mission("gates", "line", 6, composition="set-based", substep=0.01), config, learner_config(config), 0)
+    squad.end[:] = squad.scenario.mission_steps
+    greedy = np.full((1, 6), FORMATION)
+    outcomes = [squad.step(greedy, 0.0) for _ in range(90)]
+    first = next(k for k, outcome in enumerate(outcomes) if outcome.lost.any())
+    assert first > LOST_AFTER
+    assert outcomes[first].ended.all()
+    np.testing.assert_allclose(outcomes[first].reward, -1.0 / (1.0 - config.gamma), rtol=1e-6)
+    assert all(outcome.reward.min() >= -1.0 for outcome in outcomes[:first])
