@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from marlbc_mj.core import laws
-from marlbc_mj.core.behaviors import Behavior, Formation, ObstacleAvoidance, nearest_obstacle
+from marlbc_mj.core.behaviors import Behavior, Formation, LineFormation, ObstacleAvoidance, nearest_obstacle
 from marlbc_mj.util.errors import ConfigurationError
 
 STEP = 1e-6  # of the finite differences [m]
@@ -156,3 +156,28 @@ def test_offsets_that_are_not_finite_are_refused():
     """The message shows them."""
     with pytest.raises(ConfigurationError, match="nan"):
         Formation("FM", ((0.0, np.nan),))
+
+
+@given(points, paths, points)
+def test_along_the_line_of_a_slot_only_near_that_line(p, path, slot):
+    """Across the path it is FR. Along the path it is FR on the line, between 0 and FR near it, and 0 from the width on."""
+    assume(np.linalg.norm(path[1]) > 1e-3)
+    along = path[1] / np.linalg.norm(path[1])
+    across = np.array([-along[1], along[0]])
+    straight, jacobian = evaluate(Formation("FR", (tuple(slot),), 2.0), p, path=path)
+    line, same = evaluate(LineFormation("FR", (tuple(slot),), 2.0, width=3.0), p, path=path)
+    np.testing.assert_array_equal(jacobian, same)
+    assert across @ line == pytest.approx(across @ straight, abs=1e-9)
+    share = max(0.0, 1.0 - (across @ (path[0] + slot - p) / 3.0) ** 2)
+    assert along @ (line - path[1]) == pytest.approx(share * (along @ (straight - path[1])), abs=1e-9)
+
+
+def test_a_path_at_rest_has_no_lines():
+    p, slot = np.array([1.0, 2.0]), ((5.0, -3.0),)
+    straight, line = (evaluate(kind("FR", slot, 2.0), p)[0] for kind in (Formation, LineFormation))
+    np.testing.assert_array_equal(line, straight)
+
+
+def test_a_line_has_a_width():
+    with pytest.raises(ConfigurationError, match="FR width"):
+        LineFormation("FR", ((0.0, 0.0),), width=0.0)

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from marlbc_mj import World
+from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION
 from marlbc_mj.policies.general_inputs import INPUTS, LANES, WAYS
 from marlbc_mj.scenarios import FAMILIES
@@ -68,3 +70,17 @@ def test_an_episode_ends_where_an_agent_is_lost() -> None:
     assert outcomes[first].ended.all()
     np.testing.assert_allclose(outcomes[first].reward, -1.0 / (1.0 - config.gamma), rtol=1e-6)
     assert all(outcome.reward.min() >= -1.0 for outcome in outcomes[:first])
+
+
+@pytest.mark.parametrize("approach", ["straight", "line"])
+def test_who_is_late_finds_the_opening_along_its_line(approach: str) -> None:
+    """Agents in front of the walls beside an opening that their column has passed: straight they stay, by lines they do not."""
+    scenario = team_mission("gates", "line", 6, composition="set-based", substep=0.01, column_approach=approach, gates=1)
+    world = World(scenario, make_controller("pd"))
+    world.reset(0)
+    formation, column = (scenario.orders.index(name) for name in scenario.formation_names)
+    steps = scenario.mission_steps
+    world.rollout(np.full((int(0.6 * steps), 1, 6), formation))
+    world.rollout(np.full((int(0.3 * steps), 1, 6), column))
+    x = world.observe().position[0, :, 0]
+    assert (x > 35.0).all() == (approach == "line")

@@ -67,6 +67,8 @@ class ScenarioOptions:
     """Formation of the team, for the same scenarios."""
     room: bool = False
     """Give a team the room that it needs: from 12 agents on a longer way, a column of several files and wider openings."""
+    along_lines: bool = False
+    """Agents come to their slots in the column along the slots' lines, not straight: first across the path, then along it."""
     split: SomeSplit = None
     """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
     set: ScenarioSettings = ()
@@ -86,6 +88,8 @@ class ScenarioOptions:
         changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
         if self.room:
             changes = {**room_for(name, self.formation, self.agents), **changes}
+        if self.along_lines:
+            changes["column_approach"] = "line"
         if self.two_sided:
             changes["two_sided"] = True
         if self.disturbance is not None or self.drag_scale is not None:

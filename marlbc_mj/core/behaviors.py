@@ -139,6 +139,30 @@ def formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out
     return 2
 
 
+@laws.behavior(gains={"gain": (), "width": (), "slot": 2})
+def line_formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
+    """FR along the line of its slot: v = p_cd' + Lambda (s e_a + e_c), s = max(0, 1 - (|e_c| / w)^2), J = I.
+
+    e_a and e_c are the parts of the slot's error along the path and across it. So an agent first goes to the line that its slot
+    moves on, and along it only then: beside an opening it does not run into the wall. On the line it is :func:`formation`, and so
+    it is on a path at rest. The two parts are those of line-of-sight guidance (T. I. Fossen, Handbook of Marine Craft
+    Hydrodynamics and Motion Control, 2011, section 10.3); the factor s is the project's.
+    """
+    speed = np.sqrt(path[1, 0] ** 2 + path[1, 1] ** 2)
+    x, y = path[0, 0] + gains.slot[0] - p[0], path[0, 1] + gains.slot[1] - p[1]
+    share, ux, uy = 1.0, 1.0, 0.0
+    if speed > 0.0:
+        ux, uy = path[1, 0] / speed, path[1, 1] / speed
+        share = max(0.0, 1.0 - ((ux * y - uy * x) / gains.width) ** 2)
+    along = (1.0 - share) * (ux * x + uy * y)
+    velocity_out[0] = path[1, 0] + gains.gain * (x - along * ux)
+    velocity_out[1] = path[1, 1] + gains.gain * (y - along * uy)
+    for axis in range(2):
+        for other in range(2):
+            jacobian_out[axis, other] = 1.0 if other == axis else 0.0
+    return 2
+
+
 @runtime_checkable
 class Behavior(Protocol):
     """The interface of behaviors: a name, the law, whether J has full rank, and the gains."""
@@ -210,6 +234,18 @@ class Formation:
 
     def params(self, agent: int) -> laws.Numbers:
         return laws.gains_of(self, slot=self.offsets[agent])
+
+
+@dataclass(frozen=True)
+class LineFormation(Formation):
+    """Hold a slot, and come to it along the line that it moves on."""
+
+    width: float = 1.5  # w: as far from that line nothing is done about the error along it [m]
+    law = staticmethod(line_formation)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _require_positive(f"{self.name} width", self.width)
 
 
 def _require_positive(what: str, value: float) -> None:

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.behaviors import AgentAvoidance, Behavior, Formation, ObstacleAvoidance
+from marlbc_mj.core.behaviors import AgentAvoidance, Behavior, Formation, LineFormation, ObstacleAvoidance
 from marlbc_mj.core.communication import IDEAL, Communication
 from marlbc_mj.core.disturbances import Disturbance, PaperDrag
 from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
@@ -327,11 +327,18 @@ def standard_behaviors(
     safe_distance: float = 2.0,
     two_sided: bool = False,
     agent_distance: float | None = None,
+    line_width: float | None = None,
 ) -> tuple[Behavior, ...]:
-    """OA, FM and FR in this order, with the gains of Table 2; then AA with OA's gain, if ``agent_distance`` is given."""
+    """OA, FM and FR in this order, with the gains of Table 2; then AA with OA's gain, if ``agent_distance`` is given.
+
+    With ``line_width`` [m], FR comes to its slots along their lines, see :class:`~marlbc_mj.core.behaviors.LineFormation`.
+    """
+    column = Formation("FR", reconstruction, formation_gain)
+    if line_width is not None:
+        column = LineFormation("FR", reconstruction, formation_gain, line_width)
     return (
         ObstacleAvoidance(avoidance_gain, safe_distance, two_sided),
         Formation("FM", formation, formation_gain),
-        Formation("FR", reconstruction, formation_gain),
+        column,
         *(() if agent_distance is None else (AgentAvoidance(avoidance_gain, agent_distance),)),
     )

@@ -41,6 +41,7 @@ class Mission:
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"
     composition: Literal["null-space", "set-based"] = "null-space"  # avoidance as an equality task, or as an inequality
+    column_approach: Literal["straight", "line"] = "straight"  # how FR comes to its slots: straight, or along their lines
     robot: str = "point_mass"
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
@@ -60,7 +61,7 @@ class Mission:
     def behaviors_for(
         self, slots: tuple[Point, ...], column: tuple[Point, ...], *, two_sided: bool = False
     ) -> tuple[Behavior, ...]:
-        """OA, FM and FR, and AA where agents avoid each other."""
+        """OA, FM and FR, and AA where agents avoid each other. A line is as wide as agents keep apart."""
         return standard_behaviors(
             slots,
             column,
@@ -69,6 +70,7 @@ class Mission:
             safe_distance=self.safe_distance,
             two_sided=two_sided,
             agent_distance=self.agent_distance if self.agent_avoidance else None,
+            line_width=self.agent_distance if self.column_approach == "line" else None,
         )
 
 
