@@ -45,7 +45,7 @@ class GeneralConfig:
 
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Random seed of network, exploration, layouts and the draws from the replay buffer."""
-    budget: Annotated[int, AT_LEAST_ONE] = 1_200_000
+    budget: Annotated[int, AT_LEAST_ONE] = 2_400_000
     """Mission steps, over all worlds."""
     start: str = ""
     """Checkpoint of a general policy whose network learning begins with; a random one by default."""
@@ -113,7 +113,7 @@ class GeneralConfig:
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
 
-    evaluate_every: Annotated[int, AT_LEAST_ONE] = 400_000
+    evaluate_every: Annotated[int, AT_LEAST_ONE] = 1_200_000
     """Mission steps between evaluations on held-out layouts."""
     save_every: Annotated[float, NOT_NEGATIVE] = 120.0
     """Time between saves for --resume [s]; a save of the default buffer takes 0.4 GB."""

@@ -1,5 +1,6 @@
 """Copies a run of the general policy into the package, with its model card."""
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +46,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         f"between formation and column, from {FEATURES} numbers that it senses and {INPUTS - FEATURES} that it pools of what it "
         "heard. It needs the set-based composition, a formation with a column and a path that moves.",
         "",
-        f"- Trained on {', '.join(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
+        f"- Trained on {_counted(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
         f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
         "twice.",
         f"- Command: `marlbc train {GENERAL} --seed {train['seed']}{''.join(map(' {}'.format, _changed(train)))}`",
@@ -58,6 +59,11 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         pipe_table(("mission steps", *families), [_curve_cells(row, families) for row in rows]),
     ]
     return "\n".join(lines) + "\n"
+
+
+def _counted(names: list[str]) -> str:
+    """Names, with how often each is there where that is more than once."""
+    return ", ".join(name if n == 1 else f"{name} ({n} times)" for name, n in Counter(names).items())
 
 
 def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
