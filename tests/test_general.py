@@ -19,8 +19,9 @@ from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, read_general, write_general
 from marlbc_mj.policies.shipped import shipped
+from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.supervisors import General, make_supervisor
-from marlbc_mj.training.general.config import GeneralConfig, input_mask, read_team
+from marlbc_mj.training.general.config import GeneralConfig, input_mask
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.general.trainer import GeneralTrainer

@@ -4,9 +4,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional
+from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from marlbc_mj.cli.choices import (
     Compositions,
@@ -330,6 +330,8 @@ class SafetyCommand:
 
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, or draws around the case study."""
+    teams: Annotated[tuple[str, ...], arg(metavar="TEAM ...")] = ()
+    """Teams that fly the families, FORMATION-AGENTS each, with the room that they need; each family's own by default."""
     supervisors: SomeSupervisors = None
     """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
     compositions: Compositions = ("null-space", "set-based")
@@ -361,6 +363,8 @@ class SafetyCommand:
         settings: dict[str, Any] = {name: getattr(self, name) for name in names}
         if self.supervisors is not None:
             settings["supervisors"] = self.supervisors
+        if self.teams:
+            settings["missions"] = tuple(f"{mission}-{team}" for team in self.teams for mission in self.missions)
         study = SafetyStudy(**settings, shields=tuple(shield == "yes" for shield in self.shields))
         with self.output.progress() as told:
             done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=told.progress)

@@ -2,11 +2,12 @@
 as many discs on a square metre as the field of four agents.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from marlbc_mj.scenarios.base import Scenario
 from marlbc_mj.scenarios.families import FAMILIES, Field, Gates
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.scenarios.formations import FORMATIONS
+from marlbc_mj.util.errors import ConfigurationError, unknown
 
 AGENTS_IN_A_FILE = 8
 """Agents that a file of the column has, about."""
@@ -14,6 +15,29 @@ LONG_WAY = 120.0
 """Way of a team whose column has several files [m]."""
 DISC_DENSITY = 12 / 912.0
 """Discs per square metre, as in the field of four agents."""
+
+
+class TeamName(NamedTuple):
+    """A team by formation and size."""
+
+    formation: str
+    agents: int
+
+
+def read_team(name: str) -> TeamName:
+    """A team from its text, ``wedge-4``.
+
+    Raises:
+        ConfigurationError: another form, an unknown formation, or a team of one.
+    """
+    formation, dash, agents = name.partition("-")
+    if not (dash and agents.isdigit()):
+        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {name!r}")
+    if formation not in FORMATIONS:
+        raise unknown("formation", formation, FORMATIONS)
+    if int(agents) < 2:
+        raise ConfigurationError(f"a team needs at least 2 agents, got {name!r}")
+    return TeamName(formation, int(agents))
 
 
 def files_of(agents: int) -> int:

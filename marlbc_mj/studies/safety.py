@@ -16,8 +16,9 @@ from marlbc_mj.report.safety_tables import safety_tables, write_cells
 from marlbc_mj.report.table import to_markdown
 from marlbc_mj.results.layouts import CellScores, LayoutMark, Marks, MissionCell, mark
 from marlbc_mj.results.seeds import SeedRun, seed_range
-from marlbc_mj.scenarios import Scenario, held_out, make_scenario
+from marlbc_mj.scenarios import FAMILIES, Scenario, held_out, make_scenario
 from marlbc_mj.scenarios.base import COMPOSITIONS
+from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.draws import SEEDS_PER_JOB, with_drag_range
 from marlbc_mj.studies.protocol import Report, Watch
@@ -172,12 +173,16 @@ def fly_cell(cell: MissionCell, controller: str, seeds: Sequence[int], progress:
 
 
 def ground(name: str) -> Scenario:
-    """The scenario of a mission: held-out layouts of a family, or draws around the case study.
+    """The scenario of a mission: held-out layouts of a family, ``gates``, or of a family with a team, ``gates-grid-9``, see
+    :mod:`marlbc_mj.scenarios.teams`; or draws around the case study.
 
     Raises:
-        ConfigurationError: an unknown scenario, or one that draws no layouts.
+        ConfigurationError: an unknown scenario or team, or a scenario that draws no layouts.
     """
     if name in DRAG_DRAWS:
         drag = DRAG_DRAWS[name][0]
         return with_drag_range(make_scenario("paper"), (drag, drag))
+    family, _, team = name.partition("-")
+    if team and family in FAMILIES:
+        return held_out(team_mission(family, *read_team(team)))
     return held_out(make_scenario(name))

@@ -1,16 +1,15 @@
 """Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
 from marlbc_mj.scenarios import Perturbation, Scenario
-from marlbc_mj.scenarios.formations import FORMATIONS
-from marlbc_mj.scenarios.teams import team_mission
+from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import unknown
 from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
 
 GENERAL = "marlms-general"
@@ -26,13 +25,6 @@ HIDEABLE = ("pooled", "lanes", "column-lane", "ways")
 _NAMED = Rule("must name at least one", bool)
 _LAYERS = Rule("layers must have at least one unit", lambda widths: bool(widths) and min(widths) >= 1)
 _DISCOUNT = Rule("must be at least 0 and below 1", lambda gamma: 0 <= gamma < 1)
-
-
-class TeamName(NamedTuple):
-    """A team by formation and size."""
-
-    formation: str
-    agents: int
 
 
 @dataclass(frozen=True)
@@ -132,22 +124,6 @@ class GeneralConfig:
                 raise unknown("group of inputs", name, HIDEABLE)
         for name in self.teams:
             read_team(name)
-
-
-def read_team(name: str) -> TeamName:
-    """A team from its text, ``wedge-4``.
-
-    Raises:
-        ConfigurationError: another form, an unknown formation, or a team of one.
-    """
-    formation, dash, agents = name.partition("-")
-    if not (dash and agents.isdigit()):
-        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {name!r}")
-    if formation not in FORMATIONS:
-        raise unknown("formation", formation, FORMATIONS)
-    if int(agents) < 2:
-        raise ConfigurationError(f"a team needs at least 2 agents, got {name!r}")
-    return TeamName(formation, int(agents))
 
 
 def training_scenarios(config: GeneralConfig) -> list[Scenario]:
