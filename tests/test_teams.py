@@ -68,8 +68,8 @@ def test_an_episode_ends_where_an_agent_is_lost() -> None:
     first = next(k for k, outcome in enumerate(outcomes) if outcome.lost.any())
     assert first > LOST_AFTER
     assert outcomes[first].ended.all()
-    np.testing.assert_allclose(outcomes[first].reward, -1.0 / (1.0 - config.gamma), rtol=1e-6)
-    assert all(outcome.reward.min() >= -1.0 for outcome in outcomes[:first])
+    np.testing.assert_allclose(outcomes[first].reward, -1.3 / (1.0 - config.gamma), rtol=1e-6)
+    assert all(outcome.reward.min() >= -1.3 for outcome in outcomes[:first])
 
 
 @pytest.mark.parametrize("approach", ["straight", "line"])

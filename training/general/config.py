@@ -44,7 +44,7 @@ class GeneralConfig:
     first_temperature: Annotated[float, POSITIVE] = 1.0
     """Temperature at the start, below 1 for a network that has learned before."""
     families: Annotated[tuple[str, ...], _NAMED] = (*DRAWN, "field", "gates", "corridor")
-    """Families that are trained on; one that is named twice counts twice."""
+    """Families that are trained on. Where one is named again, FR comes to its slots along their lines (``--along-lines``)."""
     teams: Annotated[tuple[str, ...], _NAMED] = ("wedge-4", "circle-8", "line-6", "grid-9", "wedge-16", "grid-16")
     """Teams that are trained on, FORMATION-AGENTS each; every family with every team."""
     long_way: Annotated[float, POSITIVE] = 80.0
@@ -100,6 +100,8 @@ class GeneralConfig:
     """Share of episodes in which the team takes the actions of a look-ahead, where it does not explore."""
     switch_cost: Annotated[float, NOT_NEGATIVE] = 0.3
     """Cost of an agent's own switch; a decision in formation costs nothing, in column 0.5, in neither 1."""
+    stray_cost: Annotated[float, NOT_NEGATIVE] = 0.3
+    """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     switching_margin: float = 0.05
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
@@ -131,8 +133,9 @@ def training_scenarios(config: GeneralConfig) -> list[Scenario]:
     spread = Perturbation(start_spread=config.start_spread, drag_scale=(0.0, config.most_drag))
     changes: dict[str, Any] = {"substep": config.substep, "composition": "set-based", "perturbation": spread}
     return [
-        team_mission(family, *team, long_way=config.long_way, **changes)
-        for family in config.families
+        team_mission(family, *team, long_way=config.long_way, column_approach=approach, **changes)
+        for k, family in enumerate(config.families)
+        for approach in ["line" if family in config.families[:k] else "straight"]
         for team in map(read_team, config.teams)
     ]
 

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.controllers import make_controller
+from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, decision_steps, motion_orders
@@ -94,10 +95,10 @@ class Squad:
         self.last = actions
         returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
-        reward = team[:, None] - self.config.switch_cost * switched
         final = self._exchange()
+        reward = team[:, None] - self.config.switch_cost * switched - self.config.stray_cost * final[..., WAYS + 1]
         lost = self._lost(final)
-        reward[lost] = -1.0 / (1.0 - self.config.gamma)
+        reward[lost] = -(1.0 + self.config.stray_cost) / (1.0 - self.config.gamma)
         ended = lost | (self.world.state.steps >= self.end)
         self.inputs = final
         if ended.any():
@@ -106,9 +107,9 @@ class Squad:
         return SquadOutcome(reward.astype(np.float32), final, ended, lost, self.interval * len(actions))
 
     def _lost(self, inputs: np.ndarray) -> np.ndarray:
-        """(W,) bool: an agent has been shut out for LOST_AFTER decisions. Obstacles that move let it in again."""
-        if self.scenario.motions:
-            return self.astray > LOST_AFTER
+        """(W,) bool: an agent has been shut out for LOST_AFTER decisions, and neither its line nor moving obstacles let it in."""
+        if self.scenario.motions or any(isinstance(behavior, LineFormation) for behavior in self.scenario.behaviors):
+            return np.zeros(len(inputs), dtype=bool)
         self.astray = np.where(shut_out(inputs).any(axis=1), self.astray + 1, 0)
         return self.astray >= LOST_AFTER
 
