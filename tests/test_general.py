@@ -17,16 +17,18 @@ from marlbc_mj.cli import main
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, read_general, write_general
+from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, mean_policy, read_general, write_general
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.supervisors import General, make_supervisor
 from marlbc_mj.training.general.config import GeneralConfig, input_mask
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.training.general.run import train_general
+from marlbc_mj.training.general.shipping import ship_mean
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.run import RESUME, Interrupted
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.provenance import plain_data
 
 SMALL = GeneralConfig(budget=400, families=("field",), teams=("wedge-4",), worlds=2, hidden=(8,), updates=2, batch=16, layouts=1)
 
@@ -230,6 +232,35 @@ def test_checkpoints_of_another_kind_are_refused(tmp_path: Path, changes, arrays
 def test_a_checkpoint_of_one_team_is_no_general_policy() -> None:
     with pytest.raises(ConfigurationError, match="of a single team"):
         read_general(shipped("marlms"))
+
+
+def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
+    """As one network, also of three layers; a mean of none is refused."""
+    deep = [with_middle_layer(random_policy(seed), seed) for seed in range(3)]
+    seen = np.random.default_rng(0).normal(size=(7, inputs.INPUTS)).astype(np.float32)
+    for policies in ([random_policy(1), random_policy(2)], deep):
+        mean = np.mean([policy.values(seen) for policy in policies], axis=0)
+        np.testing.assert_allclose(mean_policy(policies, 0.05).values(seen), mean, rtol=1e-4, atol=1e-4)
+    with pytest.raises(ConfigurationError, match="at least one policy"):
+        mean_policy([], 0.0)
+
+
+def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
+    run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0, "cpu_s": 1.0}, "git_revision": "abc"}
+    for k in range(2):
+        write_general(tmp_path / f"{k}.safetensors", random_policy(k), run)
+    shipped_to = ship_mean([tmp_path / "0.safetensors", tmp_path / "1.safetensors"], "both", tmp_path)
+    assert read_general(shipped_to)[1]["mean_of"] == [run, run]
+    assert shipped_to.with_suffix(".md").read_text().count("marlbc train marlms-general --seed 0 --set budget=400") == 2
+    with pytest.raises(ConfigurationError, match="exists"):
+        ship_mean([shipped_to], "both", tmp_path)
+
+
+def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
+    """The policy with another layer between its two."""
+    weight = np.random.default_rng(seed).normal(size=(1, 16, 16)).astype(np.float32)
+    weights, biases = policy.network.weights, policy.network.biases
+    return make_general((weights[0], weight, weights[1]), (biases[0], biases[0], biases[1]), 0.0)
 
 
 @pytest.mark.parametrize(

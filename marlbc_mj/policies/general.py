@@ -4,6 +4,7 @@ Its inputs are in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one v
 and what it has heard, however old, from however many; who has heard nothing decides by itself.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -127,6 +128,36 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
     """The policy of one dueling network, weights (1, in, out) and biases (1, 1, out) of its layers."""
     return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
+
+
+def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
+    """One policy whose values are the mean of those of others: their networks side by side, weights between two of them zero.
+
+    Raises:
+        ConfigurationError: no policies, or networks of different depth.
+    """
+    networks = [policy.network for policy in policies]
+    if not networks or len({len(network.weights) for network in networks}) > 1:
+        raise ConfigurationError("a mean takes at least one policy, and networks that have the same number of layers")
+    last = len(networks[0].weights) - 1
+    share = np.float32(1.0 / len(networks))
+    weights, biases = [], []
+    for k in range(last + 1):
+        layers = [network.weights[k][0] for network in networks]
+        if k == 0:
+            joined = np.concatenate(layers, axis=1)
+        elif k < last:
+            joined = np.zeros(np.sum([layer.shape for layer in layers], axis=0), dtype=np.float32)
+            row = column = 0
+            for layer in layers:
+                joined[row : row + layer.shape[0], column : column + layer.shape[1]] = layer
+                row, column = row + layer.shape[0], column + layer.shape[1]
+        else:
+            joined = share * np.concatenate(layers, axis=0)
+        weights.append(joined[None])
+        offsets = [network.biases[k] for network in networks]
+        biases.append(np.concatenate(offsets, axis=-1) if k < last else share * np.sum(offsets, axis=0, dtype=np.float32))
+    return make_general(tuple(weights), tuple(biases), margin)
 
 
 def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:

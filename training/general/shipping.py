@@ -1,17 +1,25 @@
 """Copies a run of the general policy into the package, with its model card."""
 
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.policies.general import read_general
+from marlbc_mj.policies.general import mean_policy, read_general, write_general
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.training.config import flat_settings
 from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.ship import put_in_package
-from marlbc_mj.util.provenance import plain_data
+from marlbc_mj.util.files import check_target, staged_file
+from marlbc_mj.util.provenance import plain_data, provenance
+
+_WHAT = (
+    "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself between "
+    f"formation and column, from {FEATURES} numbers that it senses and {INPUTS - FEATURES} that it pools of what it heard. It "
+    "needs the set-based composition, a formation with a column and a path that moves."
+)
 
 
 def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
@@ -29,6 +37,51 @@ def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool
     return put_in_package(run, name, folder, overwrite=overwrite, read=read_general, write_card=general_card)
 
 
+def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
+    """Write the mean of several policies and its model card; returns the checkpoint's path.
+
+    Args:
+        checkpoints: of general policies; one that is named twice counts twice.
+        name: name of the shipped checkpoint.
+        folder: folder of the shipped checkpoints.
+        overwrite: whether a checkpoint of that name may be replaced.
+
+    Raises:
+        ConfigurationError: a damaged checkpoint, networks that have no mean, or a file that may not be replaced.
+    """
+    parts = [read_general(path) for path in checkpoints]
+    policy = mean_policy([part for part, _ in parts], GeneralConfig().switching_margin)
+    target = folder / f"{name}.safetensors"
+    check_target(target, overwrite=overwrite)
+    runs = [{key: part[key] for key in ("train", "evaluation", "git_revision")} for _, part in parts]
+    write_general(target, policy, {**provenance(), "mean_of": runs})
+    with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
+        staging.write_text(_mean_card(name, runs))
+    return target
+
+
+def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
+    """The model card of a mean, in Markdown: a line per network."""
+    rows = [
+        (
+            f"`marlbc train {GENERAL} --seed {run['train']['seed']}{''.join(map(' {}'.format, _changed(run['train'])))}`",
+            f"{run['evaluation']['mission_steps']:.0f}",
+            f"{run['evaluation']['cpu_s']:.0f}",
+            run["git_revision"],
+        )
+        for run in runs
+    ]
+    lines = [
+        f"# {name}",
+        "",
+        f"{_WHAT} Its action values are the mean of those of {len(runs)} networks that were trained apart or one from the other; "
+        "a file named in `start` is the checkpoint of another line.",
+        "",
+        pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
+    ]
+    return "\n".join(lines) + "\n"
+
+
 def general_card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
     """The model card in Markdown: what the checkpoint is, how it was made, its learning curve on held-out layouts.
 
@@ -42,9 +95,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
     lines = [
         f"# {name}",
         "",
-        "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself "
-        f"between formation and column, from {FEATURES} numbers that it senses and {INPUTS - FEATURES} that it pools of what it "
-        "heard. It needs the set-based composition, a formation with a column and a path that moves.",
+        _WHAT,
         "",
         f"- Trained on {_counted(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
         f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
