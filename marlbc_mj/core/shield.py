@@ -236,7 +236,7 @@ def watch_assumptions(numbers, view, i, last, breaches):
 
 @allocation_free
 def target_of(numbers, view, i, force):
-    """(w (2 numbers), worst speed [m/s], need [m]): where ``force`` (2,) [N] takes agent ``i``, and how near things matter then."""
+    """(w [m/s], worst speed [m/s], need [m]): where ``force`` (2,) [N] takes agent ``i``, and how near things matter then."""
     per = view.h / numbers.mass
     x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
     worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
