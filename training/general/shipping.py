@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from marlbc_mj.policies.general import mean_policy, read_general, write_general
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS
 from marlbc_mj.policies.shipped import FOLDER
@@ -66,7 +68,7 @@ def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
         (
             f"`marlbc train {GENERAL} --seed {run['train']['seed']}{''.join(map(' {}'.format, _changed(run['train'])))}`",
             f"{run['evaluation']['mission_steps']:.0f}",
-            f"{run['evaluation']['cpu_s']:.0f}",
+            f"{run['evaluation'].get('cpu_s', np.nan):.0f}",
             run["git_revision"],
         )
         for run in runs
