@@ -9,6 +9,7 @@ from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION
 from marlbc_mj.policies.general_inputs import INPUTS, LANES, WAYS
 from marlbc_mj.scenarios import FAMILIES
 from marlbc_mj.scenarios.teams import files_of, room_for, team_mission
+from marlbc_mj.studies.safety import ground
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
 from marlbc_mj.training.general.squads import LOST_AFTER, Squad, look_ahead, shut_out
 from marlbc_mj.util.errors import ConfigurationError
@@ -84,3 +85,11 @@ def test_who_is_late_finds_the_opening_along_its_line(approach: str) -> None:
     world.rollout(np.full((int(0.3 * steps), 1, 6), column))
     x = world.observe().position[0, :, 0]
     assert (x > 35.0).all() == (approach == "line")
+
+
+def test_a_mission_of_the_study_of_safety_names_team_and_approach() -> None:
+    straight, lines = (ground(f"corridor-grid-9{end}") for end in ("", "-lines"))
+    assert straight == team_mission("corridor", "grid", 9, split="test")
+    assert lines == team_mission("corridor", "grid", 9, split="test", column_approach="line")
+    with pytest.raises(ConfigurationError, match="FORMATION-AGENTS"):
+        ground("gates-nine")

@@ -55,6 +55,8 @@ SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
 OWN = "own"
 """Stands for a composition where a supervisor gives its own velocities."""
+LINES = "-lines"
+"""Ending of a team that comes to its column along the slots' lines."""
 FIRST_SEED = 80_000
 
 
@@ -174,7 +176,8 @@ def fly_cell(cell: MissionCell, controller: str, seeds: Sequence[int], progress:
 
 def ground(name: str) -> Scenario:
     """The scenario of a mission: held-out layouts of a family, ``gates``, or of a family with a team, ``gates-grid-9``, see
-    :mod:`marlbc_mj.scenarios.teams`; or draws around the case study.
+    :mod:`marlbc_mj.scenarios.teams`; or draws around the case study. A team whose name ends in ``-lines`` comes to its column
+    along the slots' lines.
 
     Raises:
         ConfigurationError: an unknown scenario or team, or a scenario that draws no layouts.
@@ -184,5 +187,6 @@ def ground(name: str) -> Scenario:
         return with_drag_range(make_scenario("paper"), (drag, drag))
     family, _, team = name.partition("-")
     if team and family in FAMILIES:
-        return held_out(team_mission(family, *read_team(team)))
+        approach = "line" if team.endswith(LINES) else "straight"
+        return held_out(team_mission(family, *read_team(team.removesuffix(LINES)), column_approach=approach))
     return held_out(make_scenario(name))

@@ -56,6 +56,8 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
     target = folder / f"{name}.safetensors"
     check_target(target, overwrite=overwrite)
     runs = [{key: part[key] for key in ("train", "evaluation", "git_revision")} for _, part in parts]
+    for run in runs:
+        run["train"] = {**run["train"], "start": "/".join(Path(run["train"].get("start", "")).parts[-3:])}
     write_general(target, policy, {**provenance(), "mean_of": runs})
     with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
         staging.write_text(_mean_card(name, runs))
@@ -77,7 +79,7 @@ def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
         f"# {name}",
         "",
         f"{_WHAT} Its action values are the mean of those of {len(runs)} networks that were trained apart or one from the other; "
-        "a file named in `start` is the checkpoint of another line.",
+        "a file named in `start` is the checkpoint of another run, of this table or before it.",
         "",
         pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
     ]
