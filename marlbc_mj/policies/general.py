@@ -141,7 +141,8 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
         raise ConfigurationError("a mean takes at least one policy, and networks that have the same number of layers")
     last = len(networks[0].weights) - 1
     share = np.float32(1.0 / len(networks))
-    weights, biases = [], []
+    weights: list[np.ndarray] = []
+    biases: list[np.ndarray] = []
     for k in range(last + 1):
         layers = [network.weights[k][0] for network in networks]
         if k == 0:
@@ -156,7 +157,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
             joined = share * np.concatenate(layers, axis=0)
         weights.append(joined[None])
         offsets = [network.biases[k] for network in networks]
-        biases.append(np.concatenate(offsets, axis=-1) if k < last else share * np.sum(offsets, axis=0, dtype=np.float32))
+        biases.append(np.concatenate(offsets, axis=-1) if k < last else np.asarray(share * np.sum(offsets, axis=0)))
     return make_general(tuple(weights), tuple(biases), margin)
 
 

@@ -148,7 +148,8 @@ class Squad:
 def shut_out(inputs: np.ndarray) -> np.ndarray:
     """(W, N) bool: agents far from both slots whose ways to both are blocked; ``inputs`` (W, N, S)."""
     far = np.tanh(LOST_BEYOND / COARSE)
-    return (inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & (inputs[..., WAYS + 1] > far) & (inputs[..., WAYS + 3] > far)
+    away = (inputs[..., WAYS + 1] > far) & (inputs[..., WAYS + 3] > far)
+    return np.asarray((inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & away)
 
 
 def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.ndarray:
