@@ -331,8 +331,8 @@ class SafetyCommand:
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, or draws around the case study."""
     teams: Annotated[tuple[str, ...], arg(metavar="TEAM ...")] = ()
-    """Teams that fly the families with the room that they need, FORMATION-AGENTS each, or FORMATION-AGENTS-lines for
-    --along-lines; each family's own by default."""
+    """Teams that fly the families with the room that they need, as FORMATION-AGENTS; with -lines behind that, they come to their
+    column along the lines of its slots. By default each family has its own team."""
     supervisors: SomeSupervisors = None
     """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
     compositions: Compositions = ("null-space", "set-based")
