@@ -69,6 +69,7 @@ def read_log(path: str | Path) -> EpisodeLog:
             motions=np.array(json.loads(metadata.get("motions", "[]")), dtype=np.float64).reshape(-1, NUMBERS),
             mjcf=model,
             substeps=_substeps(found, metadata, columns["position"].shape[1]),
+            robots=tuple(map(str, json.loads(metadata.get("robots", "[]")))),
             **columns,
         )
         _check_log(log)
@@ -98,6 +99,8 @@ def _check_log(log: EpisodeLog) -> None:
     for name in ("link", "age"):
         if getattr(log, name).shape not in ((steps, 0, 0), (steps, agents, agents)):
             raise ValueError(f"{name} has shape {getattr(log, name).shape}")
+    if len(log.robots) not in (0, agents):
+        raise ValueError(f"robots names {len(log.robots)} for {agents} agents")
     if not (log.age >= 0).all():
         raise ValueError("an age is negative, or not a number")
     if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
@@ -339,9 +342,11 @@ def _course(metadata: dict[str, str], agents: int) -> Course:
     (x, y), (vx, vy) = np.array(json.loads(metadata["path"]), dtype=np.float64).reshape(2, 2).tolist()
     formations = np.array(json.loads(metadata["slots"]), dtype=np.float64).reshape(2, agents, 2)
     limit, given = numbers.pop("scenario_force_limit"), [*numbers.values(), x, y, vx, vy, *formations.ravel()]
-    if not min(*numbers.values(), limit) > 0 or not np.isfinite([*given, limit]).all():
+    own = json.loads(metadata.get("robot_force_limits", json.dumps([limit] * agents)))
+    limits = np.array(own, dtype=np.float64).reshape(agents)
+    if not min(*numbers.values(), *limits) > 0 or not np.isfinite([*given, *limits]).all():
         raise ValueError("substep, safe_distance, force_limit, path or slots are no numbers of a scenario")
-    return Course(**numbers, force_limit=limit, path_origin=(x, y), path_velocity=(vx, vy), formations=formations)
+    return Course(**numbers, force_limits=limits, path_origin=(x, y), path_velocity=(vx, vy), formations=formations)
 
 
 def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:
