@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.choices import (
+    ROBOTS_SETTING,
     Compositions,
     ControllerName,
     MissionNames,
@@ -93,9 +94,9 @@ class ScenarioOptions:
 
     def _split_settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """The settings without that of the robots, and the names that it gives: their scale is the scenario's from the start."""
-        given = [setting for setting in self.set if setting.startswith("robots=")]
-        names = given[-1].removeprefix("robots=").split(",") if given else []
-        return tuple(setting for setting in self.set if setting not in given), tuple(filter(None, names))
+        given = [setting for setting in self.set if setting.partition("=")[0] == ROBOTS_SETTING]
+        names = given[-1].partition("=")[2].split(",") if given else []
+        return tuple(setting for setting in self.set if setting not in given), tuple(names)
 
     def _robot_changes(self, name: str, robots: tuple[str, ...]) -> dict[str, Any]:
         """Fields that another robot, or one of each agent's, changes, without those that other options set.

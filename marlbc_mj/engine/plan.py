@@ -128,10 +128,9 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     guarded(lambda: _check_substep(scenario, controller), f"{who}: linear_gains")
     fleet = scenario.fleet
     fleet.check(scenario)
-    solid = next((robot.name for robot in fleet.kinds if robot.contact), None)
-    if solid is not None and scenario.moving:
+    if fleet.contact and scenario.moving:
         raise ConfigurationError(
-            f"robot {solid!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
+            f"robot {fleet.solid!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
             "through only; choose a robot without contact"
         )
     limit = scenario.force_limit if controller.limited else np.inf

@@ -145,6 +145,11 @@ def _messages(shield: Shield, scenario: Scenario) -> dict[str, float]:
 
 def _missing(robot: Robot) -> str:
     """What a robot lacks for a shield."""
+    if robot.force_error is not None:
+        return (
+            f"shield: robot {robot.name!r} has no tube, how far [m] it may be from its reference, which a shield of references "
+            "needs; give Shield(tube=...), or measure it: `python -m marlbc_mj.studies.shield_robots ROBOT`"
+        )
     return (
         f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
         "it within one substep, in every direction, besides the planar force and the disturbance; and so is its tube, how far "

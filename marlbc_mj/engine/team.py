@@ -104,7 +104,7 @@ def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
     scenario = plan.scenario
     if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
         raise ConfigurationError(
-            f"robot {scenario.fleet.words} collides with obstacles, whose radii no seed can change; "
+            f"robot {plan.fleet.solid!r} collides with obstacles, whose radii no seed can change; "
             "give the family one radius: [r, r]"
         )
 

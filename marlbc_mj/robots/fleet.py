@@ -77,7 +77,12 @@ class Fleet:
     @property
     def contact(self) -> bool:
         """Whether obstacles are solid: to any of them."""
-        return any(robot.contact for robot in self.robots)
+        return self.solid is not None
+
+    @property
+    def solid(self) -> str | None:
+        """Name of the first robot to which obstacles are solid."""
+        return next((robot.name for robot in self.robots if robot.contact), None)
 
     @property
     def floating(self) -> bool:

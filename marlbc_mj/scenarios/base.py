@@ -274,7 +274,7 @@ class Scenario:
             raise ConfigurationError(f"scenario {self.name!r}: robots must be names, one per agent, got {self.robots!r}")
         if len(names) != self.agents:
             raise ConfigurationError(
-                f"scenario {self.name!r}: robots names {len(names)} for {self.agents} agents: {', '.join(names)}"
+                f"scenario {self.name!r}: robots names {len(names)} robots for {self.agents} agents: {', '.join(names)}"
             )
         if self.robot not in (POINT_MASS, names[0]):
             raise ConfigurationError(
