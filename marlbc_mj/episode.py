@@ -21,7 +21,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
 """Pose of robots that are where their p is and never turn."""
-LEVEL = (0.0, 1.0, 0.0, 0.0, 0.0)
+LEVEL_POSE = (0.0, 1.0, 0.0, 0.0, 0.0)
 """Height and quaternion of such robots in a team of which others have a pose."""
 
 
@@ -187,7 +187,7 @@ def body_poses(world: World, b: int = 0) -> np.ndarray:
         return NO_POSE
     return np.stack(
         [
-            qpos[first : first + 7] if len(robot.joints) == 1 else [qpos[first], qpos[second], *LEVEL]
+            qpos[first : first + 7] if len(robot.joints) == 1 else [qpos[first], qpos[second], *LEVEL_POSE]
             for robot, (first, second) in zip(fleet.robots, index.tolist(), strict=True)
         ]
     )

@@ -9,7 +9,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from marlbc_mj.robots import MODELS, Fleet, Robot
+from marlbc_mj.robots import MODELS, Robot, RobotFleet
 from marlbc_mj.robots.standard import quiet
 from marlbc_mj.scenarios import Obstacle, Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -76,7 +76,7 @@ def unfit(scenario: Scenario, error: Exception) -> ConfigurationError:
     return ConfigurationError(f"{who} cannot be put into one world{times}: {one_line(error)}")
 
 
-def _prepare_arena(spec: mujoco.MjSpec, fleet: Fleet) -> None:
+def _prepare_arena(spec: mujoco.MjSpec, fleet: RobotFleet) -> None:
     """Take the options of contact from the robots' MJCF, and draw the ground at their scale."""
     children = [(robot.name, robot.spec().option) for robot in fleet.kinds]
     for name in OPTIONS:
@@ -133,7 +133,7 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
     spec.attach(child, prefix=agent_prefix(agent), frame=spec.worldbody.add_frame())
 
 
-def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, fleet: Fleet) -> None:
+def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, fleet: RobotFleet) -> None:
     """A cylinder without contact: the paper's obstacles are passed through, and counted. For robots with contact it is solid,
     as large as the scenario says, on a body that an episode's draw can move.
     """

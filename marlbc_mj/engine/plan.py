@@ -23,7 +23,7 @@ from marlbc_mj.engine.native import step_address
 from marlbc_mj.engine.records import MissionRules, Native, Plant
 from marlbc_mj.engine.references import entry, no_entry, refer
 from marlbc_mj.engine.shielding import resolve
-from marlbc_mj.robots import Fleet, Robot
+from marlbc_mj.robots import Robot, RobotFleet
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import guarded
@@ -38,7 +38,7 @@ class Plan:
 
     scenario: Scenario
     controller: Controller
-    fleet: Fleet
+    fleet: RobotFleet
     xml: str  # the assembled MJCF
     model: mujoco.MjModel
     mission: MissionRules

@@ -9,7 +9,7 @@ from marlbc_mj.controllers import PD, SORLC, Controller
 from marlbc_mj.core.motion import obstacles_at
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, following_distance, retreat_drift, stopping_distance
-from marlbc_mj.robots import Fleet, Robot
+from marlbc_mj.robots import Robot, RobotFleet
 from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
@@ -157,7 +157,7 @@ def _missing(robot: Robot) -> str:
     )
 
 
-def _find_tube(shield: Shield, scenario: Scenario, fleet: Fleet, controller: Controller | None) -> float:
+def _find_tube(shield: Shield, scenario: Scenario, fleet: RobotFleet, controller: Controller | None) -> float:
     """How far agents may be from their references [m]: given, computed for direct robots, or measured, in this order.
 
     In a mixed team the widest tube holds for all.
@@ -186,7 +186,7 @@ def _with_one(scenario: Scenario, robot: Robot) -> Scenario:
     """A scenario as one robot of its mixed team sees it: all agents have that robot's mass and limit."""
     if not scenario.robots:
         return scenario
-    one = Fleet((robot,))
+    one = RobotFleet((robot,))
     (mass,), (unit,) = one.masses(scenario.mass).tolist(), one.masses(scenario.unit_force).tolist()
     limit = float(one.force_limits(scenario.force_limit)[0])
     return replace(scenario, robot=robot.name, robots=(), mass=mass, unit_force=unit, force_limit=limit)

@@ -10,7 +10,7 @@ from marlbc_mj.robots.base import Robot
 from marlbc_mj.util.errors import ConfigurationError
 
 
-class Group(NamedTuple):
+class AgentGroup(NamedTuple):
     """Adjacent agents with the same robot."""
 
     first: int
@@ -19,7 +19,7 @@ class Group(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Fleet:
+class RobotFleet:
     """The robots of a team, one per agent, in the order of the agents; they may differ.
 
     Where one number is wanted for the whole team, that of the robot counts that is hardest to please: the greatest size and
@@ -39,12 +39,12 @@ class Fleet:
         return tuple({id(robot): robot for robot in self.robots}.values())
 
     @property
-    def groups(self) -> tuple[Group, ...]:
+    def groups(self) -> tuple[AgentGroup, ...]:
         """Adjacent agents with the same robot; agents keep their numbers, so a kind may have several groups."""
         found, first = [], 0
         for _, members in groupby(self.robots, key=id):
             same = list(members)
-            found.append(Group(first, first + len(same), same[0]))
+            found.append(AgentGroup(first, first + len(same), same[0]))
             first += len(same)
         return tuple(found)
 

@@ -14,8 +14,9 @@ from marlbc_mj.core.disturbances import Disturbance, PaperDrag
 from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.core.orders import Orders
-from marlbc_mj.robots import Fleet, make_fleet
+from marlbc_mj.robots import RobotFleet, make_fleet
 from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
+from marlbc_mj.scenarios.robot_names import PAPER_ROBOT, settle_robots
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.settings import check_kinds
 
@@ -26,7 +27,6 @@ MOST_BEHAVIORS = 6  # whose 720 orders are still a table
 REFERENCE_MODES = ("virtual", "actual")
 COMPOSITIONS = ("null-space", "set-based")
 """Avoidance as an equality task (12), or as an inequality."""
-POINT_MASS = "point_mass"  # the paper's robot
 YOUNG = {"young": True}
 """Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
 
@@ -96,7 +96,7 @@ class Scenario:
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"  # where behaviors are evaluated: at p_r or at the measured p
-    robot: str = POINT_MASS  # of every agent
+    robot: str = PAPER_ROBOT  # of every agent
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
     # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
@@ -124,7 +124,9 @@ class Scenario:
         object.__setattr__(self, "schedule", tuple(Window(*w) for w in self.schedule))
         object.__setattr__(self, "motions", tuple(Motion(*m) for m in self.motions))
         self._check_numbers()
-        self._settle_robots()
+        robot, robots = settle_robots(self.name, self.agents, self.robot, self.robots)
+        object.__setattr__(self, "robot", robot)
+        object.__setattr__(self, "robots", robots)
         self._check_team()
         self._check_clocks()
         self.imperfections.check(self.agents, self.substep)
@@ -137,7 +139,7 @@ class Scenario:
         return len(self.starts)
 
     @property
-    def fleet(self) -> Fleet:
+    def fleet(self) -> RobotFleet:
         """The robots of all agents.
 
         Raises:
@@ -264,24 +266,6 @@ class Scenario:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be numbers, got {values!r}") from None
             if not finite:
                 raise ConfigurationError(f"scenario {self.name!r}: {name} must be finite, got {values}")
-
-    def _settle_robots(self) -> None:
-        """Check ``robots``; where they are all the same, ``robot`` alone says which."""
-        names = tuple(self.robots)
-        if not names:
-            return
-        if isinstance(self.robots, str) or not all(isinstance(name, str) for name in names):
-            raise ConfigurationError(f"scenario {self.name!r}: robots must be names, one per agent, got {self.robots!r}")
-        if len(names) != self.agents:
-            raise ConfigurationError(
-                f"scenario {self.name!r}: robots names {len(names)} robots for {self.agents} agents: {', '.join(names)}"
-            )
-        if self.robot not in (POINT_MASS, names[0]):
-            raise ConfigurationError(
-                f"scenario {self.name!r}: robot {self.robot!r} and robots {', '.join(names)} disagree; give one of both"
-            )
-        object.__setattr__(self, "robot", names[0])
-        object.__setattr__(self, "robots", names if len(set(names)) > 1 else ())
 
     def _check_team(self) -> None:
         if self.agents < 2:

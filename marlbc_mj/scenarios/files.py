@@ -64,7 +64,7 @@ def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any)
     """The scenario of a TOML file, with any of its fields changed. Reading it runs no code unless that is allowed.
 
     A robot's file is looked up beside the TOML file. A robot that has a scale (mass, limits, substep) gives it to fields that the
-    file does not name; of several, see :meth:`marlbc_mj.robots.fleet.Fleet.scale`.
+    file does not name; of several, see :meth:`marlbc_mj.robots.fleet.RobotFleet.scale`.
 
     Args:
         path: the file.
