@@ -239,6 +239,6 @@ def test_robots_that_stand_on_different_ground_are_refused(monkeypatch):
 
 
 def test_titles_name_the_robots():
-    assert mission_title(gate().name) == "Point and gate, Crazyflies, discs, omnidirectional bases"
+    assert mission_title(gate().name) == "Point and gate, mixed team"
     assert robots_title(MIXED) == "Crazyflies (1), discs (2, 4), omnidirectional bases (3)"
     assert robots_title(("disc", "disc")) == "discs"

@@ -30,7 +30,8 @@ def mission_title(name: str) -> str:
     mission, _, suffix = name.partition("-")
     robots = suffix.split("+") if suffix else []
     if mission in MISSION_TITLES and all(robot in ROBOTS for robot in robots):
-        return ", ".join((MISSION_TITLES[mission], *(ROBOT_TITLES.get(robot, robot) for robot in robots)))
+        team = [ROBOT_TITLES.get(robot, robot) for robot in robots]
+        return ", ".join((MISSION_TITLES[mission], *(team if len(team) < 2 else ["mixed team"])))
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
 
