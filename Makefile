@@ -14,6 +14,8 @@ STAMP := .venv/installed
 # Where packages come from (index, links, proxy, certificates, cache) stays the caller's business.
 unexport VIRTUAL_ENV CONDA_PREFIX PYTHONHOME PYTHONPATH PYTHONSTARTUP
 unexport PIP_TARGET PIP_PREFIX PIP_ROOT PIP_PYTHON PIP_CONSTRAINT PIP_BUILD_CONSTRAINT PIP_REQUIREMENT PIP_EDITABLE PIP_NO_DEPS
+# Python keeps its byte code: without it every process compiles what it imports, and pytest its assertions, anew.
+unexport PYTHONDONTWRITEBYTECODE
 unexport PIP_DRY_RUN PIP_REQUIRE_HASHES PIP_NO_BUILD_ISOLATION PIP_IGNORE_REQUIRES_PYTHON PIP_REPORT PIP_DEPENDENCY_GROUP
 export PIP_USER := 0
 export PIP_PROGRESS_BAR := off

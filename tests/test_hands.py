@@ -300,6 +300,35 @@ def test_joblib_plays_copies_in_its_workers():
     assert (one == two).all() and (one == played(env, 5)).all()
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_ray_plays_copies_in_its_workers(monkeypatch):
+    """An environment goes to a task and to an actor, which keeps it; both play on where the original stands."""
+    ray = pytest.importorskip("ray")
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    env = PaperFormation(duration=2.0)
+    env.reset(seed=0)
+
+    class Player:
+        def __init__(self, env):
+            self.env = env
+
+        def play(self, steps):
+            return played(self.env, steps)
+
+    path = [str(Path(__file__).parent), *sys.path]
+    ray.init(
+        num_cpus=2, include_dashboard=False, log_to_driver=False, runtime_env={"env_vars": {"PYTHONPATH": os.pathsep.join(path)}}
+    )
+    try:
+        of_task = ray.get(ray.remote(played).remote(env, 5))
+        actor = ray.remote(Player).remote(env)
+        of_actor = np.concatenate([ray.get(actor.play.remote(steps)) for steps in (2, 3)])
+    finally:
+        ray.shutdown()
+    assert (of_task == of_actor).all() and (of_task == played(env, 5)).all()
+
+
 @pytest.mark.filterwarnings("ignore")  # of these libraries
 def test_stable_baselines_learns_on_the_pettingzoo_view():
     """SuperSuit copies the environment with cloudpickle; PPO then steps the copies."""

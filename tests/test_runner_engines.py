@@ -1,8 +1,11 @@
 """Engines: the same results to the last bit, failures and retries, on Ray's and submitit's processes of this machine."""
 
 import os
+import secrets
 import signal
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +15,7 @@ import pytest
 from small_studies import Roots, Squares
 
 from marlbc_mj.studies import runner
-from marlbc_mj.studies.engines import make_engine
+from marlbc_mj.studies.engines import guard, make_engine
 from marlbc_mj.studies.engines.base import Ears, Engine, Task, Work
 from marlbc_mj.studies.engines.slurm_arrays import SlurmArray
 from marlbc_mj.studies.runner import run_jobs, run_study
@@ -136,3 +139,15 @@ def test_an_engine_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
         run_jobs(Squares(), engine="dask")
     with pytest.raises(ConfigurationError, match="workers must be at least 1, got 0"):
         run_jobs(Squares(), engine="ray", workers=0)
+
+
+def test_the_guard_ends_processes_that_keep_starting_others():
+    """As a raylet does with its workers: one look alone would leave those that were started meanwhile."""
+    token = secrets.token_hex(8)
+    code = "import subprocess, sys\nwhile True: subprocess.Popen(['sleep', '30'])"
+    with subprocess.Popen([sys.executable, "-S", "-c", code], env={**os.environ, guard.TOKEN: token}) as breeding:
+        while len(guard.marked(token)) < 5:
+            time.sleep(0.01)
+        assert guard.end_marked(token)
+        assert breeding.wait() == -signal.SIGKILL
+    assert guard.marked(token) == []

@@ -14,6 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_runner import STUDIES
 
+from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.episode import Trajectory
 from marlbc_mj.results.summary import Result
 from marlbc_mj.studies import codec, packs, runner, store
@@ -227,16 +228,28 @@ def test_the_same_call_goes_on(tmp_path: Path, ran: list[int], capsys: pytest.Ca
     run_study(Halves(), tmp_path / "whole")
     assert ran == list(range(6))
     for stop_at in (2, 4):
-        with pytest.raises(error):
+        with pytest.raises(error) as stopped:
             run_study(Halves(stop_at=stop_at, error=error), tmp_path / "out")
         said = capsys.readouterr().err
         assert [path.name for path in (tmp_path / "out").iterdir()] == [JOBS_FOLDER]
-        assert f"{stop_at} of 6 jobs are done and kept in" in said and ("going on" in said) == (stop_at == 4)
+        assert f"{stop_at} of 6 jobs are done and kept in" in stopped.value.__notes__[0] and ("going on" in said) == (
+            stop_at == 4
+        )
     assert ran == [*range(6), 0, 1, 2, 3]
     done = run_study(Halves(), tmp_path / "out")
     assert ran == [*range(6), *range(6)] and [float(each[0]) for each in done.results] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
     assert files(tmp_path / "out") == files(tmp_path / "whole") and not (tmp_path / "out" / JOBS_FOLDER).exists()
     assert {path.name for path in tmp_path.iterdir()} == {"out", "whole"}
+
+
+@pytest.mark.parametrize(("error", "status"), [(KeyboardInterrupt, 130), (MemoryError, 3), (SimulationError, 3)])
+def test_the_command_says_what_stopped_it_and_what_is_kept_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], error: type, status: int
+) -> None:
+    with pytest.raises(SystemExit) as ended, in_one_line("marlbc"):
+        run_study(Halves(stop_at=2, error=error), tmp_path / "out")
+    lines = capsys.readouterr().err.splitlines()
+    assert ended.value.code == status and len(lines) == 1 and "; 2 of 6 jobs are done and kept in" in lines[0]
 
 
 def test_nothing_is_left_of_a_run_in_which_nothing_ended(tmp_path: Path) -> None:

@@ -3,7 +3,10 @@
 import io
 import json
 import os
+import signal
 import struct
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -19,7 +22,7 @@ from marlbc_mj.recording import reader
 from marlbc_mj.recording.exports import export_log
 from marlbc_mj.recording.reader import log_info, read_log, recover_log
 from marlbc_mj.recording.stage import make_stage
-from marlbc_mj.robots import make_robot
+from marlbc_mj.robots import make_robot, trial
 from marlbc_mj.scenarios import load_scenario, make_scenario
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -344,3 +347,25 @@ def test_a_force_limit_that_mujoco_takes_for_zero_is_one_line(tmp_path, capsys):
         main(["run", str(toml(tmp_path, OPEN + "force_limit = 5e-324\n")), "--out", str(tmp_path / "out")])
     said = capsys.readouterr().err.strip()
     assert stopped.value.code == 2 and "invalid force range" in said and len(said.splitlines()) == 1
+
+
+def test_files_are_tried_out_by_one_server_of_each_process(tmp_path):
+    """It loads MuJoCo once; one that was killed is replaced, a process that was forked has its own, none outlives its process."""
+    path = tmp_path / "ball.xml"
+    path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
+    limits = trial.Limits(20.0, 5, 8 * 2**30)
+    assert trial.try_out(path, limits) == (0, "")
+    first = trial._server.process.pid
+    assert trial.try_out(path, limits) == (0, "") and trial._server.process.pid == first
+    os.kill(first, signal.SIGKILL)
+    assert trial.try_out(path, limits) == (0, "") and trial._server.process.pid != first
+    code = (
+        "import os, sys; from pathlib import Path; from marlbc_mj.robots import trial as t; l = t.Limits(20.0, 5, 2**33)\n"
+        "p = Path(sys.argv[1]); a = t.try_out(p, l); print(t._server.process.pid, flush=True)\n"
+        "if os.fork() == 0: b = t.try_out(p, l); print(t._server.process.pid, flush=True); sys.exit(a != b)\n"
+        "sys.exit(os.waitstatus_to_exitcode(os.wait()[1]))"
+    )
+    done = subprocess.run([sys.executable, "-W", "error", "-c", code, path], capture_output=True, text=True, check=True)
+    servers = done.stdout.split()
+    assert len(set(servers)) == 2 and done.stderr == ""
+    assert not any(Path(f"/proc/{server}").exists() for server in servers)

@@ -43,10 +43,25 @@ def decisions() -> None:
     run_episode(World(paper(duration=0.5), record=True), make_supervisor("scripted"))
 
 
+def rest() -> None:
+    """The shield alone, as its study of random states has it; robots; networks of one hidden layer."""
+    from marlbc_mj import World, make_scenario
+    from marlbc_mj.core.stopping import ForceBound
+    from marlbc_mj.policies.greedy import Policy, best_actions
+    from marlbc_mj.studies.shield_states import Trial, leave_rate
+
+    leave_rate(Trial(ForceBound(), speed_cap=14.0), 10)
+    for robot, shield in (("disc", False), ("omni", False), ("diff_drive", True), ("crazyflie", True)):
+        scenario = replace(make_scenario("robot_gate", robot=robot), duration=0.5, composition="set-based")
+        World(scenario, shield=shield).step(np.zeros((1, scenario.agents), dtype=np.int64))
+    layers = [np.zeros((4, a, b), dtype=np.float32) for a, b in ((3, 5), (5, 4))]
+    policy = Policy(tuple(layers), tuple(layer[:, :1] for layer in layers), np.ones(3, dtype=np.float32), True, 0.1)
+    values = policy.values(np.zeros((1, 3), dtype=np.float32))
+    best_actions(values, np.zeros((1, 4), dtype=np.int64), np.ones(1, dtype=bool), np.float32(0.1))
+
+
 if __name__ == "__main__":
-    with ProcessPoolExecutor(
-        2, mp_context=get_context("spawn")
-    ) as pool:  # by the time that the second asks for the loop, it is kept
-        for part in [pool.submit(work) for work in (loop, decisions)]:
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # what one has compiled is kept for the others
+        for part in [pool.submit(work) for work in (loop, decisions, rest)]:
             part.result()
     sys.exit(0)

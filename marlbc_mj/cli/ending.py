@@ -47,20 +47,25 @@ def in_one_line(prog: str) -> Iterator[None]:
             finally:
                 sys.stdout.flush()
     except MarlbcError as error:
-        _end(f"{prog}: {one_line(error)}", error.exit_status)
-    except KeyboardInterrupt:
-        _end(f"{prog}: interrupted", INTERRUPTED)
-    except Terminated:
-        _end(f"{prog}: terminated", TERMINATED)
-    except MemoryError:
-        _end(f"{prog}: not enough memory", 3)
+        _end(_line(prog, str(error), error), error.exit_status)
+    except KeyboardInterrupt as error:
+        _end(_line(prog, "interrupted", error), INTERRUPTED)
+    except Terminated as error:
+        _end(_line(prog, "terminated", error), TERMINATED)
+    except MemoryError as error:
+        _end(_line(prog, "not enough memory", error), 3)
     except BrokenPipeError:
         _end("", PIPE_CLOSED)
     except OSError as error:
         if error.errno not in NO_SPACE and error.filename is None:
             raise
         what = "standard output" if error.filename is None else error.filename
-        _end(f"{prog}: {one_line(f'cannot use {what}: {error.strerror}')}", 3 if error.errno in NO_SPACE else 2)
+        _end(_line(prog, f"cannot use {what}: {error.strerror}", error), 3 if error.errno in NO_SPACE else 2)
+
+
+def _line(prog: str, said: str, error: BaseException) -> str:
+    """What stopped the program and the notes that the error carries, of results that are kept for example, in one line."""
+    return f"{prog}: {one_line('; '.join([said, *getattr(error, '__notes__', ())]))}"
 
 
 def _end(said: str, status: int) -> None:

@@ -5,7 +5,6 @@ keyframes, lights, skins and custom texts are left out, and names get no slash, 
 """
 
 import signal
-import subprocess
 import sys
 import warnings
 from collections.abc import Iterator
@@ -19,29 +18,13 @@ import numpy as np
 
 from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.files import check_files
+from marlbc_mj.robots.trial import Limits, try_out
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import beside
 from marlbc_mj.util.text import one_line
 
-_TRIAL_TIME = 60.0  # that compiling a robot may take by the clock [s]
-_TRIAL_CPU = 5  # that compiling it and two steps may take of a processor [s]
-_TRIAL_MEMORY = 8 * 2**30  # address space that it may take [bytes]
-_TRIAL = """
-import resource, sys
-resource.setrlimit(resource.RLIMIT_AS, ({memory}, {memory}))
-resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-resource.setrlimit(resource.RLIMIT_CPU, ({cpu}, {cpu} + 1))
-import mujoco
-mujoco.set_mju_user_warning(lambda text: None)
-try:
-    model = mujoco.MjSpec.from_file(sys.argv[1]).compile()
-    data = mujoco.MjData(model)
-except (ValueError, MemoryError, mujoco.FatalError) as error:
-    print(" ".join(str(error).split()) or type(error).__name__)
-    sys.exit(3)
-for _ in range(2):
-    mujoco.mj_step(model, data)
-"""
+_LIMITS = Limits(seconds=60.0, cpu=5, memory=8 * 2**30)
+"""Of compiling a robot and two steps."""
 
 
 def standard_text(path: Path) -> str:
@@ -91,21 +74,22 @@ def _try_out(path: Path) -> None:
     """
     if not sys.executable:  # Python is embedded in another program
         return
-    command = [sys.executable, "-c", _TRIAL.format(memory=_TRIAL_MEMORY, cpu=_TRIAL_CPU), str(path)]
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=_TRIAL_TIME, cwd=path.resolve().parent)
-    except subprocess.TimeoutExpired as error:
-        raise ConfigurationError(f"{path} takes more than {_TRIAL_TIME:g} s to compile") from error
-    if done.returncode == -signal.SIGXCPU:
+        status, said = try_out(path, _LIMITS)
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be tried out: {one_line(error)}") from error
+    if status is None:
+        raise ConfigurationError(f"{path} takes more than {_LIMITS.seconds:g} s to compile")
+    if status == -signal.SIGXCPU:
         raise ConfigurationError(
-            f"{path} takes more than {_TRIAL_CPU} s of a processor to compile and make two steps; simplify it"
+            f"{path} takes more than {_LIMITS.cpu} s of a processor to compile and make two steps; simplify it"
         )
-    if done.returncode < 0:
-        raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-done.returncode}); simplify the file")
-    if done.returncode not in (0, 3):
-        raise ConfigurationError(f"{path} cannot be tried out: {one_line(done.stderr)[-200:]}")
-    if done.returncode == 3 and "memory" in done.stdout.lower():
-        raise ConfigurationError(f"{path} does not compile: {one_line(done.stdout)}")
+    if status < 0:
+        raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-status}); simplify the file")
+    if status not in (0, 3):
+        raise ConfigurationError(f"{path} cannot be tried out: {one_line(said)[-200:]}")
+    if status == 3 and "memory" in said.lower():
+        raise ConfigurationError(f"{path} does not compile: {one_line(said)}")
 
 
 @contextmanager

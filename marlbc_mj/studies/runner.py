@@ -95,10 +95,10 @@ def run_study(
             with staged_folder(out, overwrite=overwrite) as folder:
                 store.place_files(dict.fromkeys(keys), folder)
                 report = study.report(results, folder, progress)
-        except BaseException:
+        except BaseException as error:
             if store.kept:
                 done = sum(key in store.kept for key in keys)
-                note(f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; the same command goes on")
+                error.add_note(f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; the same command goes on")
             raise
     return Conclusion(results, report)
 
