@@ -33,7 +33,9 @@ _END: dict[str, Any] = {"color": FAILED_COLOR, "marker": "x", "markersize": 4, "
 def write_comparison(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
     """study.md, study.tex, curves.pdf and curves.png, from the lines of the CSV files alone."""
     table = learners_table(rows)
-    figure_note = "`curves.pdf`: median and range over the runs that got that far; violation is the worst agent's, and linear below 0.1 s.\n"
+    figure_note = (
+        "`curves.pdf`: median and range over the runs that got that far; violation is the worst agent's, linear below 0.1 s.\n"
+    )
     named = "".join(f"- `{name}`: {VARIANTS[name].line}\n" for name in by_variant(rows))
     for name, text in (("study.md", f"{to_markdown(table)}\n{named}\n{figure_note}"), ("study.tex", to_latex(table) + "\n")):
         with staged_file(folder / name, overwrite=True) as staging:
