@@ -25,6 +25,8 @@ from marlbc_mj.scenarios.titles import mission_title, robots_title
 from marlbc_mj.studies.robot_truth import compare
 from marlbc_mj.supervisors import Scripted
 from marlbc_mj.tasks.formation import make_environment
+from marlbc_mj.tasks.gymnasium_env import PaperFormation
+from marlbc_mj.tasks.parallel_env import PaperFormationParallel
 from marlbc_mj.util.errors import ConfigurationError
 
 MIXED = ("crazyflie", "disc", "omni", "disc")
@@ -242,3 +244,19 @@ def test_titles_name_the_robots():
     assert mission_title(gate().name) == "Point and gate, mixed team"
     assert robots_title(MIXED) == "Crazyflies (1), discs (2, 4), omnidirectional bases (3)"
     assert robots_title(("disc", "disc")) == "discs"
+
+
+def test_gymnasium_and_pettingzoo_take_a_mixed_team():
+    """The same decisions, the same rewards and positions as in World."""
+    scenario, world = gate(duration=0.2), World(gate(duration=0.2), PD())
+    single, parallel = PaperFormation(scenario, PD()), PaperFormationParallel(scenario, PD())
+    single.reset(seed=0)
+    parallel.reset(seed=0)
+    orders = world.scenario.orders.representative[[0, 1, 0, 1]][None]
+    for _ in range(scenario.mission_steps - 1):  # with the last one they begin anew
+        step = world.step(orders)
+        _, reward, *_ = single.step(np.array([0, 1, 0, 1]))
+        _, rewards, *_ = parallel.step({agent: k % 2 for k, agent in enumerate(parallel.agents)})
+        assert {reward, *rewards.values()} == {step.reward[0]}
+    for env in (single, parallel):
+        np.testing.assert_array_equal(env.batch.world.state.position, world.state.position)

@@ -20,8 +20,9 @@ from marlbc_mj.cli.terminal import print_results, result_line
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.report import curves, figures, paper_values, plotting, write_report
+from marlbc_mj.report import curves, figures, paper_values, plotting
 from marlbc_mj.report.arena import trajectories
+from marlbc_mj.report.bundle import write_report
 from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actuator
 from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_benchmark_page
