@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import fields, is_dataclass
+from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import tyro
@@ -104,8 +105,8 @@ def check_words(chosen: Chosen) -> None:
 
 
 def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:
-    """What a word becomes a value by, where the hint of a field says so itself."""
-    for part in get_args(hint):
+    """What a word becomes a value by, where the hint of a field says so itself; files are left to tyro, which counts words first."""
+    for part in () if Path in get_args(hint) else get_args(hint):
         found = part if isinstance(part, PrimitiveConstructorSpec) else _constructor_of(part)
         if found is not None:
             return found
