@@ -53,7 +53,6 @@ def test_options_and_subcommands_are_those_of_the_help(capsys: pytest.CaptureFix
         ["run", "papre"],
         ["bench", "--supervisors", "scripted", "scriptd"],
         ["run", "--set=robots=disc,dsic"],
-        ["video", "no.mcap"],
     ],
 )
 def test_a_wrong_word_is_found_before_tyro_loads_what_it_parses_with(arguments, monkeypatch, capsys) -> None:

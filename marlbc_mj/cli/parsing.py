@@ -105,7 +105,7 @@ def check_words(chosen: Chosen) -> None:
 
 
 def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:
-    """What a word becomes a value by, where the hint of a field says so itself; files are left to tyro, which counts words first."""
+    """What a word becomes a value by, where a field says so itself. Files are left to tyro, which counts words first."""
     for part in () if Path in get_args(hint) else get_args(hint):
         found = part if isinstance(part, PrimitiveConstructorSpec) else _constructor_of(part)
         if found is not None:
