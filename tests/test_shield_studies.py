@@ -35,19 +35,28 @@ def test_no_mission_fails_with_a_shield_and_some_do_without(family):
     assert free.failed > 0
 
 
-def test_a_large_team_is_shielded_by_its_grids_as_by_trying_all_pairs():
-    """Bit for bit: grids of obstacles and team only say early that nothing is near."""
-    scenario = make_scenario("field", agents=48, formation="grid", obstacles=48, radius=(0.3, 0.6), gap=2.5, length=140.0)
+SCRATCH_OF_A_SHIELD = {"grid": (1, 0), "looked": (1, 0, 3)}
+"""Parts of a team that only save time, and their shapes where there are none."""
+
+
+@pytest.mark.parametrize(("agents", "missing"), [(48, ("grid",)), (48, ("grid", "looked")), (48, ("looked",)), (5, ("looked",))])
+def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agents, missing):
+    """Bit for bit: both only say early that nothing is near."""
+    large = {"radius": (0.3, 0.6), "gap": 2.5, "length": 140.0} if agents == 48 else {}
+    scenario = make_scenario("field", agents=agents, formation="grid", obstacles=agents, **large)
     worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
-    assert worlds[0].state.grid.shape[1] > 0
-    worlds[1].state = worlds[1].state._replace(grid=np.zeros((1, 0)))
+    for name in missing:
+        assert getattr(worlds[0].state, name).size > 0
+    worlds[1].state = worlds[1].state._replace(**{name: np.zeros(SCRATCH_OF_A_SHIELD[name]) for name in missing})
     worlds[1]._hand_over()
-    assert worlds[1]._loop.arguments.team.grid.shape[1] == 0  # the loop's own
+    for name in missing:
+        assert getattr(worlds[1]._loop.arguments.team, name).size == 0  # the loop's own
     rng = np.random.default_rng(0)
-    for _ in range(30):
-        velocity = 15.0 * rng.normal(size=(1, 48, 2))
+    for step in range(30):
+        together = worlds[0].state.position.mean(axis=1, keepdims=True) - worlds[0].state.position
+        velocity = 2.0 * together + 15.0 * rng.normal(size=(1, agents, 2)) / (1 + step % 3)
         for world in worlds:
-            world.step(np.zeros((1, 48), dtype=np.int64), velocity)
+            world.step(np.zeros((1, agents), dtype=np.int64), velocity)
     for name in ("position", "velocity", "interventions", "force_change", "breaches"):
         np.testing.assert_array_equal(getattr(worlds[0].state, name), getattr(worlds[1].state, name))
     assert worlds[0].state.interventions.sum() > 0

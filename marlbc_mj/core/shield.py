@@ -21,6 +21,7 @@ from marlbc_mj.core.barriers import Barrier
 from marlbc_mj.core.braking import restrain
 from marlbc_mj.core.cells import fill, room
 from marlbc_mj.core.laws import allocation_free, clip
+from marlbc_mj.core.lookout import is_alone, look, most_moved
 from marlbc_mj.core.stopping import (
     TINY,
     ForceBound,
@@ -234,15 +235,22 @@ def watch_assumptions(numbers, view, i, last, breaches):
 
 
 @allocation_free
+def target_of(numbers, view, i, force):
+    """(w [m/s], worst speed [m/s], need [m]): where ``force`` (2,) [N] takes agent ``i``, and how near things matter then."""
+    per = view.h / numbers.mass
+    x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
+    worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
+    return x, y, worst, max(reach_of(numbers, view, worst), view.stopping[i])
+
+
+@allocation_free
 def shield_agent(numbers, view, i, longest, force, counts):
     """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit.
 
     ``longest`` [m] is the team's greatest stopping distance.
     """
     per = view.h / numbers.mass
-    x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
-    worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
-    need = max(reach_of(numbers, view, worst), view.stopping[i])
+    x, y, worst, need = target_of(numbers, view, i, force)
     k = most_pressing(numbers, view, i, need) if anything_near(numbers, view, i, longest, need) else -1
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
         counts.breaches[i, MOTION_BROKEN if moves(view, k) else STATE_BROKEN] += 1.0
@@ -278,17 +286,34 @@ def shield_team(numbers, view, last, force, counts):
         counts: rows of this team; added to.
     """
     longest = fill_stopping(numbers, view)
-    if view.grid.shape[0] > 0:
-        if view.obstacles.shape[1] > 3:
-            fill(view.obstacles, view.grid[: room(view.obstacles.shape[0])])
-        fill(view.p, view.grid[room(view.obstacles.shape[0]) :])
+    farthest, filled = np.inf, False
+    if view.looked.shape[0] > 0:
+        farthest = most_moved(numbers, view)
+        if farthest == np.inf:
+            fill_grids(view)
+            look(numbers, view)
+            farthest, filled = 0.0, True
     for i in range(view.p.shape[0]):
         watch_assumptions(numbers, view, i, last[i], counts.breaches[i])
         for axis in range(2):
             force[i, axis] = clip(force[i, axis], numbers.box)
-        shield_agent(numbers, view, i, longest, force[i], counts)
+        _, _, worst, need = target_of(numbers, view, i, force[i])
+        if farthest == np.inf or worst > numbers.speed_cap or not is_alone(view, i, longest, need, farthest):
+            if not filled:
+                fill_grids(view)
+                filled = True
+            shield_agent(numbers, view, i, longest, force[i], counts)
         for axis in range(2):
             last[i, 0, axis], last[i, 1, axis] = view.moving[i, axis], force[i, axis]
+
+
+@allocation_free
+def fill_grids(view):
+    """Sort the team, and obstacles that move, into the view's grids, if it has any; a mission step has sorted the others."""
+    if view.grid.shape[0] > 0:
+        if view.obstacles.shape[1] > 3:
+            fill(view.obstacles, view.grid[: room(view.obstacles.shape[0])])
+        fill(view.p, view.grid[room(view.obstacles.shape[0]) :])
 
 
 @allocation_free

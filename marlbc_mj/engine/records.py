@@ -90,6 +90,7 @@ class Team(NamedTuple):
     breaches: np.ndarray  # (B, N, A) substeps in which its assumptions did not hold, see ShieldCounts
     last_substep: np.ndarray  # (B, N, 2, 2) v and u of the substep before [m/s], [N]
     stopping: np.ndarray  # (B, N) scratch: stopping distances [m]
+    looked: np.ndarray  # (B, N, 3) scratch of a shield, see marlbc_mj.core.lookout; (B, 0, 3) where it is of no use
     stamps: np.ndarray  # (B, N, N, 2) live stamps, see marlbc_mj.core.stamps; (B, 0, 0, 2) where all agents know all
     planes: np.ndarray  # (B, N, N, 2, 3) their half-planes
     memory: np.ndarray  # (B, R, N, 3) the past of a shield: p, stopping distance [m]

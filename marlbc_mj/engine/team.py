@@ -20,7 +20,7 @@ from marlbc_mj.engine.records import Record, Team
 from marlbc_mj.engine.shielding import check_draw
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "tracks")
+SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "looked", "tracks")
 """Fields of a team that carry nothing from one mission step to the next."""
 
 
@@ -64,6 +64,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         breaches=np.zeros((*shielded, len(ASSUMPTIONS))),
         last_substep=np.full((*forces, 2, 2), np.nan),
         stopping=np.zeros(forces),
+        looked=np.zeros((worlds, 0 if moving or mailed[1] else forces[1], 3)),
         stamps=np.full((*mailed, 2), NEVER_STAMPED),
         planes=np.zeros((*mailed, 2, 3)),
         memory=np.zeros((worlds, ring, mailed[1], 3)),

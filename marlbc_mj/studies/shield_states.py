@@ -68,7 +68,7 @@ def _leave_rate(numbers, truth, h, things, states, rng):
     left, agents, obstacles = 0, 2, np.zeros((max(things - 1, 1), 5 if truth.obstacle_speed > 0.0 else 3))
     p, v, stopping, force = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, ASSUMED))
-    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)))
+    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)), np.zeros((0, 3)))
     counts = ShieldCounts(interventions, change, breaches)
     for _ in range(states):
         _draw_state(rng, numbers, h, things, view)
