@@ -42,8 +42,8 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str], status: in
 def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A benchmark of a 2 s mission, with a small video."""
     out = tmp_path_factory.mktemp("bench") / "out"
-    supervisors = ["--supervisors", "scripted", "fsams"]
-    main(["bench", "paper", *supervisors, "--controllers", "sorlc", "pd", "--out", str(out), "--duration", "2.0"])
+    methods = ["--supervisors", "scripted", "--controllers", "sorlc", "pd"]
+    main(["bench", "paper", *methods, "--out", str(out), "--duration", "2.0"])
     return out
 
 
@@ -52,8 +52,7 @@ def test_bench_leaves_what_it_promises(results: Path) -> None:
     names = {p.name for p in results.iterdir()}
     files = {MANIFEST, "config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"}
     assert names == files | {"figures", "logs", "video"}
-    methods = {f"{s}+{c}" for s in ("scripted", "fsams") for c in ("sorlc", "pd")}
-    assert {p.stem for p in (results / "logs").iterdir()} == methods
+    assert {p.stem for p in (results / "logs").iterdir()} == {"scripted+sorlc", "scripted+pd"}
     assert [p.name for p in (results / "video").iterdir()] == ["scripted+sorlc.mp4"]
     assert {p.suffix for p in (results / "figures").iterdir()} == {".pdf", ".png"}
     assert [p.name for p in results.parent.iterdir()] == ["out"]

@@ -46,7 +46,7 @@ SMALL = {
 
 
 def small(**changes) -> TrainConfig:
-    return make_config("fast", **{**SMALL, "budget": 40_000, "evaluate_every": 20_000, **changes})
+    return make_config("fast", **{**SMALL, "budget": 24_000, "evaluate_every": 12_000, **changes})
 
 
 def equal(a, b):
@@ -135,7 +135,7 @@ def test_a_run_leaves_what_the_design_fixes(finished):
     assert list(rows[0]) == [
         "wall_s", "mission_steps", "return", *(f"switches_{i}" for i in range(1, 5)), "violation_time", "clearance_min"
     ]  # fmt: skip
-    assert [float(r["mission_steps"]) for r in rows][-1] >= 40_000
+    assert [float(r["mission_steps"]) for r in rows][-1] >= 24_000
     config = json.loads((finished / "config.json").read_text())
     assert config["train"]["seed"] == 0 and "torch" in config["versions"]
     assert {p.name for p in (finished / "checkpoint").iterdir()} == {
@@ -158,8 +158,8 @@ def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     """kill -9 at any moment while it learns: what was saved last is enough to end with the same networks, to the bit."""
     settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in SMALL.items() if k != "threads"]
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "40000"]
-    command += ["--set", *settings, "evaluate_every=20000", "save_every=0.4"]
+    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "24000"]
+    command += ["--set", *settings, "evaluate_every=12000", "save_every=0.3"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def updates():
@@ -171,7 +171,7 @@ def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     process.kill()
     assert process.wait() == -signal.SIGKILL
     saved = read_arrays(folder / RESUME)[1]["scalars"]
-    assert saved["updates"] > 0 and saved["steps"] < 40_000
+    assert saved["updates"] > 0 and saved["steps"] < 24_000
     config = json.loads((folder / "config.json").read_text())
     resume(folder)
     assert json.loads((folder / "config.json").read_text()) == config and not list(folder.rglob("*partial*"))
@@ -427,7 +427,7 @@ DAMAGED_RUNS = {
     "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
     "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
     "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
-    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 40000 instead of 7"),
+    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 24000 instead of 7"),
 }
 
 
