@@ -25,9 +25,9 @@ def shrink_rows(rows, units):
 
 
 @allocation_free
-def out_of_range(spans, ctrl, first, last):
-    """0, or 1 + the first agent from ``first`` to ``last - 1`` with a control that is not finite or huge."""
-    for i in range(first, last):
+def out_of_range(spans, ctrl):
+    """0, or 1 + the first of the agents with these spans (n, 3, 2) that has a control that is not finite or huge."""
+    for i in range(spans.shape[0]):
         for k in range(spans[i, 2, 0], spans[i, 2, 1]):
             if not abs(ctrl[k]) < DIVERGED:
                 return 1 + i
@@ -40,33 +40,30 @@ def actuate(drives, plant, state, qpos, qvel, force, h, ctrl):
 
     Returns 0, or 1 + agent where a control is not finite or huge.
     """
+    for i in range(force.shape[0]):
+        if plant.ctrl_index[i, 0] >= 0:
+            for axis in range(2):
+                ctrl[plant.ctrl_index[i, axis]] = force[i, axis]
     for g in range(plant.groups.shape[0]):
-        first, last = plant.groups[g, 0], plant.groups[g, 1]
-        if plant.groups[g, 2] == 0:
-            for i in range(first, last):
-                for axis in range(2):
-                    ctrl[plant.ctrl_index[i, axis]] = force[i, axis]
-        else:
-            law, spans = as_drive(drives[g]), plant.spans[first:last]
-            law(plant.robot_params[first:last], state[first:last], qpos, qvel, force[first:last], h, spans, ctrl)
-            failed = out_of_range(plant.spans, ctrl, first, last)
-            if failed:
-                return failed
+        first, end = plant.groups[g, 0], plant.groups[g, 1]
+        law, spans = as_drive(drives[g]), plant.spans[first:end]
+        law(plant.robot_params[first:end], state[first:end], qpos, qvel, force[first:end], h, spans, ctrl)
+        failed = out_of_range(spans, ctrl)
+        if failed:
+            return first + failed
     return 0
 
 
 @on_both_paths
 def read_robots(readings, plant, state, qpos, qvel, actuator_force, p, v, force):
     """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators really gave."""
+    for i in range(p.shape[0]):
+        if plant.ctrl_index[i, 0] >= 0:
+            for axis in range(2):
+                p[i, axis] = qpos[plant.qpos_index[i, axis]]
+                v[i, axis] = qvel[plant.qvel_index[i, axis]]
+                force[i, axis] = actuator_force[plant.ctrl_index[i, axis]]
     for g in range(plant.groups.shape[0]):
-        first, last = plant.groups[g, 0], plant.groups[g, 1]
-        if plant.groups[g, 2] == 0:
-            for i in range(first, last):
-                for axis in range(2):
-                    p[i, axis] = qpos[plant.qpos_index[i, axis]]
-                    v[i, axis] = qvel[plant.qvel_index[i, axis]]
-                    force[i, axis] = actuator_force[plant.ctrl_index[i, axis]]
-        else:
-            law, own = as_reading(readings[g]), state[first:last]
-            spans, seen = plant.spans[first:last], (p[first:last], v[first:last], force[first:last])
-            law(plant.robot_params[first:last], own, qpos, qvel, actuator_force, spans, seen[0], seen[1], seen[2])
+        first, end = plant.groups[g, 0], plant.groups[g, 1]
+        law, own, spans = as_reading(readings[g]), state[first:end], plant.spans[first:end]
+        law(plant.robot_params[first:end], own, qpos, qvel, actuator_force, spans, p[first:end], v[first:end], force[first:end])

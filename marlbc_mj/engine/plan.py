@@ -85,19 +85,22 @@ class Plan:
         robots_own = [law for robot in self.fleet.kinds for law in (robot.drive, robot.reading) if law is not None]
         return all(map(laws.is_compiled, (self.controller.law, self.scenario.disturbance.law, *robots_own)))
 
-    def _laws(self, made: Callable[[laws.Law, Any], Any], none: Any) -> tuple[Any, ...]:
-        """Controller, disturbance, and the groups' drives and readings, as ``made`` of law and kind; ``none`` for no such law."""
-        robots = [group.robot for group in self.fleet.groups]
+    def _laws(self, made: Callable[[laws.Law, Any], Any]) -> tuple[Any, ...]:
+        """Controller, disturbance, and the groups' drives and readings, as ``made`` of law and kind."""
         return (
             made(self.controller.law, laws.CONTROLLER),
             made(self.scenario.disturbance.law, laws.DISTURBANCE),
-            [none if robot.drive is None else made(robot.drive, laws.DRIVE) for robot in robots],
-            [none if robot.reading is None else made(robot.reading, laws.READING) for robot in robots],
+            [made(cast(laws.Law, group.robot.drive), laws.DRIVE) for group in self.fleet.driven],
+            self.readings(made),
         )
+
+    def readings(self, made: Callable[[laws.Law, Any], Any] = laws.for_team) -> list[Any]:
+        """The reading of each group of the plant, as ``made`` of law and kind; by default for the Python path."""
+        return [made(cast(laws.Law, group.robot.reading), laws.READING) for group in self.fleet.driven]
 
     def compiled_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """What compiled code reaches by address, for one MjData per world; whoever calls keeps them alive."""
-        *team_laws, drives, readings = self._laws(laws.address, 0)
+        *team_laws, drives, readings = self._laws(laws.address)
         arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
         columns = (drives, readings, [d._address for d in data], *arrays)
         entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
@@ -105,7 +108,7 @@ class Plan:
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
-        team_laws = self._laws(laws.for_team, None)
+        team_laws = self._laws(laws.for_team)
         columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
         return Native._make((shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
 
@@ -222,7 +225,7 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
         nq=int(model.nq),
         nv=int(model.nv),
         nu=int(model.nu),
-        groups=np.array([(g.first, g.end, not g.robot.direct) for g in fleet.groups], dtype=np.int64),
+        groups=np.array([(group.first, group.end) for group in fleet.driven], dtype=np.int64).reshape(-1, 2),
         spans=find_spans(model, scenario),
         robot_params=_padded([[robot.params_row() for robot in fleet.robots]])[0],
         masses=fleet.masses(scenario.mass),
@@ -236,7 +239,7 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
 def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Addresses of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, (N, 2) each, found by name.
 
-    A free joint's axes are its first two. Robots that are not direct have zeros for ctrl.
+    A free joint's axes are its first two. Robots that are not direct have -1 for ctrl.
     """
     qpos, qvel, ctrl = np.zeros((3, scenario.agents, 2), dtype=np.int64)
     for i, robot in enumerate(scenario.fleet.robots):
@@ -245,8 +248,7 @@ def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray,
             offset = axis if len(robot.joints) == 1 else 0
             qpos[i, axis] = joint.qposadr[0] + offset
             qvel[i, axis] = joint.dofadr[0] + offset
-            if robot.direct:
-                ctrl[i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id
+            ctrl[i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id if robot.direct else -1
     return qpos, qvel, ctrl
 
 

@@ -21,8 +21,8 @@ class Plant(NamedTuple):
 
     qpos_index: np.ndarray  # (N, 2) where each agent's axes are in qpos
     qvel_index: np.ndarray  # (N, 2) in qvel
-    ctrl_index: np.ndarray  # (N, 2) in ctrl; zeros for robots that are not direct
-    groups: np.ndarray  # (G, 3) int64: adjacent agents with the same robot: first, last + 1, and 0 for a direct robot, else 1
+    ctrl_index: np.ndarray  # (N, 2) in ctrl; -1 for robots that are not direct
+    groups: np.ndarray  # (G, 2) int64 first and last + 1 of adjacent agents with the same robot, where that is not direct
     nq: int
     nv: int
     nu: int
@@ -48,8 +48,8 @@ class Native(NamedTuple):
     model: Any  # MjModel
     controller: Any  # law of the whole team
     disturbance: Any  # law of the whole team
-    drives: Any  # (G,) a law of each group of the plant; 0 for a direct robot
-    readings: Any  # (G,) a law of each group; 0 for a direct robot
+    drives: Any  # (G,) a law of each group of the plant
+    readings: Any  # (G,) a law of each group
     data: Any  # (B,) MjData
     qpos: Any  # (B,) its arrays
     qvel: Any

@@ -141,10 +141,9 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)
     if len(plan.solid):
         data.mocap_pos[plan.solid, :2] = team.obstacles[b, :, :2]
-    if plant.groups[:, 2].any():
+    if len(plant.groups):
         p, v, force = np.zeros((3, *team.position[b].shape))
-        reading = [g.robot.reading and laws.for_team(g.robot.reading, laws.READING) for g in plan.fleet.groups]
-        read_robots(reading, plant, team.robot[b], data.qpos, data.qvel, data.actuator_force, p, v, force)
+        read_robots(plan.readings(), plant, team.robot[b], data.qpos, data.qvel, data.actuator_force, p, v, force)
         data.qpos[base] += np.ravel(position - p)
         team.velocity[b] = v
     if team.sensed.shape[1] > 0:  # the past that delays look into is the present

@@ -49,6 +49,11 @@ class RobotFleet:
         return tuple(found)
 
     @property
+    def driven(self) -> tuple[AgentGroup, ...]:
+        """Groups whose robots have laws of their own."""
+        return tuple(group for group in self.groups if not group.robot.direct)
+
+    @property
     def words(self) -> str:
         """The robots in messages: ``'disc'``, or ``'disc' and 'omni'``."""
         first, *others = [repr(robot.name) for robot in self.kinds]
