@@ -43,7 +43,7 @@ def gate(robots: tuple[str, ...] = MIXED, **changes) -> Scenario:
 @pytest.mark.parametrize("robots", [MIXED, SLIDING, ("diff_drive", "omni", "crazyflie", "diff_drive")])
 def test_compiled_loop_python_path_and_dm_control_agree(robots):
     """p, v, force and pose are the same to the bit on both paths of World, and the same in a dm_control episode."""
-    scenario = gate(robots, perturbation=Perturbation(start_spread=0.05, obstacle_spread=0.05))
+    scenario = gate(robots, duration=0.25, perturbation=Perturbation(start_spread=0.05, obstacle_spread=0.05))
     compiled, python = (
         run_episode(World(scenario, PD(), record=True, native=native), Scripted(), seed=3) for native in (None, False)
     )
@@ -169,7 +169,7 @@ def test_a_shield_of_references_keeps_a_mixed_team_clear():
     crowded = replace(scenario, starts=tuple((first.x + unit * x, first.y + unit * y) for x, y in places))
     world = World(crowded, PD(), record=True, shield=True)
     assert world.plan.plant.shield[0].tube == make_robot("diff_drive").tube
-    clearance, distance, off = attack(world, 120, speed=crowded.speed_limit, change=30)
+    clearance, distance, off = attack(world, 60, speed=crowded.speed_limit, change=30)
     assert clearance > crowded.safe_distance and distance > 2.0 * scenario.fleet.radius
     assert off <= world.plan.plant.shield[0].tube
 

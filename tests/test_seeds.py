@@ -3,6 +3,7 @@
 import csv
 import json
 import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -219,13 +220,14 @@ def test_report_leaves_whole_files(failing: SeedResults, tmp_path: Path) -> None
 
 def test_the_page_grows_as_methods_end(results: SeedResults, tmp_path: Path) -> None:
     """A method is shown once all its draws have ended; until the reference has, others are compared with the first that has."""
+    results = replace(results, methods=results.methods[:2])
     study = DrawsStudy(results.scenario, tuple((m.supervisor, m.controller) for m in results.methods), results.seeds)
     tell = growing_page(study, tmp_path, CONFIG)
     folder, shown = tmp_path / ".jobs" / "so_far", []
     for job, runs in reversed(list(zip(study.jobs(), results.methods, strict=True))):
         tell(job, runs)
-        shown.append(re.findall(r"(\d) of 4 methods so far", (folder / "index.html").read_text()))
-    assert shown == [["1"], ["1"], ["1"], ["4"]]
+        shown.append(re.findall(r"(\d) of 2 methods so far", (folder / "index.html").read_text()))
+    assert shown == [["1"], ["2"]]
     assert (folder / "tables.md").read_text() == markdown(make_seed_tables(results, analyse(results)))
     assert {path.name for path in folder.iterdir()} == {"index.html", "tables.md"}
 
