@@ -9,6 +9,7 @@ from marlbc_mj import World, make_controller, make_scenario, make_supervisor, ru
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.video import VideoStyle, render_video
 from marlbc_mj.robots import make_robot
+from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.robot_gate import ORIGIN
 from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, SHOWN, fly_gate
 
@@ -17,6 +18,7 @@ MOST_BYTES = 150_000
 SECONDS = 6.0  # about how long an animation lasts
 FAMILY_SEEDS = {"field": 1, "forest": 1, "gates": 1, "corridor": 1, "traffic": 1, "exchange": 0}
 """The draw of each family that is shown."""
+MIXED = ("crazyflie", "disc", "omni", "diff_drive")
 GATE_MIDDLE, REACH = 65.0, 7.0  # of the picture of a robot, along the path, in length units
 
 
@@ -30,13 +32,15 @@ class Shot(NamedTuple):
 
 def shots(names: list[str]) -> Iterator[Shot]:
     """Those asked for, or all; each is flown when its turn comes."""
-    for name in names or ["mission", *FAMILY_SEEDS, *SHOWN]:
+    for name in names or ["mission", *FAMILY_SEEDS, *SHOWN, "mixed"]:
         if name == "mission":
             log = fly("paper", "marlms", seed=0)
             yield Shot(name, log, VideoStyle(speed=10.0, fps=10, size=(840, 378), camera="wide", end=92.0, samples=4))
         elif name in FAMILY_SEEDS:
             log = fly(name, "lookahead", seed=FAMILY_SEEDS[name], composition="set-based")
             yield Shot(f"gallery/{name}", log, style(log, 0.0, float(log.time[-1]), "wide", 8))
+        elif name == "mixed":
+            yield mixed_shot()
         else:
             yield robot_shot(name)
 
@@ -50,11 +54,21 @@ def fly(scenario: str, supervisor: str, *, seed: int, **changes: str) -> Episode
 
 
 def robot_shot(name: str) -> Shot:
-    """Four robots in a column, from the first that comes into the picture of the gate to the last that leaves it."""
+    """Four robots of one kind in a column."""
     _, trajectory = fly_gate(name, "scripted")
-    robot, scenario = make_robot(name), trajectory.scenario
-    log = from_trajectory(trajectory, GATE_CONTROLLERS["pd"](robot))
-    unit, speed = robot.length, scenario.path_velocity[0]
+    return gate_shot(name, from_trajectory(trajectory, GATE_CONTROLLERS["pd"](make_robot(name))), trajectory.scenario)
+
+
+def mixed_shot() -> Shot:
+    """Four different robots in one team, at the same gate."""
+    scenario, law = make_scenario("robot_gate", robots=MIXED), make_controller("pd")
+    trajectory = run_episode(World(scenario, law, record=True), make_supervisor("scripted"), names=("scripted", "pd"))
+    return gate_shot("mixed", from_trajectory(trajectory, law), scenario)
+
+
+def gate_shot(name: str, log: EpisodeLog, scenario: Scenario) -> Shot:
+    """What is seen at the gate, from the first that comes into the picture to the last that leaves it."""
+    unit, speed = scenario.fleet.length, scenario.path_velocity[0]
     start, end = (unit * (GATE_MIDDLE + side * 1.4 * REACH - ORIGIN) / speed for side in (-1.0, 1.0))
     return Shot(f"gallery/{name}", log, style(log, start, end, f"at:{unit * GATE_MIDDLE},0,{unit * REACH}", 8))
 

@@ -21,6 +21,8 @@ from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
 """Pose of robots that are where their p is and never turn."""
+LEVEL_POSE = (0.0, 1.0, 0.0, 0.0, 0.0)
+"""Height and quaternion of such robots in a team of which others have a pose."""
 
 
 class Frame(NamedTuple):
@@ -179,7 +181,13 @@ def _hearing(frames: list[Frame]) -> Hearing | None:
 
 
 def body_poses(world: World, b: int = 0) -> np.ndarray:
-    """(N, 7) of the bodies of world ``b``, (0, 7) where they have no free joint."""
-    if len(world.plan.robot.joints) > 1:
+    """(N, 7) of the bodies of world ``b``, (0, 7) where none has a free joint; those without one lie level on the ground."""
+    fleet, qpos, index = world.plan.fleet, world.data[b].qpos, world.plan.plant.qpos_index
+    if not fleet.floating:
         return NO_POSE
-    return np.stack([world.data[b].qpos[first : first + 7] for first in world.plan.plant.qpos_index[:, 0]])
+    return np.stack(
+        [
+            qpos[first : first + 7] if len(robot.joints) == 1 else [qpos[first], qpos[second], *LEVEL_POSE]
+            for robot, (first, second) in zip(fleet.robots, index.tolist(), strict=True)
+        ]
+    )

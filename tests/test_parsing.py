@@ -48,6 +48,19 @@ def test_options_and_subcommands_are_those_of_the_help(capsys: pytest.CaptureFix
 
 
 @pytest.mark.parametrize(
+    "arguments",
+    [
+        ["run", "papre"],
+        ["bench", "--supervisors", "scripted", "scriptd"],
+        ["run", "--set=robots=disc,dsic"],
+    ],
+)
+def test_a_wrong_word_is_found_before_tyro_loads_what_it_parses_with(arguments, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(tyro, "cli", None)
+    assert said_of(arguments, capsys).count("\n") == 1
+
+
+@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["robot", "check"], r"Missing from marlbc robot check: ROBOT file; see `marlbc robot check --help`"),

@@ -32,7 +32,8 @@ from marlbc_mj.episode import Trajectory, run_episode
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.exports import export_log
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
-from marlbc_mj.recording.reader import log_info, read_log, recover_log
+from marlbc_mj.recording.mcap_file import recover_log
+from marlbc_mj.recording.reader import log_info, read_log
 from marlbc_mj.recording.writer import LogWriter, partial_name
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.summary import json_numbers

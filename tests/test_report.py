@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from itertools import combinations
 from pathlib import Path
@@ -19,13 +20,15 @@ from marlbc_mj.cli.terminal import print_results, result_line
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
-from marlbc_mj.report import curves, figures, paper_values, plotting, write_report
+from marlbc_mj.report import curves, figures, paper_values, plotting
 from marlbc_mj.report.arena import trajectories
+from marlbc_mj.report.bundle import write_report
 from marlbc_mj.report.findings import claims, oracle_gap, predictions, same_actuator
 from marlbc_mj.report.formats import significant, spans
 from marlbc_mj.report.page import write_benchmark_page
 from marlbc_mj.report.paper_values import order_mark
 from marlbc_mj.report.pareto import pareto
+from marlbc_mj.report.so_far import write_so_far
 from marlbc_mj.report.table import Column, Table, latex, to_latex, to_markdown
 from marlbc_mj.report.tables import latex_document, make_tables, markdown
 from marlbc_mj.report.templates import render
@@ -33,7 +36,7 @@ from marlbc_mj.results.metrics import AgentMetrics, TeamMetrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.scenarios import paper
-from marlbc_mj.studies.bench import SoFar
+from marlbc_mj.studies.so_far import SoFar
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.method_names import display_name
@@ -275,16 +278,17 @@ def test_a_line_per_method_says_what_came_of_it(results: list[Result]) -> None:
 def test_the_page_grows_as_methods_end(results: list[Result], tmp_path: Path) -> None:
     """Whole at any time, with how many there will be; the page that is written last does not load itself again."""
     facts = {"scenario": paper(), "versions": {"numpy": "2"}, "git_revision": "abc", "seed": 0, "command": "marlbc bench"}
-    page = SoFar(tmp_path / "so_far", facts, [result.key for result in results])
+    page = SoFar(tmp_path, [result.key for result in results], partial(write_so_far, config=facts))
+    folder = tmp_path / ".jobs" / "so_far"
     shown = []
     for result in (results[1], results[0], results[3], results[2]):
-        page.add(result)
-        page._written = -np.inf
-        text = (tmp_path / "so_far" / "index.html").read_text()
+        page.add(result.key, result)
+        page._next = -np.inf
+        text = (folder / "index.html").read_text()
         shown.append((re.findall(r"(\d) of 4 methods so far", text), "refresh" in text))
-        assert {path.name for path in (tmp_path / "so_far").iterdir()} == {"index.html", "tables.md"}
+        assert {path.name for path in folder.iterdir()} == {"index.html", "tables.md"}
     assert shown == [(["1"], True), (["2"], True), (["3"], True), (["4"], False)]
-    assert (tmp_path / "so_far" / "tables.md").read_text() == markdown(make_tables(results, "paper"))
+    assert (folder / "tables.md").read_text() == markdown(make_tables(results, "paper"))
 
 
 def test_failures_appear_in_every_form(results: list[Result]) -> None:

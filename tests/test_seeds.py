@@ -2,6 +2,8 @@
 
 import csv
 import json
+import re
+from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
@@ -16,6 +18,7 @@ from marlbc_mj.report.seed_files import seed_summary, write_seed_csv
 from marlbc_mj.report.seed_page import write_seed_report
 from marlbc_mj.report.seed_tables import make_seed_tables
 from marlbc_mj.report.table import to_latex, to_markdown
+from marlbc_mj.report.tables import markdown
 from marlbc_mj.report.templates import render
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.scores import SCORES
@@ -23,7 +26,7 @@ from marlbc_mj.results.seed_statistics import analyse, group, supervisor_of
 from marlbc_mj.results.seeds import Instance, MethodRuns, SeedResults, SeedRun, seed_range
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.scenarios import Perturbation, Scenario, paper
-from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION, perturbed, run_methods
+from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION, DrawsStudy, growing_page, perturbed, run_methods
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -213,6 +216,20 @@ def test_report_leaves_whole_files(failing: SeedResults, tmp_path: Path) -> None
     with (tmp_path / "episodes.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 2 * 4 * 4 and sum(bool(row["failure"]) for row in rows) == 2 * 4
+
+
+def test_the_page_grows_as_methods_end(results: SeedResults, tmp_path: Path) -> None:
+    """A method is shown once all its draws have ended; until the reference has, others are compared with the first that has."""
+    results = replace(results, methods=results.methods[:2])
+    study = DrawsStudy(results.scenario, tuple((m.supervisor, m.controller) for m in results.methods), results.seeds)
+    tell = growing_page(study, tmp_path, CONFIG)
+    folder, shown = tmp_path / ".jobs" / "so_far", []
+    for job, runs in reversed(list(zip(study.jobs(), results.methods, strict=True))):
+        tell(job, runs)
+        shown.append(re.findall(r"(\d) of 2 methods so far", (folder / "index.html").read_text()))
+    assert shown == [["1"], ["2"]]
+    assert (folder / "tables.md").read_text() == markdown(make_seed_tables(results, analyse(results)))
+    assert {path.name for path in folder.iterdir()} == {"index.html", "tables.md"}
 
 
 def test_report_without_figures(failing: SeedResults, tmp_path: Path) -> None:

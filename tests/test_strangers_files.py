@@ -18,9 +18,10 @@ from mcap.writer import CompressionType, Writer
 
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import digest, read_arrays, write_arrays
-from marlbc_mj.recording import reader
+from marlbc_mj.recording import mcap_file
 from marlbc_mj.recording.exports import export_log
-from marlbc_mj.recording.reader import log_info, read_log, recover_log
+from marlbc_mj.recording.mcap_file import recover_log
+from marlbc_mj.recording.reader import log_info, read_log
 from marlbc_mj.recording.stage import make_stage
 from marlbc_mj.robots import make_robot, trial
 from marlbc_mj.scenarios import load_scenario, make_scenario
@@ -302,7 +303,7 @@ def bomb(path: Path, compress, kind: CompressionType, size: int, said: int) -> P
 @pytest.mark.parametrize("honest", [True, False])
 def test_a_bomb_is_not_opened(tmp_path, compress, kind, honest, monkeypatch):
     """Whether it says how large it is or not."""
-    size = 2 * reader.MOST_CHUNK
+    size = 2 * mcap_file.MOST_CHUNK
     path = bomb(tmp_path / "b.mcap", compress, kind, size, size if honest else 100)
     monkeypatch.setattr(zstandard, "decompress", None)
     monkeypatch.setattr(lz4.frame, "decompress", None)
@@ -312,7 +313,7 @@ def test_a_bomb_is_not_opened(tmp_path, compress, kind, honest, monkeypatch):
 
 
 def test_chunks_together_have_a_limit_too(log, monkeypatch):
-    monkeypatch.setattr(reader, "MOST_UNPACKED", 1000)
+    monkeypatch.setattr(mcap_file, "MOST_UNPACKED", 1000)
     with pytest.raises(ConfigurationError, match="larger than 1000 bytes together"):
         read_log(log)
 

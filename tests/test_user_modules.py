@@ -27,6 +27,7 @@ from marlbc_mj.studies.robot_check import checklist
 from marlbc_mj.studies.robot_truth import all_plain
 from marlbc_mj.supervisors import Learned, OneTeam, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.matplotlib_folder import prepare_matplotlib
 
 SKATE = """<mujoco model="skate"><compiler autolimits="true"/><worldbody><body name="deck" pos="0 0 0.08">
 <joint name="sx" type="slide" axis="1 0 0"/><joint name="sy" type="slide" axis="0 1 0"/>
@@ -180,6 +181,23 @@ def test_without_a_folder_for_the_cache_code_is_compiled_in_memory(monkeypatch):
     monkeypatch.setattr(compiling.numba, "njit", refuse)
     for make in (compiling.compiled, compiling.threaded, compiling.allocation_free):
         assert make(add_up)(4) == 6
+
+
+def test_matplotlib_gets_a_folder_where_its_own_cannot_be_written(monkeypatch, tmp_path):
+    """A home that is a file cannot hold one; a folder that is named already, or can be made, is left alone."""
+    for name in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    prepare_matplotlib()
+    assert "MPLCONFIGDIR" not in os.environ and not list(tmp_path.iterdir())
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("HOME", str(tmp_path / "file"))
+    monkeypatch.setenv("MPLCONFIGDIR", "")
+    prepare_matplotlib()
+    folder = Path(os.environ["MPLCONFIGDIR"])
+    assert folder.is_dir()
+    prepare_matplotlib()
+    assert os.environ["MPLCONFIGDIR"] == str(folder)
 
 
 MINE = """

@@ -1,11 +1,12 @@
 """Is the wheel small, and does it work where nothing else of the project is? ``python tests/wheel.py dist [--install FOLDER]``.
 
 With ``--install`` it goes into a new environment in the folder, which is removed afterwards, and an episode is flown there. What
-is printed: seconds and megabytes of the installation, and seconds to the end of the first and the second command.
+is printed: seconds and megabytes of the installation, seconds of each command, a wrong word and an evaluation among them.
 """
 
 import argparse
 import os
+import resource
 import shutil
 import subprocess
 import sys
@@ -17,6 +18,8 @@ from pathlib import Path
 MOST_BYTES = 2_000_000
 ROOT = Path(__file__).resolve().parents[1]
 EPISODE = ("run", "paper", "--controller", "pd", "--duration", "1", "--overwrite", "--quiet")
+EVALUATION = ("evaluate", "field", "--supervisors", "fixed", "--seeds", "1", "--duration", "1", "--overwrite", "--quiet")
+WRONG_WORD = ("run", "paper", "--supervisor", "scriptd")
 
 
 def the_wheel(folder: Path) -> Path:
@@ -40,23 +43,33 @@ def install(wheel: Path, folder: Path, extras: Sequence[str]) -> None:
     python, wanted = folder / "env" / "bin" / "python", f"{wheel}[{','.join(extras)}]" if extras else str(wheel)
     call([str(python), "-m", "pip", "install", "--quiet", "-c", str(ROOT / "constraints.txt"), wanted], folder)
     held = sum(path.lstat().st_size for path in (folder / "env").rglob("*") if path.is_file() and not path.is_symlink())
-    print(f"installed {wheel.name} with {' '.join(extras) or 'no extras'}: {time.monotonic() - began:.0f} s, {held / 1e6:.0f} MB")
+    took = f"{time.monotonic() - began:.0f} s, {processor_time():.0f} s of processor time, {held / 1e6:.0f} MB"
+    print(f"installed {wheel.name} with {' '.join(extras) or 'no extras'}: {took}")
     marlbc = str(folder / "env" / "bin" / "marlbc")
-    for line in (("--version",), ("list", "--quiet"), EPISODE, EPISODE):
-        began = time.monotonic()
-        call([marlbc, *line], folder)
-        print(f"marlbc {' '.join(line)}: {time.monotonic() - began:.1f} s")
+    first = ("--version",), ("list", "--quiet")
+    for line, status in (*((each, 0) for each in first), (WRONG_WORD, 2), (EPISODE, 0), (EPISODE, 0), (EVALUATION, 0)):
+        said, used = time.monotonic(), processor_time()
+        call([marlbc, *line], folder, status)
+        print(f"marlbc {' '.join(line)}: {time.monotonic() - said:.1f} s, {processor_time() - used:.1f} s of processor time")
+        if line == EPISODE:
+            print(f"from nothing to the end of this episode: {time.monotonic() - began:.0f} s")
     if "parquet" in extras:
         call([marlbc, "export", "out/run/logs/scripted+pd.mcap", "episode.parquet"], folder)
     shutil.rmtree(folder)
 
 
-def call(command: Sequence[str], folder: Path) -> None:
-    """Run a command in the folder with nothing of the caller's Python; the process ends with its status where that is not 0."""
+def processor_time() -> float:
+    """Of all commands so far [s]; it says more than the clock where others use the machine."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def call(command: Sequence[str], folder: Path, status: int = 0) -> None:
+    """Run a command in the folder with nothing of the caller's Python; this process ends with 1 where its status is another."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV", "PIP_TARGET")}
     done = subprocess.run(command, cwd=folder, env={**environment, "NUMBA_CACHE_DIR": str(folder.resolve() / "cache")})
-    if done.returncode:
-        sys.exit(done.returncode)
+    if done.returncode != status:
+        sys.exit(f"{' '.join(command)} ended with status {done.returncode}, not {status}")
 
 
 def main() -> None:

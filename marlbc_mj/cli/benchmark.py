@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from marlbc_mj.cli.choices import (
+    ROBOTS_SETTING,
     Compositions,
     ControllerName,
     MissionNames,
@@ -72,7 +73,8 @@ class ScenarioOptions:
     split: SomeSplit = None
     """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
     set: ScenarioSettings = ()
-    """Settings of communication and imperfections: communication.range=8 communication.loss=0.2."""
+    """Settings of communication and imperfections, and each agent's robot where they differ: communication.range=8
+    robots=disc,disc,omni,crazyflie."""
 
     allow_code: bool = False
     """Run the Python file that a scenario file names as its robot."""
@@ -95,19 +97,35 @@ class ScenarioOptions:
         if self.disturbance is not None or self.drag_scale is not None:
             scale = 1.0 if self.drag_scale is None else self.drag_scale
             changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name), **changes)
-        return with_settings(scenario, self.set)
+        settings, robots = self._split_settings()
+        scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name, robots), **changes)
+        return with_settings(scenario, settings)
 
-    def _robot_changes(self, name: str) -> dict[str, Any]:
-        """Fields that another robot changes, without those that other options set."""
-        from marlbc_mj.robots import make_robot
+    def _split_settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """The settings without that of the robots, and the names that it gives: their scale is the scenario's from the start."""
+        given = [setting for setting in self.set if setting.partition("=")[0] == ROBOTS_SETTING]
+        names = given[-1].partition("=")[2].split(",") if given else []
+        return tuple(setting for setting in self.set if setting not in given), tuple(names)
 
-        if self.robot is None:
+    def _robot_changes(self, name: str, robots: tuple[str, ...]) -> dict[str, Any]:
+        """Fields that another robot, or one of each agent's, changes, without those that other options set.
+
+        Raises:
+            ConfigurationError: both are given, or a robot that cannot be made.
+        """
+        from marlbc_mj.robots import make_fleet
+
+        if self.robot is not None and robots:
+            raise ConfigurationError(
+                f"--robot {self.robot} is every agent's, and robots={','.join(robots)} each agent's; give one"
+            )
+        if self.robot is None and not robots:
             return {}
+        chosen = {"robots": robots} if robots else {"robot": self.robot, "robots": ()}
         if name == "robot_gate":
-            return {"robot": self.robot}
-        scale = make_robot(self.robot).scale()
-        return {key: value for key, value in scale.items() if getattr(self, key, None) is None or key == "robot"}
+            return chosen
+        scale = make_fleet(robots or (str(self.robot),)).scale()
+        return {**{key: value for key, value in scale.items() if getattr(self, key, None) is None}, **chosen}
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,10 @@ _LISTED = Kind("kind", ())
 _DEVICE = Kind("device", ("devices",))
 
 
+ROBOTS_SETTING = "robots"
+"""The setting of a scenario that names each agent's robot."""
+
+
 @cache
 def selectable() -> dict[str, dict[str, str]]:
     """Descriptions by kind and name, of everything that can be selected."""
@@ -99,13 +103,15 @@ def check_setting(kind: Kind, text: str) -> str:
     """``NAME=VALUE``, if there is such a setting.
 
     Raises:
-        ConfigurationError: there is none, or no value.
+        ConfigurationError: there is none, or no value, or a robot that there is not.
     """
-    name, equals, _ = text.partition("=")
+    name, equals, value = text.partition("=")
     if not equals:
         raise ConfigurationError(f"--set takes name=value, got {text!r}")
     if name not in names_of(kind):
         raise unknown(kind.word, name, names_of(kind))
+    for robot in value.split(",") if name == ROBOTS_SETTING else ():
+        check_word(_ROBOT, robot)
     return text
 
 

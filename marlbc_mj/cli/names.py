@@ -9,7 +9,7 @@ from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
-from marlbc_mj.cli.choices import NAMES_FILE
+from marlbc_mj.cli.choices import NAMES_FILE, ROBOTS_SETTING
 
 _BASES = ("inputs as in the paper", "inputs relative to the reference", "no networks")
 _COMPOSITIONS = ("avoidance as an equality task, projected (12)", "avoidance as an inequality: a bound on the velocity")
@@ -85,7 +85,8 @@ def _settings() -> dict[str, dict[str, str]]:
     from marlbc_mj.training.config import TrainConfig
     from marlbc_mj.training.general.config import GeneralConfig
 
-    of_scenario = {**_defaults(IDEAL, "communication."), **_defaults(NO_IMPERFECTIONS, "imperfections.")}
+    robots = {ROBOTS_SETTING: "each agent's robot, separated by commas; the scenario's robot for all by default"}
+    of_scenario = {**_defaults(IDEAL, "communication."), **_defaults(NO_IMPERFECTIONS, "imperfections."), **robots}
     return {
         "settings of a scenario": of_scenario,
         "settings of training": {**_defaults(GeneralConfig()), **_defaults(TrainConfig())},

@@ -7,10 +7,12 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import fields, is_dataclass
-from typing import Any, NamedTuple, get_args, get_type_hints
+from pathlib import Path
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import FlagCreatePairsOff, Positional
+from tyro.constructors import PrimitiveConstructorSpec
 
 from marlbc_mj.cli.choices import WrongWord
 from marlbc_mj.util.text import nearest_word, one_line
@@ -59,6 +61,7 @@ def parse(commands: Any, arguments: Sequence[str] | None, *, prog: str, descript
     hook = getattr(getattr(tyro, "_errors", None), "on_parse_error", None)
     about = description if chosen.kind is commands else None
     try:
+        check_words(chosen)
         with nullcontext() if hook is None else hook(refuse):
             return _of_tyro(chosen, about)
     except WrongWord as wrong:
@@ -76,6 +79,43 @@ def choose_command(commands: Any, given: list[str], prog: str) -> Chosen:
         word, *rest = chosen.rest
         chosen = Chosen(known[word], f"{chosen.prog} {word}", rest)
     return chosen
+
+
+def check_words(chosen: Chosen) -> None:
+    """Check what the first words and options choose by name. tyro does so, too, but loads half a second of other packages first.
+
+    Raises:
+        WrongWord: a word that means nothing here.
+    """
+    if not is_dataclass(chosen.kind):
+        return
+    hints = dict(_named_options(chosen.kind))
+    own = get_type_hints(chosen.kind, include_extras=True).values()
+    hint: Any = next((each for each in own if _POSITIONAL in get_args(each)[1:]), None)
+    for word in chosen.rest:
+        if word.startswith("--"):
+            name, _, value = word.partition("=")
+            hint, words = hints.get(name.replace("_", "-")), [value] if value else []
+        else:
+            words = [word]
+        constructor = _constructor_of(hint)
+        if words and constructor is not None:
+            constructor.instance_from_str(words)
+            hint = hint if _is_tuple(hint) else None
+
+
+def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:
+    """What a word becomes a value by, where a field says so itself. Files are left to tyro, which counts words first."""
+    for part in () if Path in get_args(hint) else get_args(hint):
+        found = part if isinstance(part, PrimitiveConstructorSpec) else _constructor_of(part)
+        if found is not None:
+            return found
+    return None
+
+
+def _is_tuple(hint: Any) -> bool:
+    """Whether a field takes several words."""
+    return get_origin(hint) is tuple or any(map(_is_tuple, get_args(hint)))
 
 
 def _refused_word(chosen: Chosen) -> Refusal | None:
@@ -146,19 +186,24 @@ def subcommands_of(kind: Any) -> dict[str, Any]:
 
 def options_of(kind: Any) -> Iterator[str]:
     """Spelling of every option of a command or a union of commands, once or more often."""
+    return (name for name, _ in _named_options(kind))
+
+
+def _named_options(kind: Any) -> Iterator[tuple[str, Any]]:
+    """Spelling and hint of every option of a command or a union of commands, once or more often."""
     for command in subcommands_of(kind).values():
-        yield from options_of(command)
+        yield from _named_options(command)
     if not is_dataclass(kind):
         return
     defaults = {each.name: each.default for each in fields(kind)}
     for name, hint in get_type_hints(kind, include_extras=True).items():  # Annotated[kind, mark, ...] or a kind
         inner, *marks = get_args(hint) or (hint,)
         if is_dataclass(inner):
-            yield from options_of(inner)
+            yield from _named_options(inner)
         elif name != "action" and _POSITIONAL not in marks:
             renamed = [mark.name for mark in marks if isinstance(getattr(mark, "name", None), str)]
             spelled = (renamed or [name])[0].replace("_", "-")
-            yield f"--no-{spelled}" if inner is bool and defaults[name] is True else f"--{spelled}"
+            yield (f"--no-{spelled}" if inner is bool and defaults[name] is True else f"--{spelled}"), hint
 
 
 _POSITIONAL = get_args(Positional[int])[1]

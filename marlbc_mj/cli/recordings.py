@@ -110,7 +110,7 @@ class LogRecoverCommand:
 
     def run(self) -> None:
         """Recover and count."""
-        from marlbc_mj.recording.reader import recover_log
+        from marlbc_mj.recording.mcap_file import recover_log
 
         saved = recover_log(self.log, self.out, overwrite=self.overwrite)
         self.output.say(f"{self.out}: {saved} messages")

@@ -41,7 +41,7 @@ TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
 
 _SPANS = types.int64[:, :, ::1]
 TEAM_DRIVE = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _MATRIX, types.float64, _SPANS, _VECTOR)
-"""A drive for every robot in turn: gains (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (3, N, 2): first
+"""A drive for every robot in turn: gains (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (N, 3, 2): first
 and last + 1 of each robot in qpos, in qvel and in ctrl; the whole ctrl."""
 
 TEAM_READING = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _SPANS, _MATRIX, _MATRIX, _MATRIX)
@@ -76,14 +76,14 @@ def _disturbance_team(gains, t, p, v, force_out):
 
 def _drive_team(gains, state, qpos, qvel, force, h, spans, ctrl_out):
     for i in range(force.shape[0]):
-        q, v, u = spans[0, i], spans[1, i], spans[2, i]
+        q, v, u = spans[i, 0], spans[i, 1], spans[i, 2]
         own = qpos[q[0] : q[1]], qvel[v[0] : v[1]]
         _law(_gains(gains[i]), _state(state[i]), own[0], own[1], force[i], h, ctrl_out[u[0] : u[1]])
 
 
 def _reading_team(gains, state, qpos, qvel, actuator_force, spans, p_out, v_out, force_out):
     for i in range(p_out.shape[0]):
-        q, v, u = spans[0, i], spans[1, i], spans[2, i]
+        q, v, u = spans[i, 0], spans[i, 1], spans[i, 2]
         own = qpos[q[0] : q[1]], qvel[v[0] : v[1]], actuator_force[u[0] : u[1]]
         _law(_gains(gains[i]), _state(state[i]), own[0], own[1], own[2], p_out[i], v_out[i], force_out[i])
 

@@ -3,10 +3,13 @@
 The engine compiles this text, and the dm_control arena is made from the same text, so there is one model.
 """
 
+from collections.abc import Sequence
+from typing import Any
+
 import mujoco
 import numpy as np
 
-from marlbc_mj.robots import MODELS, Robot, make_robot
+from marlbc_mj.robots import MODELS, Robot, RobotFleet
 from marlbc_mj.robots.standard import quiet
 from marlbc_mj.scenarios import Obstacle, Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -24,6 +27,8 @@ _OWN = ("timestep", "disableflags")
 OPTIONS = tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_") and name not in _OWN)
 """Options of a robot's MJCF that the arena takes over, gravity and air among them: whoever flies or slides there depends on them.
 The time step is the scenario's."""
+MEDIUM = ("gravity", "wind", "density", "viscosity", "magnetic", "disableflags")
+"""Options in which robots of one world must agree; of others, what one robot's file leaves open is as another's says."""
 
 
 def agent_prefix(agent: int) -> str:
@@ -35,26 +40,27 @@ def assemble(scenario: Scenario, limit: float) -> str:
     """The MJCF of a whole scenario.
 
     Args:
-        scenario: which robot, how many, what obstacles, which substep.
+        scenario: which robots, what obstacles, which substep.
         limit: force range of every motor [N]; infinite, for laws that ignore the actuator, removes those of a robot that has no
             mass and no force limit of its own.
 
     Raises:
-        ConfigurationError: unknown robot, one that MuJoCo does not take several times, or a limit that is not positive.
+        ConfigurationError: unknown robot, one that MuJoCo does not take several times, robots whose options contradict each
+            other, or a limit that is not positive.
     """
     if not limit > 0:
         raise ConfigurationError(f"force limit must be positive, got {limit}")
-    robot = make_robot(scenario.robot)
+    fleet = scenario.fleet
     spec = mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
     spec.modelname = scenario.name
     spec.option.timestep = scenario.substep
     spec.memory = MEMORY + MEMORY_PER_AGENT * max(0, scenario.agents - 32)
-    _prepare_arena(spec, robot, scenario.agents)
-    for agent in range(scenario.agents):
+    _prepare_arena(spec, fleet)
+    for agent, robot in enumerate(fleet.robots):
         _attach(spec, robot, agent, scenario.mass, limit)
     for k, obstacle in enumerate(scenario.obstacles):
-        _add_obstacle(spec, k, obstacle, robot)
-    _add_cameras(spec, scenario)
+        _add_obstacle(spec, k, obstacle, fleet)
+    _add_cameras(spec, scenario, fleet.length)
     with quiet():
         try:
             spec.compile()
@@ -64,23 +70,47 @@ def assemble(scenario: Scenario, limit: float) -> str:
 
 
 def unfit(scenario: Scenario, error: Exception) -> ConfigurationError:
-    """The error for a robot that MuJoCo takes alone, but not as a team."""
-    return ConfigurationError(f"robot {scenario.robot!r} cannot be put into one world {scenario.agents} times: {one_line(error)}")
+    """The error for robots that MuJoCo takes alone, but not as a team."""
+    fleet = scenario.fleet
+    who, times = (f"robots {fleet.words}", "") if fleet.mixed else (f"robot {fleet.words}", f" {scenario.agents} times")
+    return ConfigurationError(f"{who} cannot be put into one world{times}: {one_line(error)}")
 
 
-def _prepare_arena(spec: mujoco.MjSpec, robot: Robot, agents: int) -> None:
-    """Take the options of contact from the robot's MJCF, and draw the ground at its scale."""
-    child = robot.spec()
+def _prepare_arena(spec: mujoco.MjSpec, fleet: RobotFleet) -> None:
+    """Take the options of contact from the robots' MJCF, and draw the ground at their scale."""
+    children = [(robot.name, robot.spec().option) for robot in fleet.kinds]
     for name in OPTIONS:
-        setattr(spec.option, name, getattr(child.option, name))
-    spec.option.disableflags |= child.option.disableflags
-    if robot.ground:
+        setattr(spec.option, name, _agreed(name, children))
+    _agreed("disableflags", children)
+    spec.option.disableflags |= children[0][1].disableflags
+    if any(robot.ground for robot in fleet.robots):
         ground = spec.geom("ground")
         ground.contype = ground.conaffinity = 1
-    if robot.mass is not None:
-        spec.memory = MEMORY + agents * MEMORY_OF_CONTACTS
-        spec.add_numeric(name="robot", data=[robot.length, robot.radius])  # the size of marks and cameras
-        spec.material("ground").texrepeat = np.array(spec.material("ground").texrepeat) / robot.length
+    if fleet.massive:
+        spec.memory = MEMORY + len(fleet.robots) * MEMORY_OF_CONTACTS
+        radii = fleet.radii.tolist() if fleet.mixed else [fleet.radius]
+        spec.add_numeric(name="robot", data=[fleet.length, *radii])  # the size of marks and cameras
+        spec.material("ground").texrepeat = np.array(spec.material("ground").texrepeat) / fleet.length
+
+
+def _agreed(name: str, children: Sequence[tuple[str, Any]]) -> Any:
+    """An option that holds for all robots: the one that is not MuJoCo's default, where the others leave it at that.
+
+    Raises:
+        ConfigurationError: two robots that say different things, or live in different media.
+    """
+    first, chosen = children[0][0], getattr(children[0][1], name)
+    default, strict = getattr(mujoco.MjSpec().option, name), name in MEDIUM
+    for other, option in children[1:]:
+        value = getattr(option, name)
+        if np.array_equal(value, chosen) or (not strict and np.array_equal(value, default)):
+            continue
+        if strict or not np.array_equal(chosen, default):
+            raise ConfigurationError(
+                f"robots {first!r} and {other!r} cannot be in one world: their files say {name} {chosen} and {value}"
+            )
+        first, chosen = other, value
+    return chosen
 
 
 def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: float) -> None:
@@ -103,32 +133,31 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
     spec.attach(child, prefix=agent_prefix(agent), frame=spec.worldbody.add_frame())
 
 
-def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, robot: Robot) -> None:
+def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, fleet: RobotFleet) -> None:
     """A cylinder without contact: the paper's obstacles are passed through, and counted. For robots with contact it is solid,
     as large as the scenario says, on a body that an episode's draw can move.
     """
-    radius = max(obstacle.radius, POINT_RADIUS * robot.length)
-    height = max(OBSTACLE_HEIGHT * robot.length, 1.5 * robot.height)
+    radius = max(obstacle.radius, POINT_RADIUS * fleet.length)
+    height = max(OBSTACLE_HEIGHT * fleet.length, 1.5 * fleet.height)
     place, parent = [obstacle.x, obstacle.y, 0.5 * height], spec.worldbody
-    if robot.contact:
+    if fleet.contact:
         parent = spec.worldbody.add_body(name=f"obstacle{k + 1}", pos=[obstacle.x, obstacle.y, 0.0], mocap=True)
-        place, radius = [0.0, 0.0, 0.5 * height], max(obstacle.radius, LEAST_SOLID * robot.length)
+        place, radius = [0.0, 0.0, 0.5 * height], max(obstacle.radius, LEAST_SOLID * fleet.length)
     parent.add_geom(
         name=f"obstacle{k + 1}",
         type=mujoco.mjtGeom.mjGEOM_CYLINDER,
         size=[radius, 0.5 * height, 0.0],
         pos=place,
         material="obstacle",
-        contype=int(robot.contact),
-        conaffinity=int(robot.contact),
+        contype=int(fleet.contact),
+        conaffinity=int(fleet.contact),
         mass=0.0,
     )
 
 
-def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario) -> None:
-    """``top`` sees the whole mission in a 16:9 picture; ``track`` follows the team's centre of mass."""
+def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario, length: float) -> None:
+    """``top`` sees the whole mission in a 16:9 picture; ``track`` follows its centre of mass; ``length`` [m] is the unit."""
     low, high = _mission_bounds(scenario)
-    length = make_robot(scenario.robot).length
     width, depth = high - low + 2.0 * MARGIN * length
     fovy = 30.0
     height = 0.5 * max(depth, width * 9.0 / 16.0) / np.tan(np.radians(0.5 * fovy))

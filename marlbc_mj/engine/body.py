@@ -1,4 +1,4 @@
-"""Between planar forces and MuJoCo's controls, and back: directly, or by the robot's own laws."""
+"""Between planar forces and MuJoCo's controls, and back: directly, or by the robots' own laws."""
 
 from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.engine.native import as_drive, as_reading
@@ -8,50 +8,62 @@ DIVERGED = 1e9
 
 
 @allocation_free
-def scale_rows(rows, factor):
-    """Multiply (N, 2) by a number, in place."""
+def scale_rows(rows, factors):
+    """Multiply every row of (N, 2) by its own of the ``factors`` (N,), in place."""
     for i in range(rows.shape[0]):
+        for axis in range(2):
+            rows[i, axis] *= factors[i]
+
+
+@allocation_free
+def shrink_rows(rows, units):
+    """Express every row of (N, 2) in its own of the ``units`` (N,), in place."""
+    for i in range(rows.shape[0]):
+        factor = 1.0 / units[i]
         for axis in range(2):
             rows[i, axis] *= factor
 
 
 @allocation_free
 def out_of_range(spans, ctrl):
-    """0, or 1 + the first agent with a control that is not finite or huge."""
-    for i in range(spans.shape[1]):
-        for k in range(spans[2, i, 0], spans[2, i, 1]):
+    """0, or 1 + the first of the agents with these spans (n, 3, 2) that has a control that is not finite or huge."""
+    for i in range(spans.shape[0]):
+        for k in range(spans[i, 2, 0], spans[i, 2, 1]):
             if not abs(ctrl[k]) < DIVERGED:
                 return 1 + i
     return 0
 
 
 @on_both_paths
-def actuate(drive, plant, state, qpos, qvel, force, h, ctrl):
-    """Turn planar forces (N, 2) into ctrl: as they are for direct robots, by the robot's ``drive`` law for others.
+def actuate(drives, plant, state, qpos, qvel, force, h, ctrl):
+    """Turn planar forces (N, 2) into ctrl: as they are for direct robots, by the ``drives`` of the groups for others.
 
     Returns 0, or 1 + agent where a control is not finite or huge.
     """
-    failed = 0
-    if plant.spans.shape[1] == 0:
-        for i in range(force.shape[0]):
+    for i in range(force.shape[0]):
+        if plant.ctrl_index[i, 0] >= 0:
             for axis in range(2):
                 ctrl[plant.ctrl_index[i, axis]] = force[i, axis]
-    else:
-        law = as_drive(drive)
-        law(plant.robot_params, state, qpos, qvel, force, h, plant.spans, ctrl)
-        failed = out_of_range(plant.spans, ctrl)
-    return failed
+    for g in range(plant.groups.shape[0]):
+        first, end = plant.groups[g, 0], plant.groups[g, 1]
+        law, spans = as_drive(drives[g]), plant.spans[first:end]
+        law(plant.robot_params[first:end], state[first:end], qpos, qvel, force[first:end], h, spans, ctrl)
+        failed = out_of_range(spans, ctrl)
+        if failed:
+            return first + failed
+    return 0
 
 
 @on_both_paths
-def read_robot(reading, plant, state, qpos, qvel, actuator_force, p, v, force):
+def read_robots(readings, plant, state, qpos, qvel, actuator_force, p, v, force):
     """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators really gave."""
-    if plant.spans.shape[1] > 0:
-        law = as_reading(reading)
-        law(plant.robot_params, state, qpos, qvel, actuator_force, plant.spans, p, v, force)
-    else:
-        for i in range(p.shape[0]):
+    for i in range(p.shape[0]):
+        if plant.ctrl_index[i, 0] >= 0:
             for axis in range(2):
                 p[i, axis] = qpos[plant.qpos_index[i, axis]]
                 v[i, axis] = qvel[plant.qvel_index[i, axis]]
                 force[i, axis] = actuator_force[plant.ctrl_index[i, axis]]
+    for g in range(plant.groups.shape[0]):
+        first, end = plant.groups[g, 0], plant.groups[g, 1]
+        law, own, spans = as_reading(readings[g]), state[first:end], plant.spans[first:end]
+        law(plant.robot_params[first:end], own, qpos, qvel, actuator_force, spans, p[first:end], v[first:end], force[first:end])

@@ -7,11 +7,10 @@ import numpy as np
 from marlbc_mj.core.barriers import Barrier
 from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, NEAREST_OBSTACLE, Behavior
 from marlbc_mj.engine.composition import PLANE_ROWS, WORKSPACE
-from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
 BARRIER_RATE = 4.0  # alpha, at most [1/s]
-BARRIER_MARGIN = 0.1  # m, in length units of the robot
+BARRIER_MARGIN = 0.1  # m, in length units of the robots
 BARRIER_REACH = 3.0  # in length units
 BARRIER_SPEED = 6.0  # of references at most, in length units per second
 _DISTANCES = {NEAREST_OBSTACLE: "safe_distance", NEAREST_NEIGHBOR: "distance"}
@@ -19,12 +18,12 @@ _DISTANCES = {NEAREST_OBSTACLE: "safe_distance", NEAREST_NEIGHBOR: "distance"}
 
 
 def make_barrier(scenario: Scenario) -> Barrier:
-    """How the inequality tasks of a set-based composition bound references, scaled to the robot.
+    """How the inequality tasks of a set-based composition bound references, scaled to the robots.
 
     An agent that approaches at rate alpha brakes with alpha times its speed, so alpha is at most A / speed. Nor may it use up
     more than the room that is left within a mission step. What two agents do in one step is within reach.
     """
-    unit, duration = make_robot(scenario.robot).length, float(scenario.mission_step)
+    unit, duration = scenario.fleet.length, float(scenario.mission_step)
     speed, braking = min(BARRIER_SPEED * unit, float(scenario.speed_limit)), float(scenario.acceleration_limit)
     sees, keeps = sees_array(scenario.behaviors), keeps_array(scenario.behaviors)
     obstacle_distance, agent_distance = (

@@ -23,7 +23,7 @@ from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_stopping, restrain_references, shield_team
 from marlbc_mj.core.stamps import Mail, exchange
 from marlbc_mj.core.stopping import TINY, ShieldView
-from marlbc_mj.engine.body import DIVERGED, actuate, read_robot, scale_rows
+from marlbc_mj.engine.body import DIVERGED, actuate, read_robots, scale_rows, shrink_rows
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
 from marlbc_mj.engine.references import call
@@ -118,7 +118,7 @@ def begin(b, orders, given, mission, behaviors, team):
 def set_forces(b, t, h, native, plant, team):
     """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
 
-    Laws see the measured p and v; their forces count in ``plant.unit_force``. Returns 0, or 1 + agent where a position,
+    Laws see the measured p and v; their forces count in ``plant.unit_forces``. Returns 0, or 1 + agent where a position,
     velocity, force or drag left the physical range; then nothing may be stepped.
     """
     p, v, drag, force = team.position[b], team.velocity[b], team.drag[b], team.force[b]
@@ -127,13 +127,13 @@ def set_forces(b, t, h, native, plant, team):
     disturbance = as_disturbance(native.disturbance)
     controller = as_controller(native.controller)
     disturbance(team.disturbance_params[b], t, p, v, drag)
-    if plant.unit_force == 1.0:
+    if plant.unit_forces.shape[0] == 0:
         controller(plant.controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
     else:
-        scale_rows(drag, 1.0 / plant.unit_force)
+        shrink_rows(drag, plant.unit_forces)
         controller(plant.controller_params, state, seen_p, seen_v, p_r, v_r, drag, h, force)
-        scale_rows(drag, plant.unit_force)
-        scale_rows(force, plant.unit_force)
+        scale_rows(drag, plant.unit_forces)
+        scale_rows(force, plant.unit_forces)
     for i in range(p.shape[0]):
         size = 0.0
         for axis in range(2):
@@ -158,7 +158,7 @@ def shield_references(b, mission, behaviors, plant, team):
         change = np.sqrt(x * x + y * y)
         if change > TINY:
             team.interventions[b, i] += mission.substeps
-            team.force_change[b, i] += numbers.mass * change
+            team.force_change[b, i] += plant.masses[i] * change
         for k in range(team.obstacles.shape[1]):
             x, y = at[i, 0] - team.obstacles[b, k, 0], at[i, 1] - team.obstacles[b, k, 1]
             kept = team.obstacles[b, k, 2] + numbers.clearance + numbers.tube - numbers.slack
@@ -223,7 +223,7 @@ def apply(b, k, mission, native, plant, team):
         if plant.loss > 0.0:
             weaken(plant, t, force)
         qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
-        failed = actuate(native.drive, plant, team.robot[b], qpos, qvel, force, h, doubles(native.ctrl[b], plant.nu))
+        failed = actuate(native.drives, plant, team.robot[b], qpos, qvel, force, h, doubles(native.ctrl[b], plant.nu))
     if failed:
         return failed + team.position.shape[1] * k
     applied = doubles(native.applied[b], plant.nv)
@@ -235,7 +235,7 @@ def apply(b, k, mission, native, plant, team):
 
 @on_both_paths
 def settle(b, k, mission, native, plant, team, record):
-    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read_robot what was reached, p_r += h v_r."""
+    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read what was reached, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
     recording = record.force.shape[1] > 0
     if recording:
@@ -247,7 +247,7 @@ def settle(b, k, mission, native, plant, team, record):
                 record.reference_velocity[b, k, i, axis] = v_r[i, axis]
     qpos, qvel = doubles(native.qpos[b], plant.nq), doubles(native.qvel[b], plant.nv)
     actuator_force = doubles(native.actuator_force[b], plant.nu)
-    read_robot(native.reading, plant, team.robot[b], qpos, qvel, actuator_force, p, v, force)
+    read_robots(native.readings, plant, team.robot[b], qpos, qvel, actuator_force, p, v, force)
     for i in range(p.shape[0]):
         for axis in range(2):
             if recording:

@@ -1,6 +1,6 @@
 """A scenario and a controller, checked against each other and turned into the arrays that the loop takes."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
@@ -23,7 +23,7 @@ from marlbc_mj.engine.native import step_address
 from marlbc_mj.engine.records import MissionRules, Native, Plant
 from marlbc_mj.engine.references import entry, no_entry, refer
 from marlbc_mj.engine.shielding import resolve
-from marlbc_mj.robots import Robot, make_robot
+from marlbc_mj.robots import Robot, RobotFleet
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import guarded
@@ -38,13 +38,14 @@ class Plan:
 
     scenario: Scenario
     controller: Controller
-    robot: Robot
+    fleet: RobotFleet
     xml: str  # the assembled MJCF
     model: mujoco.MjModel
     mission: MissionRules
     behaviors: Behaviors
     plant: Plant
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
+    robot_state: np.ndarray  # (N, S) robots' state at t = 0
     disturbance_params: np.ndarray  # (P,)
     solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
     shield: Shield | bool | None = None  # as it was asked for
@@ -52,6 +53,11 @@ class Plan:
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy is made anew: the addresses of laws and of MuJoCo's model are those of one process."""
         return make_plan, (self.scenario, self.controller, self.shield)
+
+    @property
+    def robot(self) -> Robot:
+        """The robot of agent 1, and of all agents unless the team is mixed."""
+        return self.fleet.robots[0]
 
     @property
     def shielded(self) -> bool:
@@ -76,28 +82,33 @@ class Plan:
     @property
     def native(self) -> bool:
         """Whether the compiled loop can run it: every law is compiled."""
-        return all(laws.is_compiled(law) for law, _ in self._laws() if law is not None)
+        robots_own = [law for robot in self.fleet.kinds for law in (robot.drive, robot.reading) if law is not None]
+        return all(map(laws.is_compiled, (self.controller.law, self.scenario.disturbance.law, *robots_own)))
 
-    def _laws(self) -> tuple[tuple[laws.Law | None, Any], ...]:
-        """Controller, disturbance, drive and reading with their kinds; None where the robot has no such law."""
+    def _laws(self, made: Callable[[laws.Law, Any], Any]) -> tuple[Any, ...]:
+        """Controller, disturbance, and the groups' drives and readings, as ``made`` of law and kind."""
         return (
-            (self.controller.law, laws.CONTROLLER),
-            (self.scenario.disturbance.law, laws.DISTURBANCE),
-            (self.robot.drive, laws.DRIVE),
-            (self.robot.reading, laws.READING),
+            made(self.controller.law, laws.CONTROLLER),
+            made(self.scenario.disturbance.law, laws.DISTURBANCE),
+            [made(cast(laws.Law, group.robot.drive), laws.DRIVE) for group in self.fleet.driven],
+            self.readings(made),
         )
+
+    def readings(self, made: Callable[[laws.Law, Any], Any] = laws.for_team) -> list[Any]:
+        """The reading of each group of the plant, as ``made`` of law and kind; by default for the Python path."""
+        return [made(cast(laws.Law, group.robot.reading), laws.READING) for group in self.fleet.driven]
 
     def compiled_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """What compiled code reaches by address, for one MjData per world; whoever calls keeps them alive."""
-        team_laws = (0 if law is None else laws.address(law, kind) for law, kind in self._laws())
+        *team_laws, drives, readings = self._laws(laws.address)
         arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
-        columns = ([d._address for d in data], *arrays)
+        columns = (drives, readings, [d._address for d in data], *arrays)
         entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
         return Native._make((None, None, *entries, *(np.array(column, dtype=np.uint64) for column in columns)))
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
-        team_laws = (None if law is None else laws.for_team(law, kind) for law, kind in self._laws())
+        team_laws = self._laws(laws.for_team)
         columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
         return Native._make((shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
 
@@ -118,11 +129,11 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
         raise ConfigurationError(f"scenario must be a Scenario, got {type(scenario).__name__}; make_scenario makes one by name")
     who = f"controller {type(require_controller(controller)).__name__}"
     guarded(lambda: _check_substep(scenario, controller), f"{who}: linear_gains")
-    robot = make_robot(scenario.robot)
-    robot.check(scenario)
-    if robot.contact and scenario.moving:
+    fleet = scenario.fleet
+    fleet.check(scenario)
+    if fleet.contact and scenario.moving:
         raise ConfigurationError(
-            f"robot {scenario.robot!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
+            f"robot {fleet.solid!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
             "through only; choose a robot without contact"
         )
     limit = scenario.force_limit if controller.limited else np.inf
@@ -135,17 +146,18 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     return Plan(
         scenario=scenario,
         controller=controller,
-        robot=robot,
+        fleet=fleet,
         xml=xml,
         model=model,
         mission=make_mission(scenario),
         behaviors=make_behaviors(scenario),
         plant=_make_plant(scenario, controller, limit, model, numbers),
         initial_state=guarded(lambda: _initial_state(scenario, controller), f"{who}: initial_state()"),
+        robot_state=_padded([[robot.state_row() for robot in fleet.robots]])[0],
         disturbance_params=laws.pack_gains(
             scenario.disturbance.law, guarded(scenario.disturbance.params, "the disturbance: params()"), laws.DISTURBANCE
         ),
-        solid=_solid_obstacles(model, scenario) if robot.contact else np.zeros(0, dtype=np.int64),
+        solid=_solid_obstacles(model, scenario) if fleet.contact else np.zeros(0, dtype=np.int64),
         shield=shield,
     )
 
@@ -200,8 +212,10 @@ def _composed(behaviors: Any) -> tuple[Any, ...]:
 
 
 def _make_plant(scenario: Scenario, controller: Controller, limit: float, model: mujoco.MjModel, shield: ShieldNumbers) -> Plant:
-    unit_limit, what = limit / scenario.unit_force, f"controller {type(controller).__name__}: params()"
-    gains = guarded(lambda: [controller.params(i, unit_limit) for i in range(scenario.agents)], what)
+    fleet, what = scenario.fleet, f"controller {type(controller).__name__}: params()"
+    units = fleet.unit_forces(scenario.unit_force)
+    unit_limits = (scenario.force_limits / units).tolist() if np.isfinite(limit) else [np.inf] * scenario.agents
+    gains = guarded(lambda: [controller.params(i, each) for i, each in enumerate(unit_limits)], what)
     params = [laws.pack_gains(controller.law, one, laws.CONTROLLER) for one in gains]
     qpos_index, qvel_index, ctrl_index = find_indices(model, scenario)
     return Plant(
@@ -211,10 +225,12 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
         nq=int(model.nq),
         nv=int(model.nv),
         nu=int(model.nu),
+        groups=np.array([(group.first, group.end) for group in fleet.driven], dtype=np.int64).reshape(-1, 2),
         spans=find_spans(model, scenario),
-        robot_params=np.tile(make_robot(scenario.robot).params_row(), (scenario.agents, 1)),
+        robot_params=_padded([[robot.params_row() for robot in fleet.robots]])[0],
+        masses=fleet.masses(scenario.mass),
         controller_params=_padded([params])[0],
-        unit_force=float(scenario.unit_force),
+        unit_forces=units if (units != 1.0).any() else np.zeros(0),
         shield=as_records(shield),
         **{name: float(value) for name, value in scenario.imperfections.params()._asdict().items()},
     )
@@ -223,35 +239,33 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
 def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Addresses of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, (N, 2) each, found by name.
 
-    A free joint's axes are its first two. Robots that are not direct have zeros for ctrl.
+    A free joint's axes are its first two. Robots that are not direct have -1 for ctrl.
     """
-    robot = make_robot(scenario.robot)
     qpos, qvel, ctrl = np.zeros((3, scenario.agents, 2), dtype=np.int64)
-    for i in range(scenario.agents):
+    for i, robot in enumerate(scenario.fleet.robots):
         for axis in range(2):
             joint = model.joint(agent_prefix(i) + robot.joints[axis % len(robot.joints)])
             offset = axis if len(robot.joints) == 1 else 0
             qpos[i, axis] = joint.qposadr[0] + offset
             qvel[i, axis] = joint.dofadr[0] + offset
-            if robot.direct:
-                ctrl[i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id
+            ctrl[i, axis] = model.actuator(agent_prefix(i) + robot.motors[axis]).id if robot.direct else -1
     return qpos, qvel, ctrl
 
 
 def find_spans(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
-    """(3, N, 2): first and last + 1 of every robot in qpos, qvel and ctrl of a compiled model; (3, 0, 2) for direct robots."""
-    robot = make_robot(scenario.robot)
-    if robot.direct:
-        return np.zeros((3, 0, 2), dtype=np.int64)
-    spans = np.empty((3, scenario.agents, 2), dtype=np.int64)
-    actuators = model.nu // scenario.agents  # robots are attached one after the other, and nothing else has actuators
-    for i in range(scenario.agents):
+    """(N, 3, 2): first and last + 1 of every robot in qpos, qvel and ctrl of a compiled model; zeros for direct robots."""
+    fleet, spans = scenario.fleet, np.zeros((scenario.agents, 3, 2), dtype=np.int64)
+    counts = {id(robot): len(robot.spec().actuators) for robot in fleet.kinds}
+    ends = np.cumsum([counts[id(robot)] for robot in fleet.robots]).tolist()  # attached in turn; nothing else has actuators
+    for i, robot in enumerate(fleet.robots):
+        if robot.direct:
+            continue
         root = model.body_rootid[model.body(agent_prefix(i) + robot.body).id]
         joints = np.flatnonzero(model.body_rootid[model.jnt_bodyid] == root)
         size = _JOINT_SIZE.get(int(model.jnt_type[joints[-1]]), (1, 1))
-        spans[0, i] = model.jnt_qposadr[joints[0]], model.jnt_qposadr[joints[-1]] + size[0]
-        spans[1, i] = model.jnt_dofadr[joints[0]], model.jnt_dofadr[joints[-1]] + size[1]
-        spans[2, i] = i * actuators, (i + 1) * actuators
+        spans[i, 0] = model.jnt_qposadr[joints[0]], model.jnt_qposadr[joints[-1]] + size[0]
+        spans[i, 1] = model.jnt_dofadr[joints[0]], model.jnt_dofadr[joints[-1]] + size[1]
+        spans[i, 2] = ends[i] - counts[id(robot)], ends[i]
     return spans
 
 
@@ -303,7 +317,8 @@ def _check_substep(scenario: Scenario, controller: Controller) -> None:
     gains = controller.linear_gains
     if gains is None:
         return
-    per_mass = scenario.unit_force / scenario.mass
+    fleet = scenario.fleet
+    per_mass = float((fleet.unit_forces(scenario.unit_force) / fleet.masses(scenario.mass)).max())
     position_gain, velocity_gain = gains
     limit = largest_stable_substep(position_gain * per_mass, velocity_gain * per_mass)
     if scenario.substep >= limit:

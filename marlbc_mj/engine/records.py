@@ -21,14 +21,16 @@ class Plant(NamedTuple):
 
     qpos_index: np.ndarray  # (N, 2) where each agent's axes are in qpos
     qvel_index: np.ndarray  # (N, 2) in qvel
-    ctrl_index: np.ndarray  # (N, 2) in ctrl; zeros for robots that are not direct
+    ctrl_index: np.ndarray  # (N, 2) in ctrl; -1 for robots that are not direct
+    groups: np.ndarray  # (G, 2) int64 first and last + 1 of adjacent agents with the same robot, where that is not direct
     nq: int
     nv: int
     nu: int
-    spans: np.ndarray  # (3, N, 2) first and last + 1 of each robot in qpos, qvel, ctrl; (3, 0, 2) for a direct robot
+    spans: np.ndarray  # (N, 3, 2) first and last + 1 of each robot in qpos, qvel, ctrl; zeros for a direct robot
     robot_params: np.ndarray  # (N, P) of drive and reading
+    masses: np.ndarray  # (N,) that planar forces accelerate [kg]
     controller_params: np.ndarray  # (N, P)
-    unit_force: float  # in which controllers count [N]
+    unit_forces: np.ndarray  # (N,) in which controllers count [N]; (0,) where all are 1 N
     position_noise: float  # of sensors, see Senses [m]
     velocity_noise: float  # [m/s]
     loss: float  # share of the force that is lost
@@ -46,8 +48,8 @@ class Native(NamedTuple):
     model: Any  # MjModel
     controller: Any  # law of the whole team
     disturbance: Any  # law of the whole team
-    drive: Any  # law of the whole team; 0 for a direct robot
-    reading: Any  # law of the whole team; 0 for a direct robot
+    drives: Any  # (G,) a law of each group of the plant
+    readings: Any  # (G,) a law of each group
     data: Any  # (B,) MjData
     qpos: Any  # (B,) its arrays
     qvel: Any

@@ -1,5 +1,6 @@
 """A shield's assumptions, taken from a scenario where they are left open, and checked before anything runs."""
 
+from dataclasses import replace
 from statistics import NormalDist
 
 import numpy as np
@@ -8,7 +9,7 @@ from marlbc_mj.controllers import PD, SORLC, Controller
 from marlbc_mj.core.motion import obstacles_at
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, following_distance, retreat_drift, stopping_distance
-from marlbc_mj.robots import Robot, make_robot
+from marlbc_mj.robots import Robot, RobotFleet
 from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
@@ -36,9 +37,15 @@ def resolve(shield: Shield, scenario: Scenario, limit: float, controller: Contro
     Raises:
         ConfigurationError: an assumption that does not hold, with the number that breaks it.
     """
-    robot = make_robot(scenario.robot)
+    fleet = scenario.fleet
+    robot = fleet.robots[0]
     known = robot.force_error is not None or shield.force_error is not None
-    level = shield.level or ("reference" if shield.tube is not None or not known else "force")
+    level = shield.level or ("reference" if shield.tube is not None or not known or fleet.mixed else "force")
+    if level == "force" and fleet.mixed:
+        raise ConfigurationError(
+            f"shield: robots {fleet.words} brake differently, and a shield of forces assumes one mass, force limit and error for "
+            "all; a shield of references takes them: Shield(level='reference')"
+        )
     _check_sensors(shield, scenario)
     numbers = _of_forces(shield, scenario, robot, limit) if level == "force" else _of_references(shield, scenario, controller)
     starts = np.array(scenario.starts, dtype=np.float64)
@@ -89,7 +96,7 @@ def _of_forces(shield: Shield, scenario: Scenario, robot: Robot, limit: float) -
 
 def _of_references(shield: Shield, scenario: Scenario, controller: Controller | None) -> ShieldNumbers:
     """Numbers of a shield of references, which brake with the scenario's acceleration limit; robots are within a tube of them."""
-    robot = make_robot(scenario.robot)
+    fleet = scenario.fleet
     if shield.mailed:
         raise ConfigurationError(
             "shield: messages may be late in a shield of forces only; references are chosen one after the other, all knowing all"
@@ -103,9 +110,9 @@ def _of_references(shield: Shield, scenario: Scenario, controller: Controller | 
             f"shield: references of scenario {scenario.name!r} cannot be shielded: they must be virtual and of limited "
             f"acceleration, got {scenario.reference!r} and {scenario.acceleration_limit:g} m/s^2"
         )
-    tube = _find_tube(shield, scenario, robot, controller)
+    tube = _find_tube(shield, scenario, fleet, controller)
     kept = scenario.safe_distance if shield.clearance is None else shield.clearance
-    between = 2.0 * robot.radius if shield.agent_distance is None else shield.agent_distance
+    between = 2.0 * fleet.radius if shield.agent_distance is None else shield.agent_distance
     return ShieldNumbers(
         force_limit=float(scenario.mass * scenario.acceleration_limit),
         box=np.inf,
@@ -138,6 +145,11 @@ def _messages(shield: Shield, scenario: Scenario) -> dict[str, float]:
 
 def _missing(robot: Robot) -> str:
     """What a robot lacks for a shield."""
+    if robot.force_error is not None:
+        return (
+            f"shield: robot {robot.name!r} has no tube, how far [m] it may be from its reference, which a shield of references "
+            "needs; give Shield(tube=...), or measure it: `python -m marlbc_mj.studies.shield_robots ROBOT`"
+        )
     return (
         f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
         "it within one substep, in every direction, besides the planar force and the disturbance; and so is its tube, how far "
@@ -145,12 +157,20 @@ def _missing(robot: Robot) -> str:
     )
 
 
-def _find_tube(shield: Shield, scenario: Scenario, robot: Robot, controller: Controller | None) -> float:
-    """How far agents may be from their references [m]: given, computed for a direct robot, or measured, in this order."""
+def _find_tube(shield: Shield, scenario: Scenario, fleet: RobotFleet, controller: Controller | None) -> float:
+    """How far agents may be from their references [m]: given, computed for direct robots, or measured, in this order.
+
+    In a mixed team the widest tube holds for all.
+    """
     if shield.tube is not None:
         return shield.tube
+    return max(_tube_of(robot, shield, scenario, controller) for robot in fleet.kinds)
+
+
+def _tube_of(robot: Robot, shield: Shield, scenario: Scenario, controller: Controller | None) -> float:
+    """How far one robot may be from its reference [m]."""
     if robot.direct and not robot.contact and controller is not None:
-        return tracking_tube(scenario, controller, _disturbance_bound(shield, scenario))
+        return tracking_tube(_with_one(scenario, robot), controller, _disturbance_bound(shield, scenario))
     if robot.tube is None:
         raise ConfigurationError(_missing(robot))
     gains = controller.linear_gains if isinstance(controller, PD | SORLC) else None
@@ -160,6 +180,16 @@ def _find_tube(shield: Shield, scenario: Scenario, robot: Robot, controller: Con
             f"{robot.gains} or {PD().linear_gains}, but {type(controller).__name__} has {gains}; give Shield(tube=...)"
         )
     return robot.tube
+
+
+def _with_one(scenario: Scenario, robot: Robot) -> Scenario:
+    """A scenario as one robot of its mixed team sees it: all agents have that robot's mass and limit."""
+    if not scenario.robots:
+        return scenario
+    one = RobotFleet((robot,))
+    (mass,), (unit,) = one.masses(scenario.mass).tolist(), one.masses(scenario.unit_force).tolist()
+    limit = float(one.force_limits(scenario.force_limit)[0])
+    return replace(scenario, robot=robot.name, robots=(), mass=mass, unit_force=unit, force_limit=limit)
 
 
 def tracking_tube(scenario: Scenario, controller: Controller, bound: ForceBound) -> float:

@@ -12,7 +12,7 @@ from marlbc_mj.core.imperfections import sense
 from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.core.stamps import NEVER_STAMPED, REMEMBERED
-from marlbc_mj.engine.body import DIVERGED
+from marlbc_mj.engine.body import DIVERGED, read_robots
 from marlbc_mj.engine.loop import judge, valid_orders
 from marlbc_mj.engine.observation import NEVER, Observation
 from marlbc_mj.engine.plan import Plan
@@ -50,7 +50,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         anchors=np.zeros((*tracks, 3)),
         motions=np.zeros((*tracks, NUMBERS)),
         disturbance_params=np.zeros((worlds, len(plan.disturbance_params))),
-        robot=np.zeros((*each, len(plan.robot.state_row()))),
+        robot=np.zeros((*each, plan.robot_state.shape[1])),
         history=np.zeros((worlds, imperfections.depth(scenario.substep), 2, agents, 2)),
         sensed=np.zeros((worlds, 2 if imperfections.sensing else 0, agents, 2)),
         noise_seed=np.zeros(worlds, dtype=np.int64),
@@ -105,7 +105,7 @@ def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
     scenario = plan.scenario
     if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
         raise ConfigurationError(
-            f"robot {scenario.robot!r} collides with obstacles, whose radii no seed can change; "
+            f"robot {plan.fleet.solid!r} collides with obstacles, whose radii no seed can change; "
             "give the family one radius: [r, r]"
         )
 
@@ -120,7 +120,7 @@ def place(
     team.position[b] = team.reference[b] = position
     team.velocity[b] = team.reference_velocity[b] = velocity
     team.controller[b] = plan.initial_state
-    team.robot[b] = plan.robot.state_row()
+    team.robot[b] = plan.robot_state
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
     team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED
@@ -133,7 +133,7 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     The base of a robot that is read elsewhere (a look-ahead point) is shifted until the reading is the position. Its
     velocity is what its joints allow. Obstacles that are solid go where this episode has them.
     """
-    plant, reading = plan.plant, plan.robot.reading
+    plant = plan.plant
     team.last_substep[b] = np.nan
     team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED  # everyone is told of the new places
     base = plant.qpos_index.ravel()
@@ -141,10 +141,9 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)
     if len(plan.solid):
         data.mocap_pos[plan.solid, :2] = team.obstacles[b, :, :2]
-    if reading is not None:
+    if len(plant.groups):
         p, v, force = np.zeros((3, *team.position[b].shape))
-        read = laws.for_team(reading, laws.READING)
-        read(plant.robot_params, team.robot[b], data.qpos, data.qvel, data.actuator_force, plant.spans, p, v, force)
+        read_robots(plan.readings(), plant, team.robot[b], data.qpos, data.qvel, data.actuator_force, p, v, force)
         data.qpos[base] += np.ravel(position - p)
         team.velocity[b] = v
     if team.sensed.shape[1] > 0:  # the past that delays look into is the present

@@ -29,7 +29,7 @@ class Course(NamedTuple):
     substep: float  # [s]
     mission_step: float  # [s]
     safe_distance: float  # [m]
-    force_limit: float  # of the scenario, finite also where the law is unlimited [N]
+    force_limits: np.ndarray  # (N,) of the agents, finite also where the law is unlimited [N]
     path_origin: tuple[float, float]  # [m]
     path_velocity: tuple[float, float]  # [m/s]
     formations: np.ndarray  # (2, N, 2) [m]
@@ -82,6 +82,7 @@ class EpisodeLog:
     shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) by the end of each mission step, columns
     # as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
     substeps: Substeps | None = None  # for metrics; None in a log that has none
+    robots: tuple[str, ...] = ()  # each agent's; empty in logs that were written before this was kept
 
     def intervened(self, step: int) -> np.ndarray:
         """(N,) bool: whose force or reference the shield changed in a mission step; (0,) without a shield."""
@@ -131,6 +132,7 @@ def from_world(world: World, b: int = 0) -> EpisodeLog:
         decision_ms=np.zeros(1),
         pose=body_poses(world, b)[None],
         shield=shield_rows(_counts_of(world, b), 1),
+        robots=_names_of(scenario),
     )
 
 
@@ -172,8 +174,14 @@ def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLo
         pose=trajectory.pose,
         shield=shield_rows(trajectory.shield, len(position)),
         substeps=_substeps_of(trajectory),
+        robots=_names_of(scenario),
         **hearing_columns(trajectory.hearing, len(position)),
     )
+
+
+def _names_of(scenario: Scenario) -> tuple[str, ...]:
+    """The name of each agent's robot."""
+    return tuple(robot.name for robot in scenario.fleet.robots)
 
 
 def course_of(scenario: Scenario) -> Course:

@@ -18,7 +18,6 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.engine.assembly import OBSTACLE_HEIGHT, POINT_RADIUS
 from marlbc_mj.recording.links import drawn_links
-from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Hearing
 from marlbc_mj.util.palette import BEHAVIOR_COLORS, agent_color, rgba
@@ -48,11 +47,11 @@ class Scene:
         self._obstacles, self._motions = obstacles, np.zeros((0, NUMBERS)) if motions is None else motions
         self._safe_distance = scenario.safe_distance
         self._static = self._obstacles_at(0.0)
-        robot = make_robot(scenario.robot)
-        radius = robot.radius
-        self._team = SceneUpdate(entities=[_agent_entity(i, radius, robot.length) for i in range(scenario.agents)])
+        fleet = scenario.fleet
+        radii = fleet.radii.tolist()
+        self._team = SceneUpdate(entities=[_agent_entity(i, radius, fleet.length) for i, radius in enumerate(radii)])
         self._transforms = FrameTransforms()
-        for i in range(scenario.agents):
+        for i, radius in enumerate(radii):
             transform = self._transforms.transforms.add(parent_frame_id=WORLD_FRAME, child_frame_id=f"agent{i + 1}")
             transform.translation.z = radius
             transform.rotation.w = 1.0
@@ -105,7 +104,7 @@ def _pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
 
 
 def _agent_entity(agent: int, radius: float, length: float) -> SceneEntity:
-    """A sphere for the agent, a small one for its reference at the robot's length unit, a line between them."""
+    """A sphere for the agent, a small one for its reference at the team's length unit, a line between them."""
     color = _color(agent_color(agent))
     spheres = [
         SpherePrimitive(pose=_pose(z=radius), size=Vector3(x=d, y=d, z=d), color=color)

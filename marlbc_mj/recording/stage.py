@@ -43,7 +43,7 @@ class Stage:
     rings: list[Mark]
     trails: list[Trail]
     scale: float = 1.0  # what 1 m of the paper's mission is here: marks and cameras shrink with small robots [m]
-    free: tuple[int, ...] = ()  # addresses in qpos of the agents' free joints, where the log has their poses
+    free: tuple[int | None, ...] = ()  # addresses in qpos of the agents' free joints, where the log has poses; None: slides
 
     def step(self, time: float) -> int:
         """Index of the mission step that ``time`` [s] lies in, the nearest one outside the log."""
@@ -71,6 +71,8 @@ class Stage:
         self.data.qpos[self.joints] = self.sample(self.log.position, time)
         poses = self.sample(self.log.pose, time) if self.free else ()
         for first, pose in zip(self.free, poses, strict=True):
+            if first is None:
+                continue
             pose[3:] /= np.linalg.norm(pose[3:])
             self.data.qpos[first : first + 7] = pose
         mujoco.mj_forward(self.model, self.data)
@@ -90,7 +92,10 @@ class Stage:
 
     def middles(self) -> np.ndarray:
         """(N, 3) where every agent's number goes [m]: on the middle of a ball, above a robot that has a pose."""
-        heights = self.data.qpos[[first + 2 for first in self.free]] + 1.9 * self.radii if self.free else self.radii
+        heights = [
+            radius if first is None else self.data.qpos[first + 2] + 1.9 * radius
+            for first, radius in zip(self.free or (None,) * len(self.radii), self.radii, strict=True)
+        ]
         return np.column_stack([self.data.qpos[self.joints], heights])
 
     def _trails(self, time: float) -> list[Mark]:
@@ -118,7 +123,7 @@ class Stage:
             far = bool(np.hypot(*(reference[i] - position[i])) > radius)
             if far:
                 marks.append(ribbon(position[i], reference[i], 0.1 * unit, 0.12 * unit, agent_color(i), unit))
-            if far or not self.free:  # a robot that is on its reference is not to be hidden by it
+            if far or not self.free or self.free[i] is None:  # a robot that is on its reference is not to be hidden by it
                 marks.append(ball(reference[i], GHOST * radius, (*agent_color(i)[:3], 0.45)))
         return marks
 
@@ -135,14 +140,14 @@ def make_stage(log: EpisodeLog) -> Stage:
     try:
         _check_self_contained(log.mjcf)
         model = mujoco.MjModel.from_xml_string(log.mjcf)
-        unit, radius = _size(model)
-        free = _free_joints(model, agents)
-        joints = [_slides(model, agent_prefix(i)) for i in agents] if not free else [[first, first + 1] for first in free]
+        unit, radii = _size(model, len(agents))
+        free = [_free_joint(model, agent_prefix(i)) for i in agents]
+        joints = [_slides(model, agent_prefix(i)) if first is None else [first, first + 1] for i, first in enumerate(free)]
         data = mujoco.MjData(model)
         discs = [model.geom(f"obstacle{k + 1}").id for k in range(len(log.obstacles))]
         _place_obstacles(model, data, discs, log.obstacles, unit)
-        if not (np.isfinite(unit) and unit > 0 and np.isfinite(radius) and radius >= 0):
-            raise ValueError(f"it says a length unit of {unit} m and a radius of {radius} m")
+        if not (np.isfinite([unit, *radii]).all() and unit > 0 and min(radii) >= 0):
+            raise ValueError(f"it says a length unit of {unit} m and radii of {radii} m")
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         raise ConfigurationError(f"the log's model cannot be shown: {one_line(error)}") from error
     return Stage(
@@ -151,7 +156,7 @@ def make_stage(log: EpisodeLog) -> Stage:
         data=data,
         joints=np.array(joints),
         discs=np.array(discs, dtype=np.int64),
-        radii=np.array([radius or _enlarge(model, i, min(BALL, BALL_SHARE * log.safe_distance)) for i in agents]),
+        radii=np.array([radii[i] or _enlarge(model, i, min(BALL, BALL_SHARE * log.safe_distance)) for i in agents]),
         rings=_rings(log, 0.0, unit),
         trails=[make_trail(i, log.time, log.position[:, i], unit) for i in agents],
         scale=unit,
@@ -177,13 +182,12 @@ def restage(stage: Stage, log: EpisodeLog) -> Stage:
     return replace(stage, log=log, rings=_rings(log, 0.0, stage.scale), trails=trails)
 
 
-def _free_joints(model: mujoco.MjModel, agents: range) -> list[int]:
-    """Addresses in qpos of the agents' free joints, none where they have slides."""
-    found = []
+def _free_joint(model: mujoco.MjModel, prefix: str) -> int | None:
+    """Address in qpos of an agent's free joint; None where it has slides."""
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-        if model.body(model.jnt_bodyid[j]).name.startswith(tuple(agent_prefix(i) for i in agents)):
-            found.append(int(model.jnt_qposadr[j]))
-    return found
+        if model.body(model.jnt_bodyid[j]).name.startswith(prefix):
+            return int(model.jnt_qposadr[j])
+    return None
 
 
 def _slides(model: mujoco.MjModel, prefix: str) -> list[int]:
@@ -202,12 +206,18 @@ def _slides(model: mujoco.MjModel, prefix: str) -> list[int]:
     return [int(model.jnt_qposadr[j]) for j in found if j is not None]
 
 
-def _size(model: mujoco.MjModel) -> tuple[float, float]:
-    """Length unit of the mission and drawn radius of a robot [m], as the assembly left them; 1 and 0 for point masses."""
+def _size(model: mujoco.MjModel, agents: int) -> tuple[float, list[float]]:
+    """Length unit of the mission and drawn radius of each robot [m], as the assembly left them; 1 and zeros for point masses.
+
+    Raises:
+        ValueError: neither one radius nor one per agent.
+    """
     if model.nnumeric == 0:
-        return 1.0, 0.0
-    unit, radius = model.numeric("robot").data
-    return float(unit), float(radius)
+        return 1.0, [0.0] * agents
+    unit, *radii = model.numeric("robot").data.tolist()
+    if len(radii) not in (1, agents):
+        raise ValueError(f"it says {len(radii)} radii for {agents} agents")
+    return unit, radii if len(radii) == agents else radii * agents
 
 
 def _place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, discs: list[int], obstacles: np.ndarray, unit: float) -> None:

@@ -27,7 +27,6 @@ from marlbc_mj.engine.plan import make_plan
 from marlbc_mj.episode import Frame
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
-from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Draw, Scenario
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import check_target, take_name
@@ -96,7 +95,7 @@ class LogWriter:
         self._scene = Scene(scenario, draw.obstacles, draw.motions)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = laws.interface(controller.law).state == sorlc.STATE
-        self._posed = len(make_robot(scenario.robot).joints) == 1
+        self._posed = scenario.fleet.floating
         self._shielded = shielded
         self._communicating = scenario.communication != IDEAL
         self._steps = 0
@@ -259,6 +258,8 @@ def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[st
         "safe_distance": repr(float(scenario.safe_distance)),
         "force_limit": repr(float(scenario.force_limit)) if controller.limited else "inf",
         "scenario_force_limit": repr(float(scenario.force_limit)),
+        "robots": json.dumps([robot.name for robot in scenario.fleet.robots]),
+        **({"robot_force_limits": json.dumps(scenario.force_limits.tolist())} if scenario.robots else {}),
         "path": json.dumps((scenario.path_origin, scenario.path_velocity)),
         "slots": json.dumps(scenario.formations.tolist()),
         "commands": json.dumps(scenario.orders.commands),

@@ -1,6 +1,5 @@
 """Report: tables, figures and the page, made from the results of a benchmark."""
 
-from marlbc_mj.report.bundle import write_report
-from marlbc_mj.results.summary import Result
+from marlbc_mj.util.matplotlib_folder import prepare_matplotlib
 
-__all__ = ["Result", "write_report"]
+prepare_matplotlib()

@@ -12,26 +12,6 @@ from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.util.files import write_json
 
 
-def write_so_far(results: Sequence[Result], total: int, folder: Path, config: Mapping[str, Any]) -> None:
-    """Write index.html and tables.md of the methods that have ended, of ``total``: no figures, no video.
-
-    Each is whole at any time, and the page loads itself again every few seconds.
-    """
-    paragraph = same_actuator(results)
-    tables = make_tables(results, config["scenario"].name)
-    for name, write in (
-        ("tables.md", lambda path: path.write_text(markdown(tables, paragraph), encoding="utf-8")),
-        (
-            "index.html",
-            lambda path: write_benchmark_page(
-                path, results=results, config=config, tables=tables, figures=folder, paragraph=paragraph, awaited=total
-            ),
-        ),
-    ):
-        write(folder / f"{name}.new")
-        (folder / f"{name}.new").replace(folder / name)
-
-
 def write_report(
     results: Sequence[Result],
     folder: Path,

@@ -121,7 +121,7 @@ def forces(trajectory: Trajectory) -> Figure:
     Over the episode, light bands hold every sample and dark lines are means of 500 bins, so that the mean of a
     chattering force is visible; the limit is dashed.
     """
-    agents, limit = trajectory.scenario.agents, trajectory.scenario.force_limit
+    agents, limits = trajectory.scenario.agents, trajectory.scenario.force_limits
     margins = pl.Margins(left=0.56, top=0.24, bottom=0.36)
     figure, panels = pl.panels(pl.DOUBLE, 0.4 + 0.75 * agents, agents, 3, margins, sharex="col", sharey=True)
     window = busiest(trajectory)
@@ -137,13 +137,13 @@ def forces(trajectory: Trajectory) -> Figure:
             panels[i, 2].plot(trajectory.time[window], trajectory.force[window, i, axis], color=color, linewidth=0.7, **style)
         pl.panel_label(panels[i, 2], f"agent {i + 1}, {_ZOOM:g} s")
         for axes in panels[i]:
-            for bound in (-limit, limit):
+            for bound in (-limits[i], limits[i]):
                 axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
-    reach = 1.12 * max(limit, float(np.abs(trajectory.force).max()))
+    reach = 1.12 * max(float(limits.max()), float(np.abs(trajectory.force).max()))
     panels[0, 0].set(ylim=(-reach, reach))
     whole, part = (0.0, trajectory.scenario.duration), (trajectory.time[window][0], trajectory.time[window][-1])
-    for axes, limits in zip(panels[-1], (whole, whole, part), strict=True):
-        axes.set(xlabel="time [s]", xlim=limits)
+    for axes, shown in zip(panels[-1], (whole, whole, part), strict=True):
+        axes.set(xlabel="time [s]", xlim=shown)
     panels[0, 2].legend(loc="lower right", bbox_to_anchor=(1.0, 0.93), ncols=2, borderpad=0.0, columnspacing=1.0)
     figure.supylabel("force [N] (dashed: limit)", fontsize=8, x=0.05 / pl.DOUBLE)
     return figure
@@ -164,7 +164,7 @@ def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
 
     The scale is linear up to the limit and logarithmic beyond, so that forces within it and far above it are both visible.
     """
-    limit = episodes[0].scenario.force_limit
+    limit = float(episodes[0].scenario.force_limits[agent])
     margins = pl.Margins(left=0.56, right=0.42, top=0.42, across=0.24, between=0.42)
     figure, panels = pl.panels(pl.DOUBLE, 3.4, 2, len(episodes), margins, sharex="row", sharey=True)
     wildest = max(episodes, key=lambda episode: float(np.abs(episode.force[:, agent]).max()))
@@ -202,7 +202,8 @@ def _draw_both_axes(axes: Axes, episode: Trajectory, agent: int, shown: np.ndarr
     time, force = episode.time[shown], episode.force[shown, agent]
     for axis in range(2):
         axes.plot(*pl.envelope(time, force[:, axis]), color=_AXIS_COLORS[axis], linewidth=0.8, label=f"$u_{'xy'[axis]}$")
-    for bound in (-episode.scenario.force_limit, episode.scenario.force_limit):
+    limit = episode.scenario.force_limits[agent]
+    for bound in (-limit, limit):
         axes.axhline(bound, color=pl.GREY, linewidth=0.5, linestyle=(0, (4, 2)))
     axes.set_xlim(time[0], time[-1] + episode.scenario.substep)
 

@@ -20,7 +20,7 @@ from marlbc_mj.report.templates import render
 from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.scenarios.titles import mission_title
+from marlbc_mj.scenarios.titles import mission_title, robots_title
 
 LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]
 POSTER_AT = 0.57
@@ -137,6 +137,7 @@ def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
     """Facts about a scenario for the page, by name."""
     return [
         ("Scenario", f"{scenario.name}: {scenario.agents} agents, {scenario.duration:g} s, reference mode {scenario.reference}"),
+        ("Robots", robots_title([robot.name for robot in scenario.fleet.robots])),
         ("Composition", scenario.composition),
         ("Clocks", f"mission step {scenario.mission_step:g} s, physics and control {scenario.substep:g} s"),
     ]

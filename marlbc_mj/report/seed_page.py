@@ -85,7 +85,7 @@ def write_seed_report(
         _write_figure(methods, folder / "figures")
     if progress is not None:
         progress("report", 1, 1)
-    return _write_page(folder / "index.html", results, methods, tables, config)
+    return write_seed_page(folder / "index.html", results, methods, tables=tables, config=config)
 
 
 def _write_figure(methods: Sequence[MethodStatistics], folder: Path) -> None:
@@ -93,9 +93,16 @@ def _write_figure(methods: Sequence[MethodStatistics], folder: Path) -> None:
     save_figure(lambda: intervals(methods), folder / FIGURE)
 
 
-def _write_page(
-    path: Path, results: SeedResults, methods: Sequence[MethodStatistics], tables: Sequence[Table], config: Mapping[str, Any]
+def write_seed_page(
+    path: Path,
+    results: SeedResults,
+    methods: Sequence[MethodStatistics],
+    *,
+    tables: Sequence[Table],
+    config: Mapping[str, Any],
+    awaited: int = 0,
 ) -> Path:
+    """Write the page of many draws; ``awaited`` is how many methods there will be, as in :func:`write_benchmark_page`."""
     scenario, draws = results.scenario, len(results.seeds)
     of_paper = scenario.name == paper_values.SCENARIO
     failed = sum(len(s.runs.failed) for s in methods)
@@ -120,6 +127,7 @@ def _write_page(
         pictures=[figure] if figure else [],
         video=None,
         methods=list(map(_method_section, methods)),
+        awaited=awaited,
     )
 
 

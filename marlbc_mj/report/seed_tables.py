@@ -10,7 +10,6 @@ from marlbc_mj.report.table import Column, Table
 from marlbc_mj.results.outcomes import outcome_rates
 from marlbc_mj.results.seed_statistics import GroupStatistics, MethodStatistics, controller_of, group, supervisor_of
 from marlbc_mj.results.seeds import MethodRuns, SeedResults
-from marlbc_mj.robots import make_robot
 from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.text import one_line
 
@@ -101,12 +100,13 @@ def _outcome_table(results: SeedResults, methods: MethodGroup[MethodRuns]) -> Ta
         rates = outcome_rates([run.metrics for run in method.runs], results.scenario)
         parts = ("success", "reached", "violation", "struck", "collided")
         rows.append((name, *(interval(percent(rates[part]), 0) for part in parts)))
-    scenario, radius = results.scenario, make_robot(results.scenario.robot).radius
+    scenario, fleet = results.scenario, results.scenario.fleet
+    radii = " or ".join(f"{robot.radius:g}" for robot in fleet.kinds)
     notes = (
         f"Success: at the end every agent is within {scenario.formation_tolerance:g} m of its slot around the desired centroid, "
         "and on the way there was no violation and no collision. In brackets: Wilson's 95 % interval.",
-        f"Violation: a clearance of at most {scenario.safe_distance:g} m. Struck: of at most {radius:g} m, the agent's radius. "
-        f"Collided: two agents within {2 * radius:g} m. A run that failed counts against its method in every column.",
+        f"Violation: a clearance of at most {scenario.safe_distance:g} m. Struck: of at most {radii} m, the agent's radius. "
+        f"Collided: two agents within {2 * fleet.radius:g} m. A run that failed counts against its method in every column.",
     )
     caption = f"Outcome of the mission for each {methods.kind} {methods.words}, over draws of the scenario"
     return Table(f"seeds-outcome-{methods.suffix}", caption, columns, tuple(rows), notes)

@@ -144,7 +144,7 @@ def _agent(flown: _Flown, agent: int) -> AgentMetrics:
         "cost_max": float(cost.max()),
         "cost_integral": float(cost.sum() * h),
         "cost_sum": float(cost.sum() * h / dt),
-        "saturation_duty": float((np.abs(force) >= course.force_limit * (1 - 1e-12)).any(axis=-1).mean()),
+        "saturation_duty": float((np.abs(force) >= course.force_limits[agent] * (1 - 1e-12)).any(axis=-1).mean()),
         "rms_position_error": float(np.sqrt(square_p.mean())),
         "rms_velocity_error": float(np.sqrt(square_v.mean())),
         "intervention_share": interventions / len(force),

@@ -6,7 +6,6 @@ from typing import NamedTuple
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.statistics import Estimate, rate
-from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 
 
@@ -32,12 +31,12 @@ def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
     """The outcome of an episode, from its metrics; None stands for a run that failed."""
     if metrics is None:
         return FAILED_MISSION
-    team, radius = metrics["team"], make_robot(scenario.robot).radius
+    team, fleet = metrics["team"], scenario.fleet
     return MissionOutcome(
         reached=team["end_error"] <= scenario.formation_tolerance,
         violated=SCORES["violation_time_worst"].read(metrics) > 0.0,
-        struck=SCORES["clearance_min_worst"].read(metrics) <= radius,
-        collided=team["agent_distance_min"] <= 2.0 * radius,
+        struck=any(a["clearance_min"] <= r for a, r in zip(metrics["agents"], fleet.radii.tolist(), strict=True)),
+        collided=team["agent_distance_min"] <= 2.0 * fleet.radius,
     )
 
 

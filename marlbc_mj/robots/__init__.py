@@ -1,12 +1,13 @@
 """Robots: one MJCF file and one Python file each, by name, or by the path of a user's."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 
 from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.crazyflie import CRAZYFLIE, crazyflie
 from marlbc_mj.robots.diff_drive import DIFF_DRIVE, diff_drive
 from marlbc_mj.robots.disc import DISC, disc
+from marlbc_mj.robots.fleet import RobotFleet
 from marlbc_mj.robots.omni import OMNI, omni
 from marlbc_mj.robots.point_mass import POINT_MASS, point_mass
 from marlbc_mj.robots.user import Stamp, is_file, load, stamp_of
@@ -47,6 +48,17 @@ def make_robot(name: str) -> Robot:
     raise unknown("robot", name, (*ROBOTS, "a path that ends in .py or .xml"))
 
 
+def make_fleet(names: Sequence[str]) -> RobotFleet:
+    """The robots of a team, from the name of each agent's.
+
+    Raises:
+        ConfigurationError: as :func:`make_robot`, or robots that cannot be in one world.
+    """
+    fleet = RobotFleet(tuple(map(make_robot, names)))
+    fleet.check_ground()
+    return fleet
+
+
 def register(robot: Robot) -> Robot:
     """Register a user's robot under a name that scenarios can use, for this process.
 
@@ -59,4 +71,4 @@ def register(robot: Robot) -> Robot:
     return robot
 
 
-__all__ = ["MODELS", "ROBOTS", "Robot", "make_robot", "register"]
+__all__ = ["MODELS", "ROBOTS", "RobotFleet", "Robot", "make_fleet", "make_robot", "register"]

@@ -212,8 +212,12 @@ class Robot:
                 f"take the robot's scale: **make_robot({self.name!r}).scale()"
             )
         for name in ("force_limit", "substep"):
-            value, most = getattr(scenario, name), getattr(self, name)
-            if value > most * (1 + 1e-9):
-                raise ConfigurationError(
-                    f"scenario {scenario.name!r}: {name} must be at most {most:g} for robot {self.name!r}, got {value:g}"
-                )
+            self.check_limit(scenario, name)
+
+    def check_limit(self, scenario: Any, name: str) -> None:
+        """Raise ConfigurationError for a field of a scenario that is larger than this robot's of the same name."""
+        value, most = getattr(scenario, name), getattr(self, name)
+        if value > most * (1 + 1e-9):
+            raise ConfigurationError(
+                f"scenario {scenario.name!r}: {name} must be at most {most:g} for robot {self.name!r}, got {value:g}"
+            )

@@ -14,7 +14,9 @@ from marlbc_mj.core.disturbances import Disturbance, PaperDrag
 from marlbc_mj.core.imperfections import NO_IMPERFECTIONS, Imperfections
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.core.orders import Orders
+from marlbc_mj.robots import RobotFleet, make_fleet
 from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
+from marlbc_mj.scenarios.robot_names import PAPER_ROBOT, settle_robots
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.settings import check_kinds
 
@@ -94,7 +96,7 @@ class Scenario:
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"  # where behaviors are evaluated: at p_r or at the measured p
-    robot: str = "point_mass"
+    robot: str = PAPER_ROBOT  # of every agent
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
     # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
@@ -112,6 +114,7 @@ class Scenario:
     # how an order becomes a reference: avoidance as an equality task (12), or as an inequality
     composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
     communication: Communication = field(default=IDEAL, metadata=YOUNG)  # who hears whom, when, of what share of messages
+    robots: tuple[str, ...] = field(default=(), metadata=YOUNG)  # of each agent, where they differ; ``robot`` is then the first
 
     def __post_init__(self) -> None:
         check_kinds(self, f"scenario {self.name!r}: ")
@@ -121,6 +124,9 @@ class Scenario:
         object.__setattr__(self, "schedule", tuple(Window(*w) for w in self.schedule))
         object.__setattr__(self, "motions", tuple(Motion(*m) for m in self.motions))
         self._check_numbers()
+        robot, robots = settle_robots(self.name, self.agents, self.robot, self.robots)
+        object.__setattr__(self, "robot", robot)
+        object.__setattr__(self, "robots", robots)
         self._check_team()
         self._check_clocks()
         self.imperfections.check(self.agents, self.substep)
@@ -131,6 +137,25 @@ class Scenario:
     def agents(self) -> int:
         """N, the number of agents."""
         return len(self.starts)
+
+    @property
+    def fleet(self) -> RobotFleet:
+        """The robots of all agents.
+
+        Raises:
+            ConfigurationError: an unknown robot, or robots that cannot be in one world.
+        """
+        return make_fleet(self.robots or (self.robot,) * self.agents)
+
+    @property
+    def force_limits(self) -> np.ndarray:
+        """(N,) force limits per axis [N]: ``force_limit``, and no more than a robot of a mixed team has itself."""
+        return self.fleet.force_limits(self.force_limit) if self.robots else np.full(self.agents, float(self.force_limit))
+
+    @property
+    def least_acceleration(self) -> float:
+        """What the weakest agent's actuators give per axis [m/s^2]."""
+        return float((self.force_limits / (self.fleet.masses(self.mass) if self.robots else self.mass)).min())
 
     @property
     def mission_steps(self) -> int:

@@ -42,7 +42,8 @@ class Mission:
     reference: Literal["virtual", "actual"] = "virtual"
     composition: Literal["null-space", "set-based"] = "null-space"  # avoidance as an equality task, or as an inequality
     column_approach: Literal["straight", "line"] = "straight"  # how FR comes to its slots: straight, or along their lines
-    robot: str = "point_mass"
+    robot: str = "point_mass"  # of every agent
+    robots: tuple[str, ...] = ()  # of each agent, where they differ
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
     unit_force: float = 1.0  # what a controller's output of 1 is [N]: a robot's mass

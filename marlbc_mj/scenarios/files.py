@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from marlbc_mj.core.disturbances import DISTURBANCES, Disturbance
-from marlbc_mj.robots import make_robot
+from marlbc_mj.robots import make_fleet, make_robot
 from marlbc_mj.robots.user import is_file
 from marlbc_mj.scenarios.base import Obstacle, Point, Scenario, Window
 from marlbc_mj.scenarios.case_study import cruise, paper
@@ -63,8 +63,8 @@ class Custom(Mission):
 def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any) -> Scenario:
     """The scenario of a TOML file, with any of its fields changed. Reading it runs no code unless that is allowed.
 
-    A robot's file is looked up beside the TOML file, and a robot that has a scale (mass, limits, substep) gives it to fields that
-    the file does not name.
+    A robot's file is looked up beside the TOML file. A robot that has a scale (mass, limits, substep) gives it to fields that the
+    file does not name; of several, see :meth:`marlbc_mj.robots.fleet.RobotFleet.scale`.
 
     Args:
         path: the file.
@@ -123,24 +123,49 @@ def _depth(text: str) -> int:
 
 
 def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any], *, allow_code: bool) -> dict[str, Any]:
-    """The content with the robot's file found beside the scenario's, and the robot's scale where the file does not set it.
+    """The content with the robots' files found beside the scenario's, and the robots' scale where the file does not set it.
 
     Raises:
         ConfigurationError: a robot that cannot be made, or a program that the file names, without leave to run it.
     """
-    name = changes.get("robot", content.get("robot"))
-    if not isinstance(name, str):
-        return content
-    if "robot" not in changes:
-        if name.partition(":")[0].endswith(".py") and not allow_code:
-            raise ConfigurationError(
-                f"{path}: robot {name!r} is a program; add --allow-code (allow_code=True in Python) to run it"
-            )
-        beside = path.parent / name
-        if is_file(name) and beside.is_file():
-            name = str(beside)
-    scale = {key: value for key, value in make_robot(name).scale().items() if value != math.inf}
-    return {**scale, **content, "robot": name}
+    given = {key: changes[key] for key in ("robot", "robots") if key in changes}
+    named = {key: value for key, value in content.items() if key in ("robot", "robots") and not given}
+    if isinstance(named.get("robot"), str):
+        named["robot"] = _beside(named["robot"], path, allow_code)
+    if _are_texts(named.get("robots")):
+        named["robots"] = [_beside(name, path, allow_code) for name in named["robots"]]
+    chosen = given or named
+    if not isinstance(chosen.get("robot", ""), str) or not _are_texts(chosen.get("robots", ())):
+        return content  # which its dataclass refuses
+    scale = {key: value for key, value in _scale(chosen).items() if value != math.inf}
+    rest = {key: value for key, value in content.items() if not given or key not in ("robot", "robots")}
+    return {**scale, **rest, **named}
+
+
+def _are_texts(value: Any) -> bool:
+    """Whether a value is a list of texts."""
+    return isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
+
+
+def _scale(chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields that one robot for all, or the robots of all agents, give a scenario; without the names themselves."""
+    if not chosen:
+        return {}
+    robots = chosen.get("robots")
+    scale = make_fleet(robots).scale() if robots else make_robot(chosen["robot"]).scale()
+    return {key: value for key, value in scale.items() if key not in ("robot", "robots")}
+
+
+def _beside(name: str, path: Path, allow_code: bool) -> str:
+    """The name of a robot in the scenario file ``path``; of a file beside that one, its path.
+
+    Raises:
+        ConfigurationError: a program, without leave to run it.
+    """
+    if name.partition(":")[0].endswith(".py") and not allow_code:
+        raise ConfigurationError(f"{path}: robot {name!r} is a program; add --allow-code (allow_code=True in Python) to run it")
+    beside = path.parent / name
+    return str(beside) if is_file(name) and beside.is_file() else name
 
 
 def _changes(content: Mapping[str, Any]) -> dict[str, Any]:

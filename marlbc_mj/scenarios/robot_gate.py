@@ -3,6 +3,7 @@
 Lengths are the paper's times the robot's length unit. The team travels at 0.4 of the robot's speed limit, and behaviors' gains
 are what its acceleration can follow: a reference that closes a gap with rate Lambda brakes with Lambda v, so Lambda = 0.8 a / v
 for FM and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
+Where robots differ, the greatest length unit and the smallest speed and acceleration count.
 """
 
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from marlbc_mj.core.disturbances import LinearDrag
-from marlbc_mj.robots import make_robot
+from marlbc_mj.robots import make_fleet
 from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors, with_changes
 from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS
 
@@ -21,22 +22,27 @@ SAFE = 2.0  # d_OA in length units, as the paper's
 AIR_DRAG = 0.0147  # of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/m]
 
 
-def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
+def robot_gate(robot: str = "disc", *, robots: tuple[str, ...] = (), **changes: Any) -> Scenario:
     """Four robots around a point obstacle and through the gate; ``changes`` replace any field.
 
+    Args:
+        robot: that all have.
+        robots: one per agent, in its place.
+        **changes: fields of the scenario and their values.
+
     Raises:
-        ConfigurationError: unknown robot, or one without limits of speed and acceleration to scale by.
+        ConfigurationError: unknown robot, or robots that cannot be in one world.
     """
-    body = make_robot(robot)
-    unit = body.length
-    finite = np.isfinite((body.speed_limit, body.acceleration_limit)).all()
-    top, brake = (body.speed_limit, body.acceleration_limit) if finite else (2.5 * unit, 4.0 * unit)
+    fleet = make_fleet(robots or (robot,) * len(SLOTS))
+    unit = fleet.length
+    limits = fleet.least("speed_limit"), fleet.least("acceleration_limit")
+    top, brake = limits if np.isfinite(limits).all() else (2.5 * unit, 4.0 * unit)
     speed, gain = 0.4 * top, 0.8 * brake / top
     avoid = SAFE * unit + speed**2 / brake + 0.3 * unit
     slots, column = (tuple((unit * x, unit * y) for x, y in which) for which in (SLOTS, COLUMN))
     steps = round(LENGTH * unit / speed / 0.05)
     fields: dict[str, Any] = {
-        "name": f"robot_gate-{Path(body.name).stem}",
+        "name": f"robot_gate-{'+'.join(Path(each.name).stem for each in fleet.kinds)}",
         "starts": tuple((x + unit * ORIGIN, y) for x, y in slots),
         "behaviors": standard_behaviors(slots, column, avoidance_gain=2.5 * gain, formation_gain=gain, safe_distance=avoid),
         "path_origin": (unit * ORIGIN, 0.0),
@@ -45,12 +51,12 @@ def robot_gate(robot: str = "disc", **changes: Any) -> Scenario:
         "safe_distance": SAFE * unit,
         "formation_tolerance": 0.5 * unit,
         "duration": 0.05 * steps,
-        "disturbance": LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
+        "disturbance": LinearDrag(coefficient=AIR_DRAG if fleet.height > 0 else 0.0),
         "schedule": _schedule(unit / speed),
         "description": "a point obstacle and a gate for four robots, scaled to --robot",
         "speed_limit": top,
         "acceleration_limit": brake,
-        **body.scale(),
+        **fleet.scale(),
     }
     return with_changes(fields, changes)
 

@@ -1,5 +1,7 @@
 """What a mission is called where a person reads it: in a page's title, in a video's header."""
 
+from collections.abc import Sequence
+
 from marlbc_mj.robots import ROBOTS
 
 MISSION_TITLES = {
@@ -25,8 +27,19 @@ ROBOT_TITLES = {
 
 def mission_title(name: str) -> str:
     """The title of a scenario, by its name; a name of a user's own with its separators as spaces."""
-    mission, _, robot = name.partition("-")
-    if mission in MISSION_TITLES and (not robot or robot in ROBOTS):
-        return MISSION_TITLES[mission] + (f", {ROBOT_TITLES.get(robot, robot)}" if robot else "")
+    mission, _, suffix = name.partition("-")
+    robots = suffix.split("+") if suffix else []
+    if mission in MISSION_TITLES and all(robot in ROBOTS for robot in robots):
+        team = [ROBOT_TITLES.get(robot, robot) for robot in robots]
+        return ", ".join((MISSION_TITLES[mission], *(team if len(team) < 2 else ["mixed team"])))
     words = name.replace("_", " ").strip()
     return words[:1].upper() + words[1:]
+
+
+def robots_title(names: Sequence[str]) -> str:
+    """The robots of a team, from the name of each agent's: "discs", or "discs (1, 2), Crazyflies (3)" with agents' numbers."""
+    titles = [ROBOT_TITLES.get(name, name) for name in names]
+    if len(set(titles)) == 1:
+        return titles[0]
+    numbers = {title: [i + 1 for i, other in enumerate(titles) if other == title] for title in titles}
+    return ", ".join(f"{title} ({', '.join(map(str, agents))})" for title, agents in numbers.items())

@@ -1,18 +1,17 @@
 """The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it leaves."""
 
-import math
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from pathlib import Path
-from time import monotonic
 from typing import Any, Literal
 
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.recording.reader import read_log
-from marlbc_mj.report.bundle import write_report, write_so_far
+from marlbc_mj.report.bundle import write_report
+from marlbc_mj.report.so_far import write_so_far
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
@@ -20,16 +19,13 @@ from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.episodes import EpisodeJob, fly, fly_or_fail, name_method, prepare
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
+from marlbc_mj.studies.so_far import SoFar
 from marlbc_mj.supervisors import CHECKPOINT_SUFFIX, ON_REQUEST, SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
-from marlbc_mj.util.files import JOBS_FOLDER, check_folder, write_json, writing
+from marlbc_mj.util.files import check_folder, write_json
 from marlbc_mj.util.modules import names_attribute
-from marlbc_mj.util.progress import Progress, note, silent
+from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
-
-SO_FAR = "so_far"
-"""Folder of the page of an unfinished run, among its other files."""
-REWRITE_AFTER = 1.0  # least time between two versions of that page [s]
 
 
 @dataclass(frozen=True)
@@ -147,10 +143,10 @@ def run_bench(
         ConfigurationError: a setting or the output folder; nothing is written then.
     """
     study = BenchStudy(scenario, config)
-    page = SoFar(out / JOBS_FOLDER / SO_FAR, describe(scenario, config), [job.key for job in study.jobs()])
+    page = SoFar(out, [job.key for job in study.jobs()], partial(write_so_far, config=describe(scenario, config)))
 
     def tell(job: EpisodeJob, result: Result) -> None:
-        page.add(result)
+        page.add(result.key, result)
         if ended is not None:
             ended(result)
 
@@ -164,34 +160,6 @@ def run_bench(
         ended=tell,
     )
     return done.results, list(done.report.problems)
-
-
-class SoFar:
-    """The page and the tables of a benchmark that has not ended; they grow as methods end.
-
-    Args:
-        folder: where they go; made with the first.
-        facts: of the run, as config.json has them.
-        keys: of all methods, in the order in which they are shown.
-    """
-
-    def __init__(self, folder: Path, facts: dict[str, Any], keys: Sequence[str]) -> None:
-        self.folder, self.facts, self.keys = folder, facts, keys
-        self.results: dict[str, Result] = {}
-        self._written = -math.inf  # when [s]
-
-    def add(self, result: Result) -> None:
-        """One more method has ended."""
-        self.results[result.key] = result
-        if monotonic() - self._written < REWRITE_AFTER and len(self.results) < len(self.keys):
-            return
-        if not self.folder.is_dir():
-            with writing(self.folder):
-                self.folder.mkdir(parents=True)
-            note(f"{self.folder / 'index.html'} grows as methods end")
-        with writing(self.folder):
-            write_so_far([self.results[key] for key in self.keys if key in self.results], len(self.keys), self.folder, self.facts)
-        self._written = monotonic()
 
 
 def describe(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:

@@ -1,14 +1,15 @@
 """Every method on the same draws around a scenario: a job is one method on up to a hundred seeds, many at a time."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain, groupby
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.report.seed_page import write_seed_report
+from marlbc_mj.report.so_far import write_seeds_so_far
 from marlbc_mj.results.seeds import MethodRuns, SeedResults, seed_range
 from marlbc_mj.results.summary import method_key
 from marlbc_mj.scenarios import Perturbation, Scenario
@@ -16,6 +17,7 @@ from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.bench import BenchConfig, describe
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_jobs, run_study
+from marlbc_mj.studies.so_far import SoFar
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
@@ -101,6 +103,8 @@ class DrawsStudy:
 def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
     """The whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
 
+    Until all have ended, a page and tables of the methods that have are in ``out/.jobs/so_far``.
+
     Raises:
         ConfigurationError: a setting or the output folder; nothing is written then.
     """
@@ -113,8 +117,32 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
         workers=config.workers,
         engine=config.engine,
         progress=tallied(study.methods, len(seeds), progress or silent),
+        ended=growing_page(study, out, describe(study.scenario, config)),
     )
     return study.gather(done.results)
+
+
+def growing_page(study: DrawsStudy, out: Path, facts: Mapping[str, Any]) -> Callable[[DrawsJob, MethodRuns], None]:
+    """For ``ended``: a page of the methods of which every job has ended."""
+    parts = dict[tuple[str, int], MethodRuns]()  # by method and first seed
+    own = {key: [(key, job.seeds[0]) for job in jobs] for key, jobs in groupby(study.jobs(), _key)}
+
+    def write(ended: Sequence[list[MethodRuns]], total: int, folder: Path) -> None:
+        write_seeds_so_far(study.gather(list(chain.from_iterable(ended))), total, folder, facts)
+
+    page = SoFar(out, list(own), write)
+
+    def tell(job: DrawsJob, runs: MethodRuns) -> None:
+        key = _key(job)
+        parts[key, job.seeds[0]] = runs
+        if all(part in parts for part in own[key]):
+            page.add(key, [parts[part] for part in own[key]])
+
+    return tell
+
+
+def _key(job: DrawsJob) -> str:
+    return method_key(job.supervisor, job.controller)
 
 
 def run_methods(

@@ -167,10 +167,11 @@ def check_free(trajectory: Trajectory, law: Controller) -> None:
     if not law.limited:
         return
     last = max(1, round(STUCK * len(trajectory.force)))
-    at_limit = (np.abs(trajectory.force[-last:]) >= scenario.force_limit * (1 - 1e-12)).any(axis=-1).all(axis=0)
+    at_limit = (np.abs(trajectory.force[-last:]) >= scenario.force_limits[:, None] * (1 - 1e-12)).any(axis=-1).all(axis=0)
     if at_limit.any():
         agents = ", ".join(str(i + 1) for i in np.flatnonzero(at_limit))
+        limits = " or ".join(f"{limit:g}" for limit in np.unique(scenario.force_limits[at_limit]).tolist())
         raise SimulationError(
-            f"saturated forever: agent {agents} at the force limit of {scenario.force_limit:g} N "
+            f"saturated forever: agent {agents} at the force limit of {limits} N "
             f"throughout the last {last * scenario.substep:g} s"
         )

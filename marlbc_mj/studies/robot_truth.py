@@ -15,7 +15,7 @@ from marlbc_mj.robots.motors import effects, posed
 
 
 class Truth(NamedTuple):
-    """Two agents of one world at one instant, as MuJoCo has them and as the robot reports them."""
+    """The agents of one world at one instant, as MuJoCo has them and as the robot reports them."""
 
     offset: np.ndarray  # (N, 2) of p from the body's place, in the body's frame [m]
     velocity_error: np.ndarray  # (N,) of v from the body's velocity at p [m/s]
@@ -25,7 +25,7 @@ class Truth(NamedTuple):
 
 def compare(world: World) -> Truth:
     """What world 0 reports now against ``xpos``, ``cvel`` and ``qfrc_actuator``."""
-    robot, model, data = world.plan.robot, world.plan.model, world.data[0]
+    model, data = world.plan.model, world.data[0]
     now = mujoco.MjData(model)  # mj_step leaves xpos and cvel at the state before it
     now.qpos[:], now.qvel[:] = data.qpos, data.qvel
     mujoco.mj_kinematics(model, now)
@@ -33,7 +33,7 @@ def compare(world: World) -> Truth:
     mujoco.mj_comVel(model, now)
     p, v, force = world.state.position[0], world.state.velocity[0], world.state.force[0]
     offset, velocity_error, height = np.zeros_like(p), np.zeros(len(p)), np.zeros(len(p))
-    for i in range(len(p)):
+    for i, robot in enumerate(world.plan.fleet.robots):
         body = model.body(agent_prefix(i) + robot.body).id
         ahead = np.append(p[i] - now.xpos[body, :2], 0.0)
         offset[i] = (now.xmat[body].reshape(3, 3).T @ ahead)[:2]

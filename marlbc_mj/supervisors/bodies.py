@@ -10,7 +10,6 @@ import numpy as np
 
 from marlbc_mj.core.laws import allocation_free
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Blend
 from marlbc_mj.supervisors.frameworks import Repertoire, behavior_velocities, evaluated_at, repertoire
@@ -58,7 +57,7 @@ def make_cruise(scenario: Scenario, motion: str, margin: float, speed: float, si
         raise ConfigurationError(f"margin must be non-negative and finite, got {margin}")
     if motion not in scenario.formation_names:
         raise unknown("formation behavior", motion, scenario.formation_names)
-    apart = give_way(scenario).distance or 2.0 * make_robot(scenario.robot).radius
+    apart = give_way(scenario).distance or 2.0 * scenario.fleet.radius
     bodies = Bodies(
         agents=float(apart + margin),
         obstacles=float(scenario.safe_distance + margin),

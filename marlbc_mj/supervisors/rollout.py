@@ -258,7 +258,7 @@ class Rollout:
         search = Search(
             rule=make_local_rule(scenario, self.margin),
             plans=plans,
-            lag=Lag(scenario.substeps if self.lag else 0, scenario.substep, scenario.force_limit / scenario.mass),
+            lag=Lag(scenario.substeps if self.lag else 0, scenario.substep, scenario.least_acceleration),
             problem=problem(scenario, weights),
             w_switch=self.w_switch,
         )

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,8 @@ PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gym
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, by the names of their distributions."""
+    from importlib.metadata import PackageNotFoundError, version  # which takes longer than the rest of a refusal
+
     found = {"python": platform.python_version()}
     for name in PACKAGES:
         try:

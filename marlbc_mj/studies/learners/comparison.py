@@ -33,7 +33,9 @@ _END: dict[str, Any] = {"color": FAILED_COLOR, "marker": "x", "markersize": 4, "
 def write_comparison(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
     """study.md, study.tex, curves.pdf and curves.png, from the lines of the CSV files alone."""
     table = learners_table(rows)
-    figure_note = "`curves.pdf`: median and range over the runs that got that far; violation is linear below 0.1 s.\n"
+    figure_note = (
+        "`curves.pdf`: median and range over the runs that got that far; violation is the worst agent's, linear below 0.1 s.\n"
+    )
     named = "".join(f"- `{name}`: {VARIANTS[name].line}\n" for name in by_variant(rows))
     for name, text in (("study.md", f"{to_markdown(table)}\n{named}\n{figure_note}"), ("study.tex", to_latex(table) + "\n")):
         with staged_file(folder / name, overwrite=True) as staging:
@@ -150,9 +152,9 @@ def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
                 axes.tick_params(labelleft=c == 0, labelbottom=key == "violation_time")
                 axes.xaxis.set_major_locator(MaxNLocator(3, steps=[1, 2, 5, 10]))
                 if key == "return":
-                    axes.set_title(name, loc="left", fontsize=6.5)
+                    axes.set_title(VARIANTS[name].title, loc="left", fontsize=6.5)
                 if c == 0:
-                    axes.set_ylabel({"return": "return [10³]", "violation_time": "violation, worst agent [s]"}[key])
+                    axes.set_ylabel({"return": "return [10³]", "violation_time": "violation [s]"}[key])
                     axes.yaxis.set_label_coords(-0.34 / width, 0.5, transform=axes.transAxes)
     figure.supxlabel("mission steps [10⁶]", fontsize=8, y=0.0, va="bottom")
     pl.legend_above(figure, _handles(), columnspacing=1.0)
@@ -202,7 +204,7 @@ def _handles() -> list[Line2D | Patch]:
     return [
         Line2D([], [], color=COLOR, label="median"),
         Patch(color=COLOR, alpha=0.25, linewidth=0, label="range of runs"),
-        Line2D([], [], color=REFERENCE_COLOR, label=f"median of {REFERENCE_VARIANT}"),
+        Line2D([], [], color=REFERENCE_COLOR, label=f"median of {VARIANTS[REFERENCE_VARIANT].title}"),
         Line2D([], [], color=pl.GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="scripted supervisor"),
         Line2D([], [], **_GOAL, label="a run meets the goal"),
         Line2D([], [], **_END, label="a run fails"),

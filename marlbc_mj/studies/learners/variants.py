@@ -12,6 +12,8 @@ from marlbc_mj.training.methods import CARE, METHODS
 class Variant:
     """One way to learn: a method and a preset with changes. A group has at most ``WIDE`` variants, a row of the figure."""
 
+    title: str
+    """Name in figures."""
     line: str
     group: str
     """Group of the comparison: learner, preset or rival."""
@@ -27,29 +29,37 @@ class Variant:
 
 _UNCENTRED = {"shaping": replace(PRESETS["fast"][0].shaping, centre=0.0)}
 VARIANTS: dict[str, Variant] = {
-    "marlms": Variant("MARLMS with the fast preset", "learner"),
-    "no-leniency": Variant("every negative TD error counts", "learner", "iql"),
-    "no-averaging": Variant("targets from one past network", "learner", changes={"copies": 1}),
-    "no-dueling": Variant("Q-values straight from the last layer", "learner", changes={"dueling": False}),
-    "plain-hash": Variant("states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
-    "no-risk": Variant("no learned risks: a cost of coming too close makes the policy careful", "learner", changes=CARE),
-    "no-exploring-starts": Variant("every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}),
+    "marlms": Variant("MARLMS", "MARLMS with the fast preset", "learner"),
+    "no-leniency": Variant("No leniency", "every negative TD error counts", "learner", "iql"),
+    "no-averaging": Variant("No averaging", "targets from one past network", "learner", changes={"copies": 1}),
+    "no-dueling": Variant("No dueling", "Q-values straight from the last layer", "learner", changes={"dueling": False}),
+    "plain-hash": Variant("Plain hash", "states hashed as they are, without auto-encoder", "learner", changes={"hash": "plain"}),
+    "no-risk": Variant(
+        "No risks", "no learned risks: a cost of coming too close makes the policy careful", "learner", changes=CARE
+    ),
+    "no-exploring-starts": Variant(
+        "No exploring starts", "every episode begins at the mission's start", "preset", changes={"exploring_starts": 0.0}
+    ),
     "uniform-starts": Variant(
-        "exploring starts anywhere, without a joint change of formation", "preset", changes={"focus": 0.0, "turning": 0.0}
+        "Uniform starts",
+        "exploring starts anywhere, without a joint change of formation",
+        "preset",
+        changes={"focus": 0.0, "turning": 0.0},
     ),
     "no-joint-exploration": Variant(
+        "No joint exploration",
         "a random order lasts one decision, of one agent",
         "preset",
         changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
     ),
-    "printed-state": Variant("the published state", "preset", changes={"state": "printed"}),
-    "no-centring": Variant("rewards are not centred", "preset", changes=_UNCENTRED),
-    "paper": Variant("the published hyper-parameters, state, reward and orders", "preset", preset="paper"),
-    "hysteretic": Variant("a negative TD error counts half", "rival", "hysteretic"),
-    "vdn": Variant("value decomposition", "rival", "vdn"),
-    "qmix": Variant("monotonic mixture of values", "rival", "qmix"),
-    "central": Variant("one network over joint orders", "rival", "central"),
-    "rlms": Variant("agents that learn alone", "rival", "rlms"),
-    "mappo": Variant("multi-agent PPO", "rival", "mappo"),
+    "printed-state": Variant("Published state", "the published state", "preset", changes={"state": "printed"}),
+    "no-centring": Variant("No centring", "rewards are not centred", "preset", changes=_UNCENTRED),
+    "paper": Variant("Published settings", "the published hyper-parameters, state, reward and orders", "preset", preset="paper"),
+    "hysteretic": Variant("Hysteretic", "a negative TD error counts half", "rival", "hysteretic"),
+    "vdn": Variant("VDN", "value decomposition", "rival", "vdn"),
+    "qmix": Variant("QMIX", "monotonic mixture of values", "rival", "qmix"),
+    "central": Variant("Central", "one network over joint orders", "rival", "central"),
+    "rlms": Variant("RLMS", "agents that learn alone", "rival", "rlms"),
+    "mappo": Variant("MAPPO", "multi-agent PPO", "rival", "mappo"),
 }
 """Method, preset and changes by name."""

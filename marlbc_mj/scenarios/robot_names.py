@@ -1,0 +1,29 @@
+"""Which robot each agent of a scenario has: one name for all, or one per agent."""
+
+from typing import Any
+
+from marlbc_mj.util.errors import ConfigurationError
+
+PAPER_ROBOT = "point_mass"
+"""What all agents have where nothing is said."""
+
+
+def settle_robots(scenario: str, agents: int, robot: str, robots: Any) -> tuple[str, tuple[str, ...]]:
+    """The fields ``robot`` and ``robots`` of a scenario as they are kept: equal teams have equal fields.
+
+    Returns:
+        The robot of all agents and (); where agents' robots differ, the first agent's robot and those of all.
+
+    Raises:
+        ConfigurationError: no names, another number than there are agents, or both fields given and in disagreement.
+    """
+    if not isinstance(robots, tuple | list) or not all(isinstance(name, str) for name in robots):
+        raise ConfigurationError(f"scenario {scenario!r}: robots must be names, one per agent, got {robots!r}")
+    if not robots:
+        return robot, ()
+    listed = ", ".join(robots)
+    if len(robots) != agents:
+        raise ConfigurationError(f"scenario {scenario!r}: robots names {len(robots)} robots for {agents} agents: {listed}")
+    if robot not in (PAPER_ROBOT, robots[0]):
+        raise ConfigurationError(f"scenario {scenario!r}: robot {robot!r} and robots {listed} disagree; give one of both")
+    return robots[0], tuple(robots) if len(set(robots)) > 1 else ()
