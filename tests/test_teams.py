@@ -1,95 +1,253 @@
-"""Room for teams of any size: missions that a column of several files can fly."""
+"""Supervisors of B teams: what one team is told does not depend on the others, and a supervisor of one team serves B."""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 
-from marlbc_mj import World
-from marlbc_mj.controllers import make_controller
-from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION
-from marlbc_mj.policies.general_inputs import INPUTS, LANES, WAYS
-from marlbc_mj.scenarios import FAMILIES
-from marlbc_mj.scenarios.teams import files_of, room_for, team_mission
-from marlbc_mj.studies.safety import ground
-from marlbc_mj.training.general.config import GeneralConfig, learner_config
-from marlbc_mj.training.general.squads import LOST_AFTER, Squad, look_ahead, shut_out
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.controllers import PD
+from marlbc_mj.core.imperfections import Imperfections
+from marlbc_mj.engine.observation import Observation
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario, paper
+from marlbc_mj.supervisors import MPCMS, SUPERVISORS, Blend, OneTeam, Supervisor, batched, carry_out, make_supervisor
+from marlbc_mj.supervisors.base import split_decision
+from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-TEAMS = [("wedge", 4), ("circle", 8), ("line", 6), ("grid", 9), ("circle", 12), ("wedge", 16), ("grid", 16), ("grid", 32)]
-
-
-@pytest.mark.parametrize(("formation", "agents"), TEAMS)
-@pytest.mark.parametrize("family", ["field", "gates", "corridor"])
-def test_the_column_is_shorter_than_the_way(family: str, formation: str, agents: int) -> None:
-    """In front of the column and behind it is at least a fifth of the way."""
-    scenario = team_mission(family, formation, agents)
-    column = scenario.formations[1]
-    way = scenario.duration * scenario.path_velocity[0]
-    assert np.ptp(column[:, 0]) <= 0.6 * way
-    assert len(np.unique(column[:, 1].round(6))) <= 2 * files_of(agents)
+TEAMS = 5
+AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
+PAPER = paper()
+FM, FR = (PAPER.orders.index(name) for name in ("FM", "FR"))
+QUICK = tuple(name for name in SUPERVISORS if name not in ("mpcms-mujoco", "oracle"))
+NEEDS = {"marlms-general": {"composition": "set-based"}}
+"""What supervisors ask of a scenario."""
 
 
-@pytest.mark.parametrize("family", ["field", "forest", "gates", "corridor", "traffic"])
-def test_a_team_of_four_has_the_families_own_mission(family: str) -> None:
-    assert team_mission(family, "wedge", 4) == FAMILIES[family]().build()
+def bits(decision) -> list[bytes]:
+    """A decision, team by team, to the last bit."""
+    orders, velocity = (decision.orders, decision.velocity) if isinstance(decision, Blend) else (decision, None)
+    return [row.tobytes() + (b"" if velocity is None else velocity[b].tobytes()) for b, row in enumerate(orders)]
 
 
-def test_only_families_make_room() -> None:
-    with pytest.raises(ConfigurationError, match="make room"):
-        room_for("paper", None, 16)
-    assert room_for("gates", "grid", 32) == {"agents": 32, "formation": "grid", "length": 120.0, "files": 4, "width": 14.0}
+def told(supervisor: Supervisor, world: World, steps: int) -> list[list[bytes]]:
+    """Decisions for all teams of a world over some mission steps, and at the end where they are."""
+    memory, observation, said = supervisor.start(world.scenario, world.worlds), world.observe(), []
+    for _ in range(steps):
+        decision, memory = supervisor.decide(observation, memory)
+        said.append(bits(decision))
+        observation = carry_out(world, decision).observation
+    return [*said, [position.tobytes() for position in observation.position]]
 
 
-def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
-    """Two blocked lanes within its bins make a column, one does not; it stays while the way back of anybody is blocked."""
-    inputs, last, bins = np.ones((4, 3, INPUTS)), np.full((4, 3), FORMATION), np.full(4, 6)
-    inputs[0, :2, 5] = inputs[1, :2, 6] = inputs[2, 1, 5] = -0.5
-    inputs[3, 1, LANES] = -0.5
-    assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, FORMATION]
-    last[3, 2] = COLUMN_ACTION
-    assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, COLUMN_ACTION]
+def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> None:
+    """Each team of ``world`` is told, to the bit, what it would be told in a world of its own."""
+    alone = [World(world.scenario, world.plan.controller) for _ in range(world.worlds)]
+    for b, own in enumerate(alone):
+        own.copy_world(world, b, 0)
+    together = told(supervisor, world, steps)
+    assert len({tuple(rows) for rows in zip(*together, strict=True)}) > 1
+    for b, own in enumerate(alone):
+        assert [rows[b] for rows in together] == [rows[0] for rows in told(supervisor, own, steps)]
 
 
-def test_shut_out_is_far_from_both_slots_with_both_ways_blocked() -> None:
-    inputs = np.zeros((1, 4, INPUTS))
-    inputs[..., LANES:WAYS] = -1.0
-    inputs[..., [WAYS + 1, WAYS + 3]] = 0.99
-    inputs[0, 1, LANES + 1] = 0.1
-    inputs[0, 2, WAYS + 3] = 0.5
-    inputs[0, 3, LANES] = 0.0
-    assert shut_out(inputs).tolist() == [[True, False, False, False]]
+@pytest.mark.parametrize("name", [name for name in QUICK if name != "oracle-schedule"])
+def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
+    """Five draws of a whole episode of 25 s, past the first point; of 8 s where a decision takes long."""
+    duration = 8.0 if name in ("mpcms", "rollout") else 25.0
+    world = World(paper(perturbation=AROUND, duration=duration, **NEEDS.get(name, {})), worlds=TEAMS)
+    world.reset(4)
+    assert_teams_are_alone(make_supervisor(name), world, world.scenario.mission_steps)
 
 
-def test_an_episode_ends_where_an_agent_is_lost() -> None:
-    """A team that never leaves its formation is lost at a gate; the cost of all time to come is in the last reward."""
-    config = GeneralConfig(families=("gates",), teams=("line-6",), lossy=0.0, guided=0.0, least_exploration=0.0)
-    squad = Squad(team_mission("gates", "line", 6, composition="set-based", substep=0.01), config, learner_config(config), 0)
-    squad.end[:] = squad.scenario.mission_steps
-    greedy = np.full((1, 6), FORMATION)
-    outcomes = [squad.step(greedy, 0.0) for _ in range(90)]
-    first = next(k for k, outcome in enumerate(outcomes) if outcome.lost.any())
-    assert first > LOST_AFTER
-    assert outcomes[first].ended.all()
-    np.testing.assert_allclose(outcomes[first].reward, -1.3 / (1.0 - config.gamma), rtol=1e-6)
-    assert all(outcome.reward.min() >= -1.3 for outcome in outcomes[:first])
+@pytest.mark.parametrize("name", QUICK)
+def test_teams_may_be_at_different_steps_of_the_mission(name):
+    """Five places of the case study, under PD; decisions that hold for an interval hold for each team's own."""
+    world = World(paper(perturbation=AROUND, **NEEDS.get(name, {})), PD(), worlds=TEAMS)
+    world.reset(1)
+    for b, step in enumerate((0, 353, 862, 1057, 1621)):
+        slots = np.array(PAPER.path_origin) + 0.05 * step * np.array(PAPER.path_velocity) + PAPER.formations[b % 2]
+        world.place(b, step, slots, np.tile(PAPER.path_velocity, (4, 1)), np.zeros(4, dtype=np.int64))
+    assert_teams_are_alone(make_supervisor(name), world, 80)
 
 
-@pytest.mark.parametrize("approach", ["straight", "line"])
-def test_who_is_late_finds_the_opening_along_its_line(approach: str) -> None:
-    """Agents in front of the walls beside an opening that their column has passed: straight they stay, by lines they do not."""
-    scenario = team_mission("gates", "line", 6, composition="set-based", substep=0.01, column_approach=approach, gates=1)
-    world = World(scenario, make_controller("pd"))
+@pytest.mark.parametrize("name", ["fsams", "fms", "layered", "mpcms"])
+def test_teams_that_give_way_are_told_what_they_are_told_alone(name):
+    """Agent avoidance, among obstacles that move and with sensors that are not perfect."""
+    crossing = imperfect(make_scenario("exchange", agents=4))
+    for scenario in (crossing, make_scenario("traffic", duration=8.0)):
+        world = World(scenario, worlds=3)
+        world.reset(2)
+        assert_teams_are_alone(make_supervisor(name), world, min(80 if name == "mpcms" else 160, scenario.mission_steps))
+
+
+def imperfect(scenario: Scenario) -> Scenario:
+    """The same scenario with noisy, late sensors."""
+    return replace(scenario, imperfections=Imperfections(position_noise=0.02, delay=0.02), perturbation=AROUND)
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_prediction_for_many_teams_does_not_depend_on_the_number_of_threads(threads):
+    world = World(paper(perturbation=AROUND), worlds=3)
     world.reset(0)
-    formation, column = (scenario.orders.index(name) for name in scenario.formation_names)
-    steps = scenario.mission_steps
-    world.rollout(np.full((int(0.6 * steps), 1, 6), formation))
-    world.rollout(np.full((int(0.3 * steps), 1, 6), column))
-    x = world.observe().position[0, :, 0]
-    assert (x > 35.0).all() == (approach == "line")
+    for b, step in enumerate((362, 1070, 0)):
+        slots = np.array(PAPER.path_origin) + 0.05 * step * np.array(PAPER.path_velocity) + PAPER.formations[0]
+        world.place(b, step, slots, np.tile(PAPER.path_velocity, (4, 1)), np.zeros(4, dtype=np.int64))
+    observation, results = world.observe(), []
+    for supervisor in (MPCMS(), MPCMS(threads=threads)):
+        memory = supervisor.start(PAPER, 3)
+        results.append(supervisor._predict(observation, memory, supervisor._pairs(memory)[1]))
+    for one, other in zip(*results, strict=True):
+        assert one.tobytes() == other.tobytes()
 
 
-def test_a_mission_of_the_study_of_safety_names_team_and_approach() -> None:
-    straight, lines = (ground(f"corridor-grid-9{end}") for end in ("", "-lines"))
-    assert straight == team_mission("corridor", "grid", 9, split="test")
-    assert lines == team_mission("corridor", "grid", 9, split="test", column_approach="line")
-    with pytest.raises(ConfigurationError, match="FORMATION-AGENTS"):
-        ground("gates-nine")
+def test_a_team_without_a_finite_cost_is_named():
+    """The second of two teams has an obstacle without end."""
+    observation = World(PAPER, worlds=2).observe()
+    observation.obstacles[1, 0, 2] = np.inf
+    supervisor = MPCMS()
+    with pytest.raises(SimulationError, match=r"no candidate has a finite cost at t = 0.000 s for team 1"):
+        supervisor.decide(observation, supervisor.start(PAPER, 2))
+
+
+def test_simulated_predictions_of_two_teams_are_those_of_each_alone():
+    """MuJoCo: every team's twin begins as the only one of one team does."""
+    world = World(PAPER, worlds=2)
+    world.place(1, 362, np.array([15.6, 0.0]) + PAPER.formations[0], np.tile((1.0, 0.0), (4, 1)), np.zeros(4, dtype=np.int64))
+    assert_teams_are_alone(MPCMS(horizon=4, instants=(0,), prediction="mujoco"), world, 3)
+
+
+# Supervisors of one team -------------------------------------------------------------------------------------------------------
+
+
+class Near(NamedTuple):
+    """Memory of :class:`Careful`."""
+
+    near: np.ndarray  # (N,) bool
+    orders: np.ndarray  # (2,)
+    solver_ms: float = 0.0
+
+
+@dataclass(frozen=True)
+class Careful:
+    """Avoids below a clearance with hysteresis; written for one team, told how long its solver takes."""
+
+    def start(self, scenario):
+        return Near(np.zeros(scenario.agents, dtype=bool), np.array([scenario.orders.index(n) for n in ("FM", "OA>FM")]))
+
+    def decide(self, observation, memory):
+        assert observation.clearance.shape == (4,) and observation.obstacles.ndim == 2 and observation.step.shape == ()
+        near = observation.clearance < np.where(memory.near, 2.8, 2.2)
+        return memory.orders[near.astype(int)], memory._replace(near=near, solver_ms=2.0)
+
+
+@dataclass(frozen=True)
+class CarefulTeams:
+    """The same for B teams."""
+
+    def start(self, scenario, teams):
+        return Careful().start(scenario)._replace(near=np.zeros((teams, scenario.agents), dtype=bool))
+
+    def decide(self, observation, memory):
+        near = observation.clearance < np.where(memory.near, 2.8, 2.2)
+        return memory.orders[near.astype(int)], memory._replace(near=near)
+
+
+@dataclass(frozen=True)
+class Says:
+    """Always the same decision, for the team at whose step this is."""
+
+    decision: object
+    other: object = None  # that of a team which is further
+
+    def start(self, scenario):
+        return None
+
+    def decide(self, observation, memory):
+        return self.other if self.other is not None and observation.step else self.decision, None
+
+
+def test_a_supervisor_of_one_team_decides_for_many():
+    """Wrapped, and only then; the same orders as one that is written for B."""
+    assert isinstance(batched(Careful()), OneTeam) and isinstance(batched(CarefulTeams()), CarefulTeams)
+    for make in (lambda: World(PAPER, worlds=3), partial(World, PAPER)):
+        world = make()
+        for b in range(world.worlds):
+            step = 362 - 20 * b
+            slots = np.array([-2.5 + 0.05 * step, 0.0]) + PAPER.formations[0]
+            world.place(b, step, slots, np.tile((1.0, 0.0), (4, 1)), np.zeros(4, dtype=np.int64))
+        start = world.snapshot()
+        one = told(batched(Careful()), world, 60)
+        world.restore(start)
+        assert one == told(CarefulTeams(), world, 60)
+    memory = batched(Careful()).start(PAPER, 3)
+    assert memory.solver_ms is None or memory.solver_ms == 0.0
+    _, memory = batched(Careful()).decide(World(PAPER, worlds=3).observe(), memory)
+    assert memory.solver_ms == 6.0  # of all three
+    assert batched(Says(np.full(4, FM))).start(PAPER, 2).solver_ms is None
+
+
+def test_episodes_take_both_forms():
+    """Bit by bit the same."""
+    scenario = paper(duration=24.0)
+    runs = [run_episode(World(scenario, record=True), supervisor) for supervisor in (Careful(), CarefulTeams())]
+    assert (np.diff(runs[0].command[:, 0]) != 0).any()
+    for name in ("position", "force", "command", "reward"):
+        assert getattr(runs[0], name).tobytes() == getattr(runs[1], name).tobytes()
+
+
+def test_velocities_of_one_team_are_stacked():
+    velocity = np.arange(8.0).reshape(4, 2)
+    decision, _ = batched(Says(Blend(np.full(4, FR), velocity))).decide(World(PAPER, worlds=2).observe(), SomeMemories(2))
+    assert isinstance(decision, Blend) and (decision.orders == FR).all() and decision.orders.shape == (2, 4)
+    assert (decision.velocity == velocity).all() and decision.velocity.shape == (2, 4, 2)
+
+
+class SomeMemories:
+    """Nothing remembered of some teams."""
+
+    def __init__(self, teams: int) -> None:
+        self.teams = (None,) * teams
+
+
+@pytest.mark.parametrize(
+    ("decision", "message"),
+    [
+        (np.full(3, FM), r"orders must have shape \(4,\), got \(3,\)"),
+        (np.full((1, 4), FM), r"orders must have shape \(4,\), got \(1, 4\)"),
+        (np.full(4, 2.0), r"array of integers with shape \(4,\), got float64"),
+        ([FM] * 4, r"array of integers with shape \(4,\), got list"),
+        (None, "got NoneType"),
+        (Blend(np.full(4, FM), np.zeros((4, 3))), r"velocities must have shape \(4, 2\), got \(4, 3\)"),
+        (np.full(4, 17), "indices from 0 to 5"),
+        (Blend(np.full(4, FM), np.full((4, 2), np.nan)), "finite"),
+    ],
+)
+def test_decisions_that_are_none_are_named(decision, message):
+    """Of one team, by its own shape; of B teams, with theirs."""
+    with pytest.raises(ConfigurationError, match=message):
+        run_episode(World(paper(duration=1.0), record=True), Says(decision))
+
+
+def test_a_decision_for_one_team_is_none_for_many():
+    """A batch supervisor that forgets its leading axis, and teams of which only some get velocities."""
+    with pytest.raises(ConfigurationError, match=r"orders must have shape \(2, 4\), got \(4,\)"):
+        split_decision(np.full(4, FM), (2, 4))
+    observation = World(PAPER, worlds=2).observe()
+    observation.step[1] = 5
+    mixed = batched(Says(np.full(4, FM), Blend(np.full(4, FM), np.zeros((4, 2)))))
+    with pytest.raises(ConfigurationError, match="velocities for some teams and orders alone for others"):
+        mixed.decide(observation, mixed.start(PAPER, 2))
+
+
+def test_an_episode_is_of_one_world():
+    with pytest.raises(ConfigurationError, match="one world, got 2"):
+        run_episode(World(PAPER, worlds=2, record=True), CarefulTeams())
+
+
+def test_a_team_of_an_observation_has_no_leading_axis():
+    observation = World(PAPER, worlds=3).observe()
+    for name, whole, own in zip(Observation._fields, observation, observation.team(2), strict=True):
+        assert own.shape == whole.shape[1:] and (own == whole[2]).all(), name
