@@ -1,6 +1,6 @@
 """A supervisor of your own: the column while an obstacle is near some agent, else the wide formation.
 
-It also runs from the command line: marlbc run paper --supervisor own_supervisor.py:Careful
+It also runs from the command line: marlbc run paper --composition set-based --supervisor own_supervisor.py:Careful
 """
 
 from dataclasses import dataclass

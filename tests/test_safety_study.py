@@ -18,12 +18,11 @@ from marlbc_mj.studies.protocol import Watch
 from marlbc_mj.studies.safety import (
     DRAG_DRAWS,
     DRAWS_EACH,
-    OWN,
     SEARCHES,
-    VELOCITY_GIVERS,
     SafetyStudy,
     ground,
 )
+from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS
 from marlbc_mj.util.errors import ConfigurationError
 
 GOOD = MissionOutcome(reached=True, violated=False, struck=False, collided=False)

@@ -25,7 +25,10 @@ CONTROL_REFERENCE = "sorlc"
 """The controller that the chance of improvement is measured against."""
 CONTROL = "control"
 """The track that compares controllers."""
-_REFERENCE_NOTE = f"Reference: {display_name(SUPERVISOR_REFERENCE)} under the null-space composition."
+_REFERENCE_NOTE = (
+    f"Reference: {display_name(SUPERVISOR_REFERENCE)} under the null-space composition. A run that was not finished, or not "
+    "begun because the method refuses the mission, counts as violated, struck and collided, too."
+)
 LEADING = 3
 """Columns that every table begins with; in text they have their intervals."""
 MOST_COLUMNS = 12
@@ -154,6 +157,7 @@ _SAFETY_AND_COST = (
     BoardColumn("violation", _share("violated"), 1, -1, (0.0, 100.0), unit="%"),
     BoardColumn("struck", _share("struck"), 1, -1, (0.0, 100.0), unit="%"),
     BoardColumn("collided", _share("collided"), 1, -1, (0.0, 100.0), unit="%"),
+    BoardColumn("not finished", _share("unfinished"), 1, -1, (0.0, 100.0), unit="%"),
     BoardColumn("switches", _median("switches"), 1, 0),
     BoardColumn("decision", _median("decision_ms"), None, 0, unit="ms"),
 )

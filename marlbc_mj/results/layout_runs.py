@@ -56,6 +56,11 @@ class LayoutRun(NamedTuple):
         """See :attr:`MissionOutcome.success`."""
         return MissionOutcome(self.reached, self.violated, self.struck, self.collided).success
 
+    @property
+    def unfinished(self) -> bool:
+        """Whether there is no flight to judge: the method refused the mission, or the run failed."""
+        return bool(self.failure)
+
     def score(self, name: str) -> float:
         """One of :data:`LAYOUT_SCORES` by name."""
         return self.scores[LAYOUT_SCORES.index(name)]

@@ -30,7 +30,7 @@ def by_cost(run: LayoutRun) -> float:
     return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success - run.score("cost_integral_sum")
 
 
-OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened")
+OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened", "unfinished")
 """Outcomes of a run by name."""
 
 

@@ -22,7 +22,7 @@ from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.draws import SEEDS_PER_JOB, with_drag_range
 from marlbc_mj.studies.protocol import Report, Watch
-from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.method_names import display_name
@@ -49,12 +49,8 @@ ORDER_GIVERS = (
     "marlms-general",
 )
 """Supervisors whose orders are composed, under either composition; the last one refuses all but the set-based one."""
-VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
-"""Supervisors that give velocities, so that the composition does not matter."""
 SEARCHES = ("mpcms", "rollout")
 """Supervisors that take seconds a layout."""
-OWN = "own"
-"""Stands for a composition where a supervisor gives its own velocities."""
 LINES = "-lines"
 """Ending of a team that comes to its column along the slots' lines."""
 FIRST_SEED = 80_000

@@ -77,6 +77,10 @@ LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed",
 ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS, "marlms-general")
 """Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
 oracle itself where nothing is perturbed, the others are no part of the paper's comparison."""
+VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
+"""Supervisors that give velocities, so that the composition does not matter."""
+OWN = "own"
+"""Stands for a composition where a supervisor gives its own velocities."""
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
 """Supervisors that nothing was trained for, without those on request."""
 
@@ -118,8 +122,10 @@ __all__ = [
     "MPCMS",
     "ON_REQUEST",
     "ORCA",
+    "OWN",
     "SUPERVISORS",
     "UNLEARNED",
+    "VELOCITY_GIVERS",
     "Blend",
     "Decision",
     "DistributedLookAhead",
