@@ -43,24 +43,15 @@ def most_moved(numbers, view):
 @allocation_free
 def look(numbers, view):
     """Fill ``view.looked``; grids, where there are any, are those of this moment."""
-    count, agents = view.obstacles.shape[0], view.p.shape[0]
-    gridded = view.grid.shape[0] > 0
-    for i in range(agents):
+    split = room(view.obstacles.shape[0])
+    for i in range(view.p.shape[0]):
         view.looked[i, X], view.looked[i, Y], view.looked[i, FREE] = view.p[i, 0], view.p[i, 1], np.inf
-    for i in range(agents):
-        if gridded:
-            k = nearest(view.p[i], view.obstacles, view.grid[: room(count)], -1)
-            if k >= 0:
-                see(view, i, view.obstacles[k], view.obstacles[k, 2] + numbers.clearance)
-            j = nearest(view.p[i], view.p, view.grid[room(count) :], i)
-            if j >= 0:
-                see(view, i, view.p[j], numbers.agent_distance)
-            continue
-        for k in range(count):
+        k = nearest(view.p[i], view.obstacles, view.grid[:split], -1)
+        if k >= 0:
             see(view, i, view.obstacles[k], view.obstacles[k, 2] + numbers.clearance)
-        for j in range(agents):
-            if j != i:
-                see(view, i, view.p[j], numbers.agent_distance)
+        j = nearest(view.p[i], view.p, view.grid[split:], i)
+        if j >= 0:
+            see(view, i, view.p[j], numbers.agent_distance)
 
 
 @allocation_free

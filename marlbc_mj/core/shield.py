@@ -244,13 +244,13 @@ def target_of(numbers, view, i, force):
 
 
 @allocation_free
-def shield_agent(numbers, view, i, longest, force, counts):
+def shield_agent(numbers, view, i, longest, target, force, counts):
     """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit.
 
-    ``longest`` [m] is the team's greatest stopping distance.
+    ``longest`` [m] is the team's greatest stopping distance, ``target`` that of :func:`target_of`.
     """
     per = view.h / numbers.mass
-    x, y, worst, need = target_of(numbers, view, i, force)
+    x, y, worst, need = target
     k = most_pressing(numbers, view, i, need) if anything_near(numbers, view, i, longest, need) else -1
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
         counts.breaches[i, MOTION_BROKEN if moves(view, k) else STATE_BROKEN] += 1.0
@@ -297,12 +297,13 @@ def shield_team(numbers, view, last, force, counts):
         watch_assumptions(numbers, view, i, last[i], counts.breaches[i])
         for axis in range(2):
             force[i, axis] = clip(force[i, axis], numbers.box)
-        _, _, worst, need = target_of(numbers, view, i, force[i])
+        target = target_of(numbers, view, i, force[i])
+        worst, need = target[2], target[3]
         if farthest == np.inf or worst > numbers.speed_cap or not is_alone(view, i, longest, need, farthest):
             if not filled:
                 fill_grids(view)
                 filled = True
-            shield_agent(numbers, view, i, longest, force[i], counts)
+            shield_agent(numbers, view, i, longest, target, force[i], counts)
         for axis in range(2):
             last[i, 0, axis], last[i, 1, axis] = view.moving[i, axis], force[i, axis]
 
