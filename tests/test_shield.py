@@ -273,7 +273,7 @@ def test_a_log_has_what_the_shield_did(tmp_path):
     scenario = paper(duration=20.0)
     world = World(scenario, SORLC(), record=True, shield=True)
     names = ("fsams", "sorlc")
-    with LogWriter(tmp_path / "a.mcap", scenario, SORLC(), names=names, seed=0, config={}, shielded=True) as log:
+    with LogWriter(tmp_path / "a.mcap", scenario, SORLC(), names=names, seed=0, config={}, plan=world.plan) as log:
         trajectory = run_episode(world, make_supervisor("fsams"), names=names, on_frame=log.write)
     with open(tmp_path / "a.mcap", "rb") as stream:
         rows = [(schema, json.loads(m.data)) for schema, _, m in make_reader(stream).iter_messages(topics=["/shield"])]

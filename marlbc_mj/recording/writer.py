@@ -23,7 +23,7 @@ from mcap_protobuf.schema import register_schema
 from marlbc_mj.controllers import Controller, sorlc
 from marlbc_mj.core import laws
 from marlbc_mj.core.communication import IDEAL
-from marlbc_mj.engine.plan import make_plan
+from marlbc_mj.engine.plan import Plan, make_plan
 from marlbc_mj.episode import Frame
 from marlbc_mj.recording import schemas
 from marlbc_mj.recording.scene import SCENE_TOPIC, TRANSFORMS_TOPIC, Scene, foxglove_layout
@@ -60,8 +60,8 @@ class LogWriter:
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.
         overwrite: replace a log, finished or partial, of the same name.
-        shielded: the team has a shield, which gets a topic of its own.
-        model: the scenario's MJCF, where a world of it has been made already; None: it is assembled for the log.
+        plan: of the World that flies; it has the model, and says whether there is a shield, which gets a topic of its own. None:
+            one without a shield is made for the log.
 
     Raises:
         ConfigurationError: a path that cannot or must not be written, or a scenario that cannot be assembled.
@@ -77,8 +77,7 @@ class LogWriter:
         seed: int,
         config: dict[str, Any],
         overwrite: bool = False,
-        shielded: bool = False,
-        model: str | None = None,
+        plan: Plan | None = None,
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
@@ -91,12 +90,13 @@ class LogWriter:
             "revision": git_revision(),
             **_describe(scenario, controller, draw),
         }
-        attachments = _attachments(scenario, model or make_plan(scenario, controller).xml, config)
+        plan = plan or make_plan(scenario, controller)
+        attachments = _attachments(scenario, plan.xml, config)
         self._scene = Scene(scenario, draw.obstacles, draw.motions)
         self._rows = [f'{{"command":{json.dumps(c)},"index":{k}}}' for k, c in enumerate(scenario.orders.commands)]
         self._weighted = laws.interface(controller.law).state == sorlc.STATE
         self._posed = scenario.fleet.floating
-        self._shielded = shielded
+        self._shielded = plan.shielded
         self._communicating = scenario.communication != IDEAL
         self._steps = 0
         self._pending = 0  # since the last flush [bytes]

@@ -156,8 +156,7 @@ def open_log(flight: Flight, folder: Path, *, overwrite: bool = False) -> LogWri
             **({"shield": True} if job.shield else {}),
         },
         overwrite=overwrite,
-        shielded=job.shield,
-        model=flight.world.plan.xml,
+        plan=flight.world.plan,
     )
 
 
