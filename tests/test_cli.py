@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.cli.benchmark import ScenarioOptions
+from marlbc_mj.cli.scenario_options import ScenarioOptions
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.engine.world import World
 from marlbc_mj.recording import writer

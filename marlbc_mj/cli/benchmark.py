@@ -1,4 +1,4 @@
-"""``marlbc bench``, ``run``, ``evaluate`` and ``safety``, and the changes to a scenario that they share."""
+"""``marlbc bench``, ``run``, ``evaluate`` and ``safety``."""
 
 import sys
 from collections.abc import Callable
@@ -9,26 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from marlbc_mj.cli.choices import (
-    ROBOTS_SETTING,
     Compositions,
     ControllerName,
     MissionNames,
     ScenarioName,
-    ScenarioSettings,
-    SomeComposition,
     SomeControllers,
     SomeCount,
-    SomeDisturbance,
-    SomeFormation,
-    SomeNumber,
     SomeRange,
-    SomeReference,
-    SomeRobot,
-    SomeSplit,
     SomeSupervisors,
     SupervisorName,
 )
 from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.cli.scenario_options import ScenarioOptions
 from marlbc_mj.cli.terminal import print_results, result_line
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.progress import note
@@ -38,94 +30,6 @@ if TYPE_CHECKING:
     from marlbc_mj.results.summary import Result
     from marlbc_mj.scenarios import Scenario
     from marlbc_mj.studies.bench import BenchConfig
-
-
-@dataclass(frozen=True)
-class ScenarioOptions:
-    """Changes to the scenario."""
-
-    substep: SomeNumber = None
-    """Physics and control step [s]; must divide the mission step of 0.05 s."""
-    reference: SomeReference = None
-    """Where behaviors are evaluated: at the reference (virtual) or at the measured position (actual)."""
-    composition: SomeComposition = None
-    """How an order becomes a reference: avoidance as an equality task (null-space) or as an inequality (set-based)."""
-    two_sided: bool = False
-    """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
-    disturbance: SomeDisturbance = None
-    """Unknown dynamics."""
-    drag_scale: SomeNumber = None
-    """Multiplies the disturbance."""
-    force_limit: SomeNumber = None
-    """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
-    duration: SomeNumber = None
-    """Mission time [s]."""
-    robot: SomeRobot = None
-    """Robot of every agent; the scenario takes its mass, force and limits."""
-    agents: SomeCount = None
-    """Size of the team, 2 to 256, for scenarios that are made for any."""
-    formation: SomeFormation = None
-    """Formation of the team, for the same scenarios."""
-    room: bool = False
-    """Give a team the room that it needs: from 12 agents on a longer way, a column of several files and wider openings."""
-    along_lines: bool = False
-    """Agents come to their slots in the column along the slots' lines, not straight: first across the path, then along it."""
-    split: SomeSplit = None
-    """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
-    set: ScenarioSettings = ()
-    """Settings of communication and imperfections, and each agent's robot where they differ: communication.range=8
-    robots=disc,disc,omni,crazyflie."""
-
-    allow_code: bool = False
-    """Run the Python file that a scenario file names as its robot."""
-
-    def build(self, name: str) -> "Scenario":
-        """The named scenario with these changes."""
-        from marlbc_mj.core.disturbances import make_disturbance
-        from marlbc_mj.scenarios import make_scenario
-        from marlbc_mj.scenarios.teams import room_for
-        from marlbc_mj.util.changes import with_settings
-
-        keys = ("substep", "reference", "composition", "force_limit", "duration", "agents", "formation", "split")
-        changes: dict[str, Any] = {key: getattr(self, key) for key in keys if getattr(self, key) is not None}
-        if self.room:
-            changes = {**room_for(name, self.formation, self.agents), **changes}
-        if self.along_lines:
-            changes["column_approach"] = "line"
-        if self.two_sided:
-            changes["two_sided"] = True
-        if self.disturbance is not None or self.drag_scale is not None:
-            scale = 1.0 if self.drag_scale is None else self.drag_scale
-            changes["disturbance"] = make_disturbance(self.disturbance or "paper", scale)
-        settings, robots = self._split_settings()
-        scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name, robots), **changes)
-        return with_settings(scenario, settings)
-
-    def _split_settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The settings without that of the robots, and the names that it gives: their scale is the scenario's from the start."""
-        given = [setting for setting in self.set if setting.partition("=")[0] == ROBOTS_SETTING]
-        names = given[-1].partition("=")[2].split(",") if given else []
-        return tuple(setting for setting in self.set if setting not in given), tuple(names)
-
-    def _robot_changes(self, name: str, robots: tuple[str, ...]) -> dict[str, Any]:
-        """Fields that another robot, or one of each agent's, changes, without those that other options set.
-
-        Raises:
-            ConfigurationError: both are given, or a robot that cannot be made.
-        """
-        from marlbc_mj.robots import make_fleet
-
-        if self.robot is not None and robots:
-            raise ConfigurationError(
-                f"--robot {self.robot} is every agent's, and robots={','.join(robots)} each agent's; give one"
-            )
-        if self.robot is None and not robots:
-            return {}
-        chosen = {"robots": robots} if robots else {"robot": self.robot, "robots": ()}
-        if name == "robot_gate":
-            return chosen
-        scale = make_fleet(robots or (str(self.robot),)).scale()
-        return {**{key: value for key, value in scale.items() if getattr(self, key, None) is None}, **chosen}
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from typing import Literal
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.benchmark import ScenarioOptions
 from marlbc_mj.cli.choices import (
     CalibratedNames,
     ControllerName,
@@ -19,6 +18,7 @@ from marlbc_mj.cli.choices import (
     SupervisorName,
 )
 from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.cli.scenario_options import ScenarioOptions
 
 
 @dataclass(frozen=True)
