@@ -136,6 +136,8 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
     Raises:
         ConfigurationError: no policies, or networks of different depth.
     """
+    from scipy.linalg import block_diag  # here, as it takes longer to import than most commands take to answer
+
     networks = [policy.network for policy in policies]
     if not networks or len({len(network.weights) for network in networks}) > 1:
         raise ConfigurationError("a mean takes at least one policy, and networks that have the same number of layers")
@@ -148,11 +150,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
         if k == 0:
             joined = np.concatenate(layers, axis=1)
         elif k < last:
-            joined = np.zeros(np.sum([layer.shape for layer in layers], axis=0), dtype=np.float32)
-            row = column = 0
-            for layer in layers:
-                joined[row : row + layer.shape[0], column : column + layer.shape[1]] = layer
-                row, column = row + layer.shape[0], column + layer.shape[1]
+            joined = block_diag(*layers)
         else:
             joined = share * np.concatenate(layers, axis=0)
         weights.append(joined[None])

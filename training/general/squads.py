@@ -19,8 +19,6 @@ from marlbc_mj.util.seeding import stream
 
 NEAREST_SIGHT = 6
 """Bins of a lane that a guided episode looks at, at least: 9 settling times ahead."""
-
-
 LOST_AFTER = 6
 """Decisions for which an agent is shut out until it is lost."""
 LOST_BEYOND = 8.0
@@ -59,9 +57,7 @@ class Squad:
         self.heard = np.zeros((config.worlds, scenario.agents, *self._sense().shape[1:]), dtype=np.float32)
         self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
         self.loss = np.zeros(config.worlds)  # share of messages missed
-        self.bins = np.zeros(
-            config.worlds, dtype=np.int64
-        )  # of lanes, that the look-ahead of a guided episode sees; 0: not guided
+        self.bins = np.zeros(config.worlds, dtype=np.int64)  # of lanes, that a guided episode looks at; 0: not guided
         self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
         self.end = np.full(config.worlds, scenario.mission_steps)  # mission step from which no decision is left
         self._restart(np.ones(config.worlds, dtype=bool))
