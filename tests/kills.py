@@ -200,7 +200,15 @@ class Killer:
         faults += self.leftovers(name, out)
         faults += differences(_output(name, self.folder / f"{name}-whole"), _output(name, out))
         faults += [f"left: {path.name}" for path in self.folder.rglob("*") if path.name.startswith(out.name) and _temporary(path)]
-        return {"command": name, "engine": self.engine, "kills": len(moments), "at": moments, "whom": struck, "kept": kept, "faults": faults}
+        return {
+            "command": name,
+            "engine": self.engine,
+            "kills": len(moments),
+            "at": moments,
+            "whom": struck,
+            "kept": kept,
+            "faults": faults,
+        }
 
     def leftovers(self, name: str, out: Path) -> list[str]:
         """Processes of the command that stay, and files under final names that are not whole."""
