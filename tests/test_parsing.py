@@ -115,6 +115,10 @@ WRONG_WORDS = {
     "video nothing.mcap": "cannot read nothing.mcap: No such file or directory",
     "run nothing.toml": "cannot read nothing.toml: No such file or directory",
     "run --supervisor nothing.py:Mine": "cannot read nothing.py: No such file or directory",
+    "suite --from nowhere": "nowhere holds no results of the suite: cannot read nowhere/suite.json: No such file or directory",
+    "study --from nowhere": "cannot read nowhere/study.csv: No such file or directory",
+    "train --resume nowhere": "nowhere holds no run to resume: there is no resume.safetensors",
+    "ship nowhere name": "cannot read nowhere/checkpoint/best.safetensors: No such file or directory",
 }
 HEAVY = """
 import json, sys

@@ -171,6 +171,19 @@ def _existing(text: str) -> Path:
     return Path(text)
 
 
+def _folder_of(file: str, said: str) -> PrimitiveConstructorSpec[Any]:
+    """A folder that holds a file; ``said`` is what is wrong with ``{folder}`` where ``{path}`` is not there."""
+
+    def check(text: str) -> Path:
+        try:
+            check_there(Path(text) / file, text)
+        except ConfigurationError:
+            raise ConfigurationError(said.format(folder=text, path=Path(text) / file)) from None
+        return Path(text)
+
+    return _primitive(check, "PATH")
+
+
 def _unset(metavar: str) -> Any:
     """Marks an option that has no value unless it is given; the help says nothing of a default."""
     return arg(metavar=metavar, help_behavior_hint="")
@@ -212,3 +225,14 @@ VariantNames = Annotated[tuple[Annotated[str, _one(_VARIANT)], ...], _shown(_VAR
 CalibratedNames = Annotated[tuple[Annotated[str, _one(_CALIBRATED)], ...], _shown(_CALIBRATED)]
 SomeKind = Annotated[Annotated[str, _one(_LISTED)] | None, _shown(_LISTED, "KIND")]
 ExistingPath = Annotated[Path, _primitive(_existing, "PATH")]
+_MISSING = "cannot read {path}: No such file or directory"
+_SUITE_FOLDER = _folder_of("suite.json", f"{{folder}} holds no results of the suite: {_MISSING}")
+SuiteSource = Annotated[Annotated[Path, _SUITE_FOLDER] | None, arg(name="from", metavar="PATH", help_behavior_hint="")]
+StudySource = Annotated[
+    Annotated[Path, _folder_of("study.csv", _MISSING)] | None, arg(name="from", metavar="PATH", help_behavior_hint="")
+]
+SavedRun = Annotated[
+    Annotated[Path, _folder_of("resume.safetensors", "{folder} holds no run to resume: there is no resume.safetensors")] | None,
+    _unset("PATH"),
+]
+TrainedRun = Annotated[Path, _folder_of("checkpoint/best.safetensors", _MISSING)]
