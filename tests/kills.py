@@ -84,6 +84,26 @@ TARGETS = {
         ),
         engines=True,
     ),
+    "suite": Target(
+        (
+            "suite",
+            "--missions",
+            "field",
+            "gates",
+            "--supervisors",
+            "fsams",
+            "fixed",
+            "--compositions",
+            "set-based",
+            "null-space",
+            "--layouts",
+            "4",
+            "--overwrite",
+            "--out",
+            "OUT",
+        ),
+        engines=True,
+    ),
     "study": Target(
         ("study", "--variants", "marlms", "vdn", "--seeds", "1", "--budget", "3200", "--out", "OUT", "--set", *TINY),
     ),
@@ -300,12 +320,7 @@ def content(path: Path) -> Any:
         case ".mcap":
             from marlbc_mj.recording.reader import read_log
 
-            log = vars(read_log(path))
-            return {
-                name: value.tobytes() if isinstance(value, np.ndarray) else value
-                for name, value in log.items()
-                if name != "decision_ms"
-            }
+            return {name: _plain(value) for name, value in vars(read_log(path)).items() if name != "decision_ms"}
         case ".safetensors":
             from marlbc_mj.policies.checkpoint import read_arrays
 
@@ -316,6 +331,13 @@ def content(path: Path) -> Any:
     if path.stat().st_size == 0 and path.name not in ("lock", "DONE"):
         raise ValueError("empty")
     return None
+
+
+def _plain(value: Any) -> Any:
+    """Arrays as bytes, within tuples too, so that all of it can be compared."""
+    if isinstance(value, tuple):
+        return tuple(map(_plain, value))
+    return value.tobytes() if isinstance(value, np.ndarray) else value
 
 
 def _timeless(value: Any) -> Any:

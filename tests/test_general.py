@@ -370,7 +370,7 @@ def test_lost_messages_age() -> None:
 
 def test_the_command_refuses_what_it_cannot_train(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for options, said in (
-        (["--preset", "paper"], "neither presets nor devices"),
+        (["--preset", "paper"], "has no presets"),
         (["--set", "teams=wedge-1"], "at least 2 agents"),
         (["--set", "nonsense=1"], "unknown setting"),
     ):
@@ -412,3 +412,15 @@ def test_it_flies_over_any_network(changes) -> None:
     taken = decisions(scenario)
     assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
     np.testing.assert_array_equal(decisions(scenario, worlds=1)[:, 0], taken[:, 0])
+
+
+def test_all_errors_count_once_values_settle() -> None:
+    """Before the share ``settle`` of the budget negative errors count half, from then on in full."""
+    trainer = GeneralTrainer(replace(SMALL, settle=0.5))
+    trainer.advance()
+    trainer.advance()
+    assert trainer.share < 0.5 and trainer.learner.treatment == "hysteretic"
+    while trainer.share < 0.5:
+        trainer.advance()
+    trainer.advance()
+    assert trainer.learner.treatment == "plain"

@@ -4,6 +4,7 @@ import random
 from pathlib import Path
 
 import kills
+import numpy as np
 import pytest
 
 
@@ -39,3 +40,9 @@ def test_what_is_wrong_is_seen(tmp_path: Path) -> None:
     assert [fault.split(":")[0] for fault in kills.torn(other)] == ["a.json is torn", "b.txt is torn"]
     (other / "a.json").write_text('{"a": 2}')
     assert kills.differences(whole, other) == ["b.txt is in one only", "a.json differs"]
+
+
+def test_logs_differ_where_an_array_does(tmp_path: Path) -> None:
+    """Arrays that stand in tuples, as those of substeps do, are compared like the others."""
+    one, other = (kills._plain((np.arange(3.0), (np.array([value]), "name"))) for value in (1.0, 2.0))
+    assert one == kills._plain((np.arange(3.0), (np.array([1.0]), "name"))) and one != other

@@ -28,8 +28,7 @@ class BaseTrainer(ABC):
     """
 
     def __init__(self, config: TrainConfig) -> None:
-        if config.device == "cuda" and not torch.cuda.is_available():
-            raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
+        check_device(config.device)
         self.config = config
         self.scenario = make_scenario(config.scenario)
         self.batch = FormationBatch(
@@ -141,6 +140,16 @@ class BaseTrainer(ABC):
     def plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""
         return [(self, "state"), *((self.batch, name) for name in ("cut", "last"))]
+
+
+def check_device(device: str) -> None:
+    """Refuse a device of networks that this machine does not have.
+
+    Raises:
+        ConfigurationError: it is cuda, and torch finds none.
+    """
+    if device == "cuda" and not torch.cuda.is_available():
+        raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
 
 
 def single_thread() -> None:

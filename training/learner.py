@@ -46,6 +46,7 @@ class Learner:
         mask: np.ndarray | None = None,
     ) -> None:
         self.config = config
+        self.treatment = config.learner  # of negative TD errors, see td_weight
         self.generator = generator
         networks, outputs = self.shape(agents, actions)
         self.network = TeamNetwork(
@@ -93,7 +94,7 @@ class Learner:
         ahead, least = self._masked(*self.targets.heads(self.tensor(batch.next_state)))
         chosen, target = self.estimates(batch, now, ahead)
         error = (target - chosen).detach()
-        weight = td_weight(error, self.tensor(batch.leniency.T), self.config.learner, self.generator)
+        weight = td_weight(error, self.tensor(batch.leniency.T), self.treatment, self.generator)
         if batch.weight is not None:
             weight = weight * self.tensor(batch.weight.T)
         errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)

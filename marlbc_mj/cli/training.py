@@ -3,7 +3,7 @@
 import sys
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from tyro.conf import OmitArgPrefixes, Positional
 
@@ -103,10 +103,14 @@ class TrainCommand:
         from marlbc_mj.training.general.config import GeneralConfig
         from marlbc_mj.util.changes import with_settings
 
-        if self.preset != "fast" or self.device is not None:
-            raise ConfigurationError(f"{self.method} has neither presets nor devices; leave out --preset and --device")
-        given = {name: getattr(self, name) for name in ("budget", "threads") if getattr(self, name) is not None}
-        return with_settings(GeneralConfig(seed=self.seed, **given), self.set)
+        if self.preset != "fast":
+            raise ConfigurationError(f"{self.method} has no presets; leave out --preset")
+        return with_settings(GeneralConfig(seed=self.seed, **self.given()), self.set)
+
+    def given(self) -> dict[str, Any]:
+        """Settings that have an option of their own, where it was given."""
+        options = {"budget": self.budget, "threads": self.threads, "device": self.device}
+        return {name: value for name, value in options.items() if value is not None}
 
     def refuse_others(self) -> None:
         """A resumed run has its own settings.
@@ -129,8 +133,7 @@ class TrainCommand:
 
         if self.method not in METHODS:
             raise unknown("method", self.method, (*METHODS, GENERAL))
-        given = {name: getattr(self, name) for name in ("budget", "threads", "device") if getattr(self, name) is not None}
-        changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **given}
+        changes = {**METHODS[self.method][0], "method": self.method, "seed": self.seed, **self.given()}
         config = make_config(self.preset, **changes)
         return with_settings(config, self.set)
 

@@ -88,6 +88,8 @@ class GeneralConfig:
     """Memory of the running mean of the weights, which the policy is made of."""
     learner: Literal["lenient", "hysteretic", "plain"] = "hysteretic"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
+    settle: Annotated[float, SHARE] = 1.0
+    """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
     cool_by: Annotated[float, POSITIVE] = 0.5
     """Share of the budget after which the temperature is 0.05."""
     hold: Annotated[int, AT_LEAST_ONE] = 6
@@ -115,6 +117,8 @@ class GeneralConfig:
     """Held-out layouts of each family per evaluation."""
     threads: Annotated[int, AT_LEAST_ONE] = 1
     """Threads of the simulation."""
+    device: Literal["cpu", "cuda"] = "cpu"
+    """Device of the network: cpu or cuda."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -169,6 +173,7 @@ def learner_config(config: GeneralConfig) -> TrainConfig:
         together=config.together,
         agreement=0.0,
         least_exploration=config.least_exploration,
+        device=config.device,
     )
 
 

@@ -9,7 +9,7 @@ import torch
 
 from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
-from marlbc_mj.training.base import prefixed, single_thread, unprefixed
+from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
@@ -28,10 +28,11 @@ class GeneralTrainer:
         config: configuration of the run.
 
     Raises:
-        ConfigurationError: a scenario or controller that cannot be used.
+        ConfigurationError: a scenario, controller or device that cannot be used.
     """
 
     def __init__(self, config: GeneralConfig) -> None:
+        check_device(config.device)
         self.config = config
         learning = learner_config(config)
         self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
@@ -115,6 +116,7 @@ class GeneralTrainer:
     def _learn(self) -> None:
         config = self.config
         rate = config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * (1.0 - self.share)
+        self.learner.treatment = "plain" if self.share >= config.settle else config.learner
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
             self.error = self.learner.update(batch, rate)
