@@ -44,6 +44,11 @@ def blocks(page: Path) -> list[Block]:
     return [Block(*found) for found in FENCE.findall(page.read_text())]
 
 
+def joined(text: str) -> list[str]:
+    """Lines of shell; one that ends with a backslash goes on in the next."""
+    return text.replace("\\\n", " ").splitlines()
+
+
 def run_page(page: Path, folder: Path) -> None:
     """Write the files of a page, then run its Python as one module and its commands, both in reading order."""
     scripts, commands = [], []
@@ -53,7 +58,7 @@ def run_page(page: Path, folder: Path) -> None:
         elif block.language == "python":
             scripts.append(block.text)
         elif block.language == "sh":
-            commands += [shlex.split(line) for line in block.text.splitlines()]
+            commands += [shlex.split(line) for line in joined(block.text)]
     (folder / "how_to.py").write_text("\n".join(scripts))
     runpy.run_path(str(folder / "how_to.py"), run_name="how_to")
     for command in commands:
@@ -152,7 +157,7 @@ def anchors(page: Path) -> set[str]:
 def test_links_lead_somewhere(page):
     """Relative links to files, headings and names of the reference, in a form that a repository's host understands, too."""
     assert not re.search(r"\]\[[^]]", prose(page)), "a cross-reference that only the site resolves"
-    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", prose(page)):
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page))):
         file, _, anchor = link.partition("#")
         target = page.parent / file if file else page
         assert target.exists(), link
@@ -162,7 +167,7 @@ def test_links_lead_somewhere(page):
 def shown_commands(page: Path) -> list[str]:
     """Lines of shell, in blocks and in the text, without comments."""
     fenced = [block for language, block in FENCED.findall(page.read_text()) if language in ("sh", "text", "")]
-    lines = "\n".join(fenced).replace("\\\n", " ").splitlines() + re.findall(r"`([^`\n]+)`", prose(page))
+    lines = joined("\n".join(fenced)) + re.findall(r"`([^`\n]+)`", prose(page))
     return [line.partition(" #")[0].strip() for line in lines]
 
 
