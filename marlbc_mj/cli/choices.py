@@ -231,7 +231,7 @@ SuiteSource = Annotated[Annotated[Path, _SUITE_FOLDER] | None, arg(name="from", 
 StudySource = Annotated[
     Annotated[Path, _folder_of("study.csv", _MISSING)] | None, arg(name="from", metavar="PATH", help_behavior_hint="")
 ]
-SavedRun = Annotated[
+ResumeFolder = Annotated[
     Annotated[Path, _folder_of("resume.safetensors", "{folder} holds no run to resume: there is no resume.safetensors")] | None,
     _unset("PATH"),
 ]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.choices import MethodName, PresetName, SavedRun, SomeCount, SomeDevice, SomePath, TrainingSettings
+from marlbc_mj.cli.choices import MethodName, PresetName, ResumeFolder, SomeCount, SomeDevice, SomePath, TrainingSettings
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
@@ -29,7 +29,7 @@ class TrainCommand:
     """Random seed of networks, exploration and starts."""
     out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
-    resume: SavedRun = None
+    resume: ResumeFolder = None
     """Folder of an interrupted run, which continues bit for bit with its own settings."""
     budget: SomeCount = None
     """Mission steps, over all worlds."""
