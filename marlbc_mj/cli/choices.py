@@ -115,6 +115,19 @@ def check_setting(kind: Kind, text: str) -> str:
     return text
 
 
+def check_team(word: str) -> str:
+    """``FORMATION-AGENTS``, or that and ``-lines``, if there is such a formation. Missions read the rest.
+
+    Raises:
+        ConfigurationError: another form, or an unknown formation.
+    """
+    formation, _, agents = word.removesuffix("-lines").partition("-")
+    if not agents.isdecimal():
+        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {word!r}")
+    check_word(_FORMATION, formation)
+    return word
+
+
 def looks_like_file(word: str) -> bool:
     """Whether a word can only be meant as a path or as something in a file."""
     return any(mark in word for mark in "/.:\\")
@@ -212,6 +225,7 @@ SomeCompositions = Annotated[tuple[Annotated[str, _one(_COMPOSITION)], ...] | No
 SomeReference = Annotated[Annotated[str, _one(_REFERENCE)] | None, _shown(_REFERENCE, "MODE")]
 SomeDisturbance = Annotated[Annotated[str, _one(_DISTURBANCE)] | None, _shown(_DISTURBANCE, "DISTURBANCE")]
 SomeFormation = Annotated[Annotated[str, _one(_FORMATION)] | None, _shown(_FORMATION, "FORMATION")]
+TeamNames = Annotated[tuple[Annotated[str, _primitive(check_team, "TEAM")], ...], arg(metavar="TEAM ...")]
 SomeSplit = Annotated[Annotated[str, _one(_SPLIT)] | None, _shown(_SPLIT, "SPLIT")]
 SomeDevice = Annotated[Annotated[str, _one(_DEVICE)] | None, _shown(_DEVICE, "DEVICE")]
 ScenarioSettings = Annotated[tuple[Annotated[str, _setting(_SETTING)], ...], _shown(_SETTING)]
