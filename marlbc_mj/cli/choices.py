@@ -184,17 +184,22 @@ def _existing(text: str) -> Path:
     return Path(text)
 
 
+def check_holds(folder: Path, file: str, said: str) -> Path:
+    """The folder, if it holds the file.
+
+    Raises:
+        ConfigurationError: it does not; ``said`` is what is wrong with ``{folder}`` where ``{path}`` is not there.
+    """
+    try:
+        check_there(folder / file, str(folder))
+    except ConfigurationError:
+        raise ConfigurationError(said.format(folder=folder, path=folder / file)) from None
+    return folder
+
+
 def _folder_of(file: str, said: str) -> PrimitiveConstructorSpec[Any]:
-    """A folder that holds a file; ``said`` is what is wrong with ``{folder}`` where ``{path}`` is not there."""
-
-    def check(text: str) -> Path:
-        try:
-            check_there(Path(text) / file, text)
-        except ConfigurationError:
-            raise ConfigurationError(said.format(folder=text, path=Path(text) / file)) from None
-        return Path(text)
-
-    return _primitive(check, "PATH")
+    """A folder that holds a file, see :func:`check_holds`."""
+    return _primitive(lambda text: check_holds(Path(text), file, said), "PATH")
 
 
 def _unset(metavar: str) -> Any:
@@ -244,9 +249,5 @@ _SUITE_FOLDER = _folder_of("suite.json", f"{{folder}} holds no results of the su
 SuiteSource = Annotated[Annotated[Path, _SUITE_FOLDER] | None, arg(name="from", metavar="PATH", help_behavior_hint="")]
 StudySource = Annotated[
     Annotated[Path, _folder_of("study.csv", _MISSING)] | None, arg(name="from", metavar="PATH", help_behavior_hint="")
-]
-ResumeFolder = Annotated[
-    Annotated[Path, _folder_of("resume.safetensors", "{folder} holds no run to resume: there is no resume.safetensors")] | None,
-    _unset("PATH"),
 ]
 TrainedRun = Annotated[Path, _folder_of("checkpoint/best.safetensors", _MISSING)]
