@@ -37,7 +37,7 @@ class GeneralConfig:
 
     seed: Annotated[int, NOT_NEGATIVE] = 0
     """Random seed of network, exploration, layouts and the draws from the replay buffer."""
-    budget: Annotated[int, AT_LEAST_ONE] = 2_400_000
+    budget: Annotated[int, AT_LEAST_ONE] = 1_600_000
     """Mission steps, over all worlds."""
     start: str = ""
     """Checkpoint of a general policy whose network learning begins with; a random one by default."""
@@ -78,17 +78,17 @@ class GeneralConfig:
     """Step size of Adam at the start of the budget."""
     final_learning_rate: Annotated[float, POSITIVE] = 3e-5
     """Step size of Adam at the end of the budget; linear in between."""
-    batch: Annotated[int, AT_LEAST_ONE] = 512
+    batch: Annotated[int, AT_LEAST_ONE] = 1024
     """Transitions of single agents per update."""
     updates: Annotated[int, AT_LEAST_ONE] = 8
     """Updates after each decision of all worlds."""
     capacity: Annotated[int, AT_LEAST_ONE] = 400_000
     """Transitions of single agents in the replay buffer."""
-    smoothing: Annotated[float, SHARE] = 0.998
+    smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
     learner: Literal["lenient", "hysteretic", "plain"] = "hysteretic"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
-    settle: Annotated[float, SHARE] = 1.0
+    settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
     cool_by: Annotated[float, POSITIVE] = 0.5
     """Share of the budget after which the temperature is 0.05."""
@@ -109,7 +109,7 @@ class GeneralConfig:
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
 
-    evaluate_every: Annotated[int, AT_LEAST_ONE] = 1_200_000
+    evaluate_every: Annotated[int, AT_LEAST_ONE] = 800_000
     """Mission steps between evaluations on held-out layouts."""
     save_every: Annotated[float, NOT_NEGATIVE] = 120.0
     """Time between saves for --resume [s]; a save of the default buffer takes 0.4 GB."""
