@@ -44,7 +44,7 @@ class Textbook:
 
     def gaussians(self, z) -> np.ndarray:
         """Psi_k(z) = exp(-|z - c_k|^2 / width^2), every coordinate of c_k the same."""
-        return np.array([np.exp(-np.sum((z - c) ** 2) / self.gains.width**2) for c in self.centres])
+        return np.exp(-((z - self.centres[:, None]) ** 2).sum(axis=1) / self.gains.width**2)
 
     def step(self, p, v, p_r, v_r, limit, h) -> np.ndarray:
         g = self.gains

@@ -53,6 +53,7 @@ def equal(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
 
 
+@pytest.mark.usefixtures("quick_hash")
 @pytest.mark.parametrize("changes", [{}, {"hash": "plain", "learner": "hysteretic", "actions": "orders", "state": "printed"}])
 def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     config = small(**changes)
@@ -72,6 +73,7 @@ def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     assert equal(*(trainer.snapshot()[0] for trainer in (one, other)))
 
 
+@pytest.mark.usefixtures("quick_hash")
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core only")
 def test_what_is_learned_does_not_depend_on_the_threads():
     """With two, the networks learn while the worlds move: the same numbers to the bit, also where one goes on from the other's
@@ -98,6 +100,7 @@ def test_what_is_learned_does_not_depend_on_the_threads():
         two.advance()
 
 
+@pytest.mark.usefixtures("quick_hash")
 @pytest.mark.parametrize("method", ["marlms", "mappo"])
 def test_torch_has_one_thread_wherever_it_computes(method, monkeypatch):
     """However many the worlds have, whose thread pool sets the number for torch too: sums must not depend on it."""
