@@ -178,7 +178,7 @@ class Killer:
         seconds, out = self.reference(name), self.folder / f"{name}-killed"
         _remove(out)
         faults: list[str] = []
-        moments, kept = [], []
+        moments, kept, struck = [], [], []
         for _ in range(rng.choice((1, 2, 3, 4))):
             process = self.start(name, out)
             moments.append(_wait(process, out, seconds, TARGETS[name].engines, rng))
@@ -186,12 +186,13 @@ class Killer:
                 moments.pop()
                 break
             whom = rng.choice(("study", "study", "group", "worker"))
-            _strike(process, whom, rng)
+            struck.append(_strike(process, whom, rng))
             if whom == "worker":  # the command itself goes on, or ends with an error
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(MOST_SECONDS)
             process.wait()
-            faults += self.leftovers(name, out)
+            said = (self.folder / "said.txt").read_text()[-300:]
+            faults += [f"after a kill of {struck[-1]}, which said {said!r}: {fault}" for fault in self.leftovers(name, out)]
             kept.append(_kept(out))
         status, _ = self.finish(name, out)
         if status != 0:
@@ -199,14 +200,22 @@ class Killer:
         faults += self.leftovers(name, out)
         faults += differences(_output(name, self.folder / f"{name}-whole"), _output(name, out))
         faults += [f"left: {path.name}" for path in self.folder.rglob("*") if path.name.startswith(out.name) and _temporary(path)]
-        return {"command": name, "engine": self.engine, "kills": len(moments), "at": moments, "kept": kept, "faults": faults}
+        return {
+            "command": name,
+            "engine": self.engine,
+            "kills": len(moments),
+            "at": moments,
+            "whom": struck,
+            "kept": kept,
+            "faults": faults,
+        }
 
     def leftovers(self, name: str, out: Path) -> list[str]:
         """Processes of the command that stay, and files under final names that are not whole."""
         until = time.monotonic() + ORPHANS_END
         while (alive := list(self.processes())) and time.monotonic() < until:
             time.sleep(0.2)
-        names = [_command_line(process) for process in alive]
+        names = [_described(process) for process in alive]
         for process in alive:
             with suppress(ProcessLookupError):
                 os.kill(process, signal.SIGKILL)
@@ -243,14 +252,17 @@ def _wait(process: subprocess.Popen[str], out: Path, seconds: float, stores: boo
     return time.monotonic() - began
 
 
-def _strike(process: subprocess.Popen[str], whom: str, rng: random.Random) -> None:
-    """SIGKILL to the study's process, to all processes of its session, or to one of its workers."""
+def _strike(process: subprocess.Popen[str], whom: str, rng: random.Random) -> str:
+    """SIGKILL to the study's process, to all processes of its session, or to one of its workers; what was killed."""
     if whom == "group":
         os.killpg(process.pid, signal.SIGKILL)
-        return
+        return whom
     workers = [child for child in _descendants(process.pid) if whom == "worker"]
+    victim = rng.choice(workers) if workers else process.pid
+    name = _command_line(victim) if workers else "the study"
     with suppress(ProcessLookupError):
-        os.kill(rng.choice(workers) if workers else process.pid, signal.SIGKILL)
+        os.kill(victim, signal.SIGKILL)
+    return name
 
 
 def _descendants(parent: int) -> list[int]:
@@ -277,6 +289,15 @@ def _command_line(process: int) -> str:
     with suppress(OSError):
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:200]
     return ""
+
+
+def _described(process: int) -> str:
+    """A process as in a list of processes: number, state, parent, time since its start [s] and command line."""
+    with suppress(OSError, IndexError):
+        entries = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+        up = float(Path("/proc/uptime").read_text().split()[0]) - int(entries[19]) / os.sysconf("SC_CLK_TCK")
+        return f"{process} {entries[0]} {entries[1]} {up:.0f} s {_command_line(process).strip()}"
+    return str(process)
 
 
 def _output(name: str, out: Path) -> Path:

@@ -61,9 +61,9 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 for a wrong setting, 3 for a failed run, see :func:`~marlbc_mj.cli.ending.in_one_line`."""
     with in_one_line("marlbc"):
         if (sys.argv[1:] if arguments is None else arguments) == ["--version"]:
-            from importlib.metadata import version
+            from marlbc_mj.util.provenance import versions
 
-            print(f"marlbc {version('marlbc-mj')}")
+            print(f"marlbc {versions()['marlbc-mj']}")
             return
         command: Any = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
         with hushed(command.output.quiet):
