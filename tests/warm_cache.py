@@ -69,7 +69,8 @@ def rest() -> None:
 
 def state() -> str:
     """All that compiled code is kept for: sources, pinned packages, Python, and the folder where it is kept."""
-    times = [path.stat().st_mtime_ns for path in (*(ROOT / "marlbc_mj").rglob("*.py"), ROOT / "constraints.txt")]
+    sources = [path for folder in ("marlbc_mj", "tasks", "training") for path in (ROOT / folder).rglob("*.py")]
+    times = [path.stat().st_mtime_ns for path in (*sources, ROOT / "constraints.txt")]
     return f"{len(times)} {max(times)} {sys.version} {os.environ.get('NUMBA_CACHE_DIR')}"
 
 
