@@ -176,7 +176,7 @@ def address(law: Law, signature: Any) -> int:
     return cast(int, cast(Any, law).address)
 
 
-def _find_address(law: Law, signature: Any) -> int:
+def _find_address(law: Any, signature: Any) -> int:
     """:func:`address` of a compiled law that was declared as this kind."""
     name, line = name_of(law), raising_line(law, set())
     if line is not None:
