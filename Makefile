@@ -78,11 +78,12 @@ wheel-test: wheel
 	@$(BIN)/python tests/wheel.py dist --install out/wheel
 	@$(BIN)/python tests/wheel.py dist --install out/wheel --extras onnx parquet robots
 
-# The tool is installed here and not with the rest: only this target needs it.
+# The tool is installed here and not with the rest: only this target needs it. With --quiet mkdocs would count no warnings,
+# and --strict would refuse nothing.
 docs: venv
 	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings_handlers.python' 2>/dev/null || \
 		$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
-	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict --site-dir out/docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir out/docs
 	@echo out/docs/index.html
 
 gallery: venv

@@ -94,12 +94,12 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
 
     As Gymnasium's SyncVectorEnv has it: what the last decision of an episode led to is in ``infos["final_obs"]`` and
     ``infos["final_info"]``, valid where ``infos["_final_obs"]`` is true; the terms in ``infos`` itself are of the other worlds.
+    Parameters that are not listed are those of :class:`PaperFormation`.
 
     Args:
         num_envs: B.
         threads: the worlds are shared out over this many.
         starts: where episodes begin; at the start of the mission by default.
-        scenario, controller, state, actions, interval, render_mode, **changes: as for :class:`PaperFormation`.
 
     Raises:
         ConfigurationError: a setting that cannot be run.

@@ -4,12 +4,14 @@ import re
 import runpy
 import shlex
 from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
 import pytest
 
-from marlbc_mj.cli import main
+from marlbc_mj.cli import Command, main, parsing
+from marlbc_mj.cli.choices import looks_like_file
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.core.disturbances import DISTURBANCES
 from marlbc_mj.studies.learners import VARIANTS
@@ -18,9 +20,12 @@ from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.rivals import LEARNERS
 
 DOCS = Path(__file__).parent.parent / "docs"
+PAGES = [DOCS.parent / "README.md", DOCS.parent / "CONTRIBUTING.md", *sorted(DOCS.rglob("*.md"))]
 HOW_TO = sorted((DOCS / "how-to").glob("*.md"))
 FENCE = re.compile(r'^```(\w+)(?: title="([\w./-]+)")?\n(.*?)^```$', re.DOTALL | re.MULTILINE)
 MEDIA = re.compile(r"""(?:!\[[^]]*\]\(|src="|poster=")([\w./-]+\.(?:png|jpg|mp4|webp|gif))""")
+FENCED = re.compile(r"^ *```(\w*)[^\n]*\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+PLACEHOLDER = re.compile(r"[A-Z=_]+|\.\.\.")
 MOST_LINES = 60
 MOST_BYTES, MOST_BYTES_TOGETHER = 150_000, 1_500_000
 
@@ -39,6 +44,11 @@ def blocks(page: Path) -> list[Block]:
     return [Block(*found) for found in FENCE.findall(page.read_text())]
 
 
+def joined(text: str) -> list[str]:
+    """Lines of shell; one that ends with a backslash goes on in the next."""
+    return text.replace("\\\n", " ").splitlines()
+
+
 def run_page(page: Path, folder: Path) -> None:
     """Write the files of a page, then run its Python as one module and its commands, both in reading order."""
     scripts, commands = [], []
@@ -48,7 +58,7 @@ def run_page(page: Path, folder: Path) -> None:
         elif block.language == "python":
             scripts.append(block.text)
         elif block.language == "sh":
-            commands += [shlex.split(line) for line in block.text.splitlines()]
+            commands += [shlex.split(line) for line in joined(block.text)]
     (folder / "how_to.py").write_text("\n".join(scripts))
     runpy.run_path(str(folder / "how_to.py"), run_name="how_to")
     for command in commands:
@@ -127,3 +137,83 @@ def test_names_in_the_reference_exist():
 def _found(name: str) -> bool:
     module, _, attribute = name.rpartition(".")
     return hasattr(import_module(module), attribute)
+
+
+def prose(page: Path) -> str:
+    """A page without its fenced blocks."""
+    return FENCED.sub("", page.read_text())
+
+
+def anchors(page: Path) -> set[str]:
+    """What can be linked to on a page: its headings, and the names that the reference shows there."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
+    plain = (re.sub(r"\[([^]]*)\]\([^)]*\)|[^\w\s-]", r"\1", heading) for heading in headings)
+    return {re.sub(r"[-\s]+", "-", each.strip().lower()) for each in plain} | set(
+        re.findall(r"^::: (\S+)", page.read_text(), re.M)
+    )
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS.parent).as_posix())
+def test_links_lead_somewhere(page):
+    """Relative links to files, headings and names of the reference, in a form that a repository's host understands, too."""
+    assert not re.search(r"\]\[[^]]", prose(page)), "a cross-reference that only the site resolves"
+    for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", re.sub(r"`[^`\n]*`", "", prose(page))):
+        file, _, anchor = link.partition("#")
+        target = page.parent / file if file else page
+        assert target.exists(), link
+        assert not anchor or {anchor, anchor.rpartition(".")[0]} & anchors(target), link
+
+
+def shown_commands(page: Path) -> list[str]:
+    """Lines of shell, in blocks and in the text, without comments."""
+    fenced = [block for language, block in FENCED.findall(page.read_text()) if language in ("sh", "text", "")]
+    lines = joined("\n".join(fenced)) + re.findall(r"`([^`\n]+)`", prose(page))
+    return [line.partition(" #")[0].strip() for line in lines]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS.parent).as_posix())
+def test_commands_can_be_given(page):
+    """Commands, options and names of every ``marlbc`` line; targets of make; modules and scripts that Python runs."""
+    makefile = (DOCS.parent / "Makefile").read_text()
+    for line in shown_commands(page):
+        if line.startswith("marlbc "):
+            check_command(line)
+        for target in re.findall(r"^make ([a-z-]+)", line):
+            assert f"\n{target}:" in makefile, line
+        for module in re.findall(r"^python -m ([\w.]+)", line):
+            assert find_spec(module), line
+        for script in re.findall(r"^python (\w[\w/.]+)", line):
+            assert (DOCS.parent / script).exists(), line
+
+
+def check_command(line: str) -> None:
+    """Fail for what the command line would refuse; files need not be there, and capitals stand for anything."""
+    words = [word for word in shlex.split(line)[1:] if not PLACEHOLDER.fullmatch(word)]
+    chosen = parsing.choose_command(Command, words, "marlbc")
+    given = {word.partition("=")[0] for word in chosen.rest if word.startswith("--")}
+    known = {*parsing.options_of(chosen.kind), "--help", "--version", "--tyro-print-completion", "--tyro-write-completion"}
+    assert given <= known, line
+    assert chosen.kind is not Command or not words or words[0].startswith("--"), line
+    parsing.check_words(chosen._replace(rest=[word for word in chosen.rest if not looks_like_file(word)]))
+
+
+def test_the_site_is_built_strictly():
+    """With --quiet mkdocs counts no warnings, and --strict refuses nothing."""
+    (build,) = (line for line in (DOCS.parent / "Makefile").read_text().splitlines() if "mkdocs build" in line)
+    assert "--strict" in build and "--quiet" not in build
+    assert "anchors: warn" in (DOCS.parent / "mkdocs.yml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("variable", "urls", "address"),
+    [
+        ("https://host/a/b.git", {"Repository": "https://host/c/d"}, "https://host/a/b"),
+        ("", {"Repository": "https://host/c/d/"}, "https://host/c/d"),
+        ("https://name:word@host/a/b", {}, ""),
+        ("git@host:a/b.git", {}, ""),
+    ],
+    ids=["variable", "project", "password", "no page"],
+)
+def test_the_site_links_to_the_repository(variable, urls, address, monkeypatch):
+    monkeypatch.setenv("REPOSITORY_URL", variable)
+    assert runpy.run_path(str(DOCS / "site_facts.py"))["repository"](urls) == address

@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.training.run import write_table
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.files import MANIFEST, alone_in, remove_leftovers, staged_file, staged_folder, write_json
+from marlbc_mj.util.files import MANIFEST, alone_in, check_writable, remove_leftovers, staged_file, staged_folder, write_json
 
 WRITERS = {
     "arrays": lambda path, size: write_arrays(path.with_suffix(".safetensors"), {"x": np.zeros(size)}, {}),
@@ -278,3 +279,15 @@ def test_one_process_writes_into_a_folder(tmp_path):
     with alone_in(out, overwrite=True):
         pass
     assert (out / "a.json").exists()
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):
+    """The trial leaves no folder; the commands that work for minutes make it first."""
+    check_writable(tmp_path / "new" / "folder" / "a.json", overwrite=False)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").touch()
+    for command in ("oracle", "perf"):
+        with pytest.raises(SystemExit) as stopped:
+            main([command, "--out", str(tmp_path / "file" / "a.json")])
+        said = capsys.readouterr().err
+        assert stopped.value.code == 2 and said.startswith("marlbc: cannot write") and said.count("\n") == 1

@@ -158,6 +158,7 @@ def test_tables_and_windows_are_one_thing(seed):
     [
         ({"scenario": paper(perturbation=Perturbation(start_spread=0.1))}, "without perturbation"),
         ({"scenario": paper(schedule=())}, "no schedule"),
+        ({"seed": -1}, "seed must not be negative, got -1"),
         ({"budget": 0}, "at least the population.* 0 and 64"),
         ({"population": 1}, "at least 2.* 1"),
         (
@@ -165,7 +166,7 @@ def test_tables_and_windows_are_one_thing(seed):
             "no safe schedule",
         ),
     ],
-    ids=["perturbed", "no schedule", "budget", "population", "never safe"],
+    ids=["perturbed", "no schedule", "seed", "budget", "population", "never safe"],
 )
 def test_what_cannot_be_searched_is_refused(changes, message):
     """One clear line."""

@@ -115,6 +115,16 @@ WRONG_WORDS = {
     "video nothing.mcap": "cannot read nothing.mcap: No such file or directory",
     "run nothing.toml": "cannot read nothing.toml: No such file or directory",
     "run --supervisor nothing.py:Mine": "cannot read nothing.py: No such file or directory",
+    "safety --teams grid-nine": "a team is FORMATION-AGENTS, wedge-4 for example, got 'grid-nine'",
+    "safety --teams wedge-4 gird-9-lines": "unknown formation 'gird'; perhaps 'grid'",
+    "bench --seeds 0": "seeds must be at least 1, got 0",
+    "suite --layouts=-1": "layouts must be at least 1, got -1",
+    "safety --seed -1": "seed must not be negative, got -1",
+    "robot gate --workers 0": "workers must be at least 1, got 0",
+    "suite --from nowhere": "nowhere holds no results of the suite: cannot read nowhere/suite.json: No such file or directory",
+    "study --from nowhere": "cannot read nowhere/study.csv: No such file or directory",
+    "train --resume nowhere": "nowhere holds no run to resume: there is no resume.safetensors",
+    "ship nowhere name": "cannot read nowhere/checkpoint/best.safetensors: No such file or directory",
 }
 HEAVY = """
 import json, sys

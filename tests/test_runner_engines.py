@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import kills
 import numpy as np
 import pytest
 from small_studies import Roots, Squares
@@ -43,8 +44,16 @@ def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> No
     """What had ended when a job failed is kept, and the rest follows."""
     with pytest.raises(SimulationError, match="it fell"):
         run_study(Roots(trouble="it fell", once=once), out, engine="ray")
-    said = []
-    done = run_study(Roots(once=once), out, engine="ray", progress=lambda *step: said.append(step))
+    said, of_ray, marked = [], set(), set()
+
+    def look(*step: object) -> None:
+        said.append(step)
+        if guard.TOKEN in os.environ:
+            of_ray.update(kills._descendants(os.getpid()))
+            marked.update(guard.marked(os.environ[guard.TOKEN]))
+
+    done = run_study(Roots(once=once), out, engine="ray", progress=look)
+    assert len(of_ray) >= 4 and of_ray <= marked and guard.TOKEN not in os.environ  # raylet, its store of states, agents
     assert files(out) == whole and all(each.flags.writeable for each in done.results)
     assert said[0][0] == "jobs" and 0 < said[0][1] < 5 and said[-1] == ("jobs", 5, 5)
     assert once.exists() and [path.name for path in out.parent.glob("out*")] == ["out"]

@@ -17,7 +17,7 @@ ZETA = 0.999
 
 
 class Temperatures:
-    """Tables T_i[code][action] of N agents (Palmer et al. 2018), and the largest temperature nu, which decays.
+    """Tables ``T_i[code][action]`` of N agents (Palmer et al. 2018), and the largest temperature nu, which decays.
 
     Args:
         agents: N.

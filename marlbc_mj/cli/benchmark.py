@@ -4,9 +4,9 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.choices import (
     Compositions,
@@ -18,6 +18,7 @@ from marlbc_mj.cli.choices import (
     SomeRange,
     SomeSupervisors,
     SupervisorName,
+    TeamNames,
 )
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.cli.scenario_options import ScenarioOptions
@@ -252,7 +253,7 @@ class SafetyCommand:
 
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
     """Scenarios that draw layouts, or draws around the case study."""
-    teams: Annotated[tuple[str, ...], arg(metavar="TEAM ...")] = ()
+    teams: TeamNames = ()
     """Teams that fly the families with the room that they need, as FORMATION-AGENTS; with -lines behind that, they come to their
     column along the lines of its slots. By default each family has its own team."""
     supervisors: SomeSupervisors = None

@@ -115,6 +115,19 @@ def check_setting(kind: Kind, text: str) -> str:
     return text
 
 
+def check_team(word: str) -> str:
+    """``FORMATION-AGENTS``, or that and ``-lines``, if there is such a formation. Missions read the rest.
+
+    Raises:
+        ConfigurationError: another form, or an unknown formation.
+    """
+    formation, _, agents = word.removesuffix("-lines").partition("-")
+    if not agents.isdecimal():
+        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {word!r}")
+    check_word(_FORMATION, formation)
+    return word
+
+
 def looks_like_file(word: str) -> bool:
     """Whether a word can only be meant as a path or as something in a file."""
     return any(mark in word for mark in "/.:\\")
@@ -171,6 +184,24 @@ def _existing(text: str) -> Path:
     return Path(text)
 
 
+def check_holds(folder: Path, file: str, said: str) -> Path:
+    """The folder, if it holds the file.
+
+    Raises:
+        ConfigurationError: it does not; ``said`` is what is wrong with ``{folder}`` where ``{path}`` is not there.
+    """
+    try:
+        check_there(folder / file, str(folder))
+    except ConfigurationError:
+        raise ConfigurationError(said.format(folder=folder, path=folder / file)) from None
+    return folder
+
+
+def _folder_of(file: str, said: str) -> PrimitiveConstructorSpec[Any]:
+    """A folder that holds a file, see :func:`check_holds`."""
+    return _primitive(lambda text: check_holds(Path(text), file, said), "PATH")
+
+
 def _unset(metavar: str) -> Any:
     """Marks an option that has no value unless it is given; the help says nothing of a default."""
     return arg(metavar=metavar, help_behavior_hint="")
@@ -199,6 +230,7 @@ SomeCompositions = Annotated[tuple[Annotated[str, _one(_COMPOSITION)], ...] | No
 SomeReference = Annotated[Annotated[str, _one(_REFERENCE)] | None, _shown(_REFERENCE, "MODE")]
 SomeDisturbance = Annotated[Annotated[str, _one(_DISTURBANCE)] | None, _shown(_DISTURBANCE, "DISTURBANCE")]
 SomeFormation = Annotated[Annotated[str, _one(_FORMATION)] | None, _shown(_FORMATION, "FORMATION")]
+TeamNames = Annotated[tuple[Annotated[str, _primitive(check_team, "TEAM")], ...], arg(metavar="TEAM ...")]
 SomeSplit = Annotated[Annotated[str, _one(_SPLIT)] | None, _shown(_SPLIT, "SPLIT")]
 SomeDevice = Annotated[Annotated[str, _one(_DEVICE)] | None, _shown(_DEVICE, "DEVICE")]
 ScenarioSettings = Annotated[tuple[Annotated[str, _setting(_SETTING)], ...], _shown(_SETTING)]
@@ -212,3 +244,10 @@ VariantNames = Annotated[tuple[Annotated[str, _one(_VARIANT)], ...], _shown(_VAR
 CalibratedNames = Annotated[tuple[Annotated[str, _one(_CALIBRATED)], ...], _shown(_CALIBRATED)]
 SomeKind = Annotated[Annotated[str, _one(_LISTED)] | None, _shown(_LISTED, "KIND")]
 ExistingPath = Annotated[Path, _primitive(_existing, "PATH")]
+_MISSING = "cannot read {path}: No such file or directory"
+_SUITE_FOLDER = _folder_of("suite.json", f"{{folder}} holds no results of the suite: {_MISSING}")
+SuiteSource = Annotated[Annotated[Path, _SUITE_FOLDER] | None, arg(name="from", metavar="PATH", help_behavior_hint="")]
+StudySource = Annotated[
+    Annotated[Path, _folder_of("study.csv", _MISSING)] | None, arg(name="from", metavar="PATH", help_behavior_hint="")
+]
+TrainedRun = Annotated[Path, _folder_of("checkpoint/best.safetensors", _MISSING)]

@@ -4,11 +4,10 @@ import sys
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes
 
-from marlbc_mj.cli.choices import SomeCount, SomePath, TrainingSettings, VariantNames
+from marlbc_mj.cli.choices import SomeCount, SomePath, StudySource, TrainingSettings, VariantNames
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import note
@@ -30,7 +29,7 @@ class StudyCommand:
     """Processes that share the runs, one thread each."""
     out: SomePath = None
     """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
-    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
+    source: StudySource = None
     """Only make table and figure again, from study.csv and curves.csv in this folder, there or in --out."""
     set: TrainingSettings = ()
     """Any setting of all runs, as for `marlbc train`."""

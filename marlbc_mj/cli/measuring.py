@@ -35,12 +35,10 @@ class PerfCommand:
 
     def run(self) -> None:
         """Measure, print, and write if asked."""
+        _check_writable(self.out, overwrite=self.overwrite)
         from marlbc_mj.studies.perf import PerfStudy
         from marlbc_mj.studies.runner import run_jobs
-        from marlbc_mj.util.files import check_target
 
-        if self.out is not None:
-            check_target(self.out, overwrite=self.overwrite)
         study = PerfStudy(self.rounds)
         results = run_jobs(study, progress=self.output.lines("measuring "))
         self.output.report(study.report(results, None).text, study.gather(results))
@@ -191,6 +189,7 @@ class OracleCommand:
 
     def run(self) -> None:
         """Search, save, and say what was found."""
+        _check_writable(self.out, overwrite=True)
         from marlbc_mj.scenarios import make_scenario
         from marlbc_mj.supervisors.oracle import save_schedule, search
 
@@ -207,3 +206,11 @@ class OracleCommand:
         save_schedule(found, scenario, self.controller, self.out)
         text = f"return {found.total:.0f} after {found.episodes} episodes (schedule of the scenario: {found.scripted})"
         self.output.report(text, {"return": found.total, "episodes": found.episodes, "scripted": found.scripted})
+
+
+def _check_writable(out: Path | None, *, overwrite: bool) -> None:
+    """Refuse a file that cannot be written, before what measures or searches is loaded."""
+    from marlbc_mj.util.files import check_writable
+
+    if out is not None:
+        check_writable(out, overwrite=overwrite)

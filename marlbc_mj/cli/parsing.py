@@ -15,7 +15,11 @@ from tyro.conf import FlagCreatePairsOff, Positional
 from tyro.constructors import PrimitiveConstructorSpec
 
 from marlbc_mj.cli.choices import WrongWord
+from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import nearest_word, one_line
+
+LEAST = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1}
+"""Smallest numbers of options that mean the same in every command."""
 
 
 class Refusal(NamedTuple):
@@ -92,16 +96,28 @@ def check_words(chosen: Chosen) -> None:
     hints = dict(_named_options(chosen.kind))
     own = get_type_hints(chosen.kind, include_extras=True).values()
     hint: Any = next((each for each in own if _POSITIONAL in get_args(each)[1:]), None)
+    name = ""
     for word in chosen.rest:
         if word.startswith("--"):
             name, _, value = word.partition("=")
             hint, words = hints.get(name.replace("_", "-")), [value] if value else []
         else:
             words = [word]
+        if words:
+            check_least(name, words[0])
         constructor = _constructor_of(hint)
         if words and constructor is not None:
             constructor.instance_from_str(words)
             hint = hint if _is_tuple(hint) else None
+
+
+def check_least(option: str, word: str) -> None:
+    """Raise WrongWord for a number below what the option takes in every command. Studies check it, too, once they are loaded."""
+    least = LEAST.get(option)
+    if least is None or not word.removeprefix("-").isdecimal() or int(word) >= least:
+        return
+    bound = f"must be at least {least}" if least else "must not be negative"
+    raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} {bound}, got {int(word)}"))
 
 
 def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:

@@ -1,10 +1,10 @@
 """``marlbc ship``: copy a training run's best checkpoint into the package."""
 
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from tyro.conf import OmitArgPrefixes, Positional
 
+from marlbc_mj.cli.choices import TrainedRun
 from marlbc_mj.cli.output import OutputOptions
 
 
@@ -12,7 +12,7 @@ from marlbc_mj.cli.output import OutputOptions
 class ShipCommand:
     """Copy the best checkpoint of a run to the shipped ones and write its model card. For developers of the package."""
 
-    run_folder: Positional[Path]
+    run_folder: Positional[TrainedRun]
     """Folder of the training run."""
     name: Positional[str]
     """Name that the supervisor gets: marlms, rlms, marlms-general."""

@@ -3,11 +3,19 @@
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Literal
 
-from tyro.conf import OmitArgPrefixes, arg
+from tyro.conf import OmitArgPrefixes
 
-from marlbc_mj.cli.choices import SomeCompositions, SomeControllers, SomeCount, SomeSupervisors, SuiteMissionNames, TrackNames
+from marlbc_mj.cli.choices import (
+    SomeCompositions,
+    SomeControllers,
+    SomeCount,
+    SomeSupervisors,
+    SuiteMissionNames,
+    SuiteSource,
+    TrackNames,
+)
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -39,7 +47,7 @@ class SuiteCommand:
     """The first 50 layouts of every mission, without supervisors that search."""
     layouts: SomeCount = None
     """The first so many layouts of every mission."""
-    source: Annotated[Path | None, arg(name="from", metavar="PATH", help_behavior_hint="")] = None
+    source: SuiteSource = None
     """Folder of results of the suite whose rows stand beside those that are flown."""
     page: bool = False
     """Fly nothing: write the page of the results in --from."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings
+from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings, check_holds
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
@@ -45,6 +45,9 @@ class TrainCommand:
 
     def run(self) -> None:
         """Train with a progress display; an interrupted run says how to continue it."""
+        if self.resume is not None:
+            self.refuse_others()
+            check_holds(self.resume, "resume.safetensors", "{folder} holds no run to resume: there is no resume.safetensors")
         from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
         from marlbc_mj.training.general.config import GENERAL
@@ -55,7 +58,6 @@ class TrainCommand:
             return
         with self.output.display(training_display) as progress:
             if self.resume is not None:
-                self.refuse_others()
                 folder, ended = self.resume, run.resume(self.resume, progress=progress)
             else:
                 config = self.config()
@@ -80,7 +82,6 @@ class TrainCommand:
 
         with self.output.display(general_display) as progress:
             if self.resume is not None:
-                self.refuse_others()
                 folder, ended = self.resume, resume_general(self.resume, progress=progress)
             else:
                 config = self.general_config()

@@ -145,7 +145,8 @@ class World:
         Args:
             b: the world; its obstacles and disturbance stay as they were drawn.
             step: mission steps that count as made.
-            position, velocity: (N, 2) [m], [m/s] of the agents and of their references alike.
+            position: (N, 2) [m] of the agents and of their references alike.
+            velocity: (N, 2) [m/s] of both.
             command: (N,) indices into ``scenario.orders.commands`` that count as given last.
         """
         team.place(self.plan, self.state, b, step, position, velocity, command)

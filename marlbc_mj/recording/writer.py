@@ -55,7 +55,8 @@ class LogWriter:
 
     Args:
         path: a name that ends in ``.mcap``; missing folders are made.
-        scenario, controller: what runs.
+        scenario: the mission that is flown.
+        controller: the law that drives the agents.
         names: supervisor's and controller's.
         seed: which draw of the scenario.
         config: all settings; attached as JSON, and hashed.

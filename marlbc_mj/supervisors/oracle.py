@@ -155,8 +155,8 @@ def search(
         progress: called with the episodes simulated so far and the best safe return (-inf before there is one).
 
     Raises:
-        ConfigurationError: a perturbed scenario, drawn or moving obstacles, no schedule to start from, too small a budget, or no
-            safe schedule found.
+        ConfigurationError: a perturbed scenario, drawn or moving obstacles, no schedule to start from, a negative seed, too small
+            a budget, or no safe schedule found.
     """
     if scenario.layout is not None or scenario.moving:
         raise ConfigurationError(
@@ -164,6 +164,8 @@ def search(
         )
     if scenario.perturbation != Perturbation():
         raise ConfigurationError("the oracle's schedule is for one draw; search on a scenario without perturbation")
+    if seed < 0:
+        raise ConfigurationError(f"seed must not be negative, got {seed}")
     if population < 2 or budget < population:
         raise ConfigurationError(f"budget must be at least the population, and that at least 2, got {budget} and {population}")
     world = World(scenario, make_controller(controller), worlds=population, threads=threads, record=True)

@@ -342,6 +342,18 @@ def check_target(path: Path, *, overwrite: bool) -> None:
             raise ConfigurationError(f"{path} exists; choose another name or add --overwrite")
 
 
+def check_writable(path: Path, *, overwrite: bool) -> None:
+    """Raise ConfigurationError if a file cannot be written, before the work that it is to hold. Nothing is left of the trial."""
+    check_target(path, overwrite=overwrite)
+    made = [folder for folder in path.parents if not folder.exists()]
+    with writing(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if not os.access(path.parent, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+        for folder in made:
+            folder.rmdir()
+
+
 def write_json(path: Path, value: Any) -> None:
     """Write indented JSON through a temporary file; numbers that are not finite are texts in it, see :func:`plain_data`."""
     with staged_file(path, overwrite=True) as staging:

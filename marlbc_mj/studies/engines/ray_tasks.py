@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +24,8 @@ from marlbc_mj.util.text import one_line
 
 TASKS_AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
 ADDRESS = "RAY_ADDRESS"
+KEEPS_ENVIRONMENT = "SPT_NOENV"
+"""Variable that keeps Ray's processes from writing their titles over their environments, where the guard's token is."""
 
 
 class RayTasks:
@@ -111,13 +113,27 @@ def _guarded() -> Iterator[None]:
     token = secrets.token_hex(8)
     command = [sys.executable, "-I", "-S", guard.__file__, token]  # without this package: it is there at once
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as guarding:
-        os.environ[guard.TOKEN] = token
         try:
-            yield
+            with _in_environment({guard.TOKEN: token, KEEPS_ENVIRONMENT: "1"}):
+                yield
         finally:
-            del os.environ[guard.TOKEN]
             guard.end_marked(token)  # agents of a raylet that was killed
             guarding.terminate()
+
+
+@contextmanager
+def _in_environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Variables of the environment during the block."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
 
 
 class _Shared(NamedTuple):
