@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -27,6 +27,8 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a job in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 MOST_WORKERS = 8  # of parallel tests: each takes up to 1.2 GB
+FIRST = ("test_train_run.py", "test_cli.py", "test_study.py", "test_report.py", "test_ending.py")
+"""Files whose tests take longest, or share what takes long to make. They run first, so that workers end together."""
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
@@ -40,13 +42,31 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out slow tests, unless they are asked for."""
+    """Leave out slow tests, unless they are asked for; of several files those of :data:`FIRST` come first."""
+    items.sort(key=lambda item: item.path.name not in FIRST)
     if not config.getoption("--slow"):
         kept, left = [], []
         for item in items:
             (left if item.get_closest_marker("slow") else kept).append(item)
         items[:] = kept
         config.hook.pytest_deselected(items=left)
+
+
+@pytest.fixture(scope="module")
+def coarse_figures() -> Iterator[None]:
+    """Figures of 75 dpi in the place of 300, which take a third of the time: for tests of what a command writes, not of what its
+    figures show.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(import_module("marlbc_mj.report.plotting")._STYLE, "savefig.dpi", 75)
+        yield
+
+
+@pytest.fixture
+def quick_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The warm-up of a quarter of the worlds, and a tenth of the auto-encoder's training: for tests that compare two learners."""
+    monkeypatch.setattr("marlbc_mj.training.trainer.WARM_UP", 1_250)
+    monkeypatch.setattr("marlbc_mj.training.codes.MINIBATCHES", 50)
 
 
 Episode = Callable[..., Trajectory]

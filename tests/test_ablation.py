@@ -25,6 +25,8 @@ from marlbc_mj.studies.ablation import (
 from marlbc_mj.studies.ablation.questions import _largest_changes, half_mission, variants
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 
 def rows_of(question: Question) -> list[AblationRow]:
     """One question, run."""

@@ -25,6 +25,8 @@ from marlbc_mj.training.config import PRESETS
 from marlbc_mj.training.methods import METHODS
 from marlbc_mj.util.files import MANIFEST
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 SHORT = ("--duration", "1.0")
 
 

@@ -44,7 +44,7 @@ class Textbook:
 
     def gaussians(self, z) -> np.ndarray:
         """Psi_k(z) = exp(-|z - c_k|^2 / width^2), every coordinate of c_k the same."""
-        return np.array([np.exp(-np.sum((z - c) ** 2) / self.gains.width**2) for c in self.centres])
+        return np.exp(-((z - self.centres[:, None]) ** 2).sum(axis=1) / self.gains.width**2)
 
     def step(self, p, v, p_r, v_r, limit, h) -> np.ndarray:
         g = self.gains
@@ -93,12 +93,13 @@ def test_sorlc_is_the_textbook_law(basis, tau_sign):
     rng = np.random.default_rng(0)
     agent, limit = 2, 150.0
     textbook, state = Textbook(gains, agent), start(gains, agent)
-    saturated = 0
+    numbers, record = laws.as_gains(gains.law, gains.params(agent, limit)), laws.interface(gains.law).state.view(state)
+    saturated, force = 0, np.full(2, np.nan)
     for _ in range(2000):
         p, v = rng.uniform(-4, 4, 2), rng.uniform(-4, 4, 2)
         p_r, v_r = p + rng.uniform(-1, 1, 2), v + rng.uniform(-1, 1, 2)
         expected = textbook.step(p, v, p_r, v_r, limit, H)
-        force = call(gains, state, p, v, p_r, v_r, limit=limit, agent=agent)
+        gains.law(numbers, record, p, v, p_r, v_r, ZERO, H, force)
         saturated += np.abs(force).max() == limit
         assert_close(force, expected)
     assert 100 < saturated < 1900

@@ -70,8 +70,7 @@ LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times t
 @pytest.fixture(scope="module")
 def compiled_before(tmp_path_factory):
     """The command has run once, so that a signal meets episodes and not the compiler."""
-    before = [*COMMAND, "bench", *QUICK, *LONG, "--out", str(tmp_path_factory.mktemp("before") / "out")]
-    subprocess.run(before, env=ENVIRONMENT, capture_output=True, check=True)
+    main(["bench", *QUICK, *LONG, "--out", str(tmp_path_factory.mktemp("before") / "out"), "--quiet"])
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")

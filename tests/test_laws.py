@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numba
@@ -15,7 +15,7 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation
 from marlbc_mj.core.disturbances import DISTURBANCES, make_disturbance
 from marlbc_mj.engine.world import World
-from marlbc_mj.robots import Robot, make_robot
+from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import paper
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -155,7 +155,7 @@ def test_wrong_names_are_refused_where_a_world_is_made():
     with pytest.raises(ConfigurationError, match="law 'wind_gusts' is not given its gain 'steady'"):
         World(paper(disturbance=Own(DISTURBANCES["gusts"][0].law, {"scale": 1.0})))
     with pytest.raises(ConfigurationError, match="law 'omni_drive' has no gain named 'weel'; its names: wheel, arm"):
-        Robot(**{**vars(make_robot("omni")), "params": {"weel": 1.0}}).params_row()
+        replace(make_robot("omni"), params={"weel": 1.0}).params_row()
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_drive_and_reading_of_a_robot_share_their_names():
     """Gains and state are one row for both."""
     omni, other = make_robot("omni"), make_robot("diff_drive")
     with pytest.raises(ConfigurationError, match="must declare the same names"):
-        Robot(**{**vars(omni), "reading": other.reading})
+        replace(omni, reading=other.reading)
 
 
 SCRIPT = """

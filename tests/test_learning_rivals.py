@@ -391,9 +391,10 @@ def equal(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
 
 
+@pytest.mark.usefixtures("quick_warm_up")
 @pytest.mark.parametrize("method", ["vdn", "qmix", "central", "rlms", "mappo"])
 def test_every_rival_goes_on_bit_for_bit(method):
-    config = small(method, ppo=PPO(rollout=6, epochs=2))
+    config = small(method, worlds=32, capacity=1_750, ppo=PPO(rollout=6, epochs=2))
     one = make_trainer(config)
     for _ in range(45):  # past the warm-up; inside a rollout
         one.advance()

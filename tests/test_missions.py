@@ -20,6 +20,8 @@ from marlbc_mj.studies.draws import perturbed, run_methods
 from marlbc_mj.supervisors import UNLEARNED, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 
 @pytest.fixture(scope="module")
 def flown():

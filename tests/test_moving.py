@@ -70,8 +70,8 @@ def test_avoidance_keeps_its_rate_relative_to_an_obstacle_that_moves(vx, vy, x, 
 
 
 def test_the_compiled_loop_the_python_path_and_dm_control_are_one():
-    """A whole episode with crossing and swinging obstacles, orders of every kind."""
-    scenario = make_scenario("traffic")
+    """An episode of 24 s with crossing and swinging obstacles, orders of every kind."""
+    scenario = make_scenario("traffic", duration=24.0)
     orders = np.random.default_rng(5).integers(0, len(scenario.orders), (scenario.mission_steps, scenario.agents))
     compiled, python = World(scenario), World(scenario, native=False)
     environment = make_environment(scenario, SORLC(), random_state=0)

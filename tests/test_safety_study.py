@@ -25,6 +25,8 @@ from marlbc_mj.studies.safety import (
 from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 GOOD = MissionOutcome(reached=True, violated=False, struck=False, collided=False)
 CELL = MissionCell("field", "set-based", False, "fixed")
 

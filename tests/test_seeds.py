@@ -30,6 +30,8 @@ from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION, DrawsStudy, growing
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 
 def run_seeds(scenario, supervisors, controllers, seeds, progress=None, **options) -> SeedResults:
     """Every supervisor with every controller."""

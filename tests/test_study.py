@@ -35,6 +35,8 @@ from marlbc_mj.training.methods import CARE
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 TINY = {"worlds": 8, "hidden": (8,), "batch": 16, "updates": 1, "capacity": 400, "start_length": 1.0, "evaluate_every": 1_600}
 SETTINGS = [f"{name}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for name, v in TINY.items()]
 REPORT = {"study.csv", "curves.csv", "study.md", "study.tex", "curves.pdf", "curves.png"}

@@ -18,6 +18,8 @@ from marlbc_mj.studies.suite.flights import BLOCK, suite_jobs
 from marlbc_mj.supervisors import SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError
 
+pytestmark = pytest.mark.usefixtures("coarse_figures")
+
 
 def test_the_suite_is_the_frozen_one() -> None:
     """Whoever changes a mission, by a default for example, makes another suite and gives it another version."""

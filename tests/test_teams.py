@@ -55,9 +55,9 @@ def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if name != "oracle-schedule"])
 def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
-    """Five draws of a whole episode of 25 s, past the first point; of 8 s where a decision takes long."""
+    """Three draws of a whole episode of 25 s, past the first point; of 8 s where a decision takes long."""
     duration = 8.0 if name in ("mpcms", "rollout") else 25.0
-    world = World(paper(perturbation=AROUND, duration=duration, **NEEDS.get(name, {})), worlds=TEAMS)
+    world = World(paper(perturbation=AROUND, duration=duration, **NEEDS.get(name, {})), worlds=3)
     world.reset(4)
     assert_teams_are_alone(make_supervisor(name), world, world.scenario.mission_steps)
 

@@ -43,6 +43,7 @@ SMALL = {
     "worlds": 128, "interval": 2, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1,
     "start_length": 2.0,
 }  # fmt: skip
+FEW = {"worlds": 32, "capacity": 1_750}  # with a warm-up as short
 
 
 def small(**changes) -> TrainConfig:
@@ -53,9 +54,10 @@ def equal(a, b):
     return a.keys() == b.keys() and all(np.array_equal(a[name], b[name], equal_nan=True) for name in a)
 
 
+@pytest.mark.usefixtures("quick_warm_up")
 @pytest.mark.parametrize("changes", [{}, {"hash": "plain", "learner": "hysteretic", "actions": "orders", "state": "printed"}])
 def test_a_restored_trainer_goes_on_bit_for_bit(changes):
-    config = small(**changes)
+    config = small(**FEW, **changes)
     one = Trainer(config)
     for _ in range(50):  # past the warm-up
         one.advance()
@@ -72,12 +74,13 @@ def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     assert equal(*(trainer.snapshot()[0] for trainer in (one, other)))
 
 
+@pytest.mark.usefixtures("quick_warm_up")
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core only")
 def test_what_is_learned_does_not_depend_on_the_threads():
     """With two, the networks learn while the worlds move: the same numbers to the bit, also where one goes on from the other's
     snapshot, and what fails on either side stops the run.
     """
-    one, two = (Trainer(small(threads=threads)) for threads in (1, 2))
+    one, two = (Trainer(small(**FEW, threads=threads)) for threads in (1, 2))
     for _ in range(50):  # past the warm-up
         assert (one.advance().state == two.advance().state).all()
     assert one.error == two.error != 0.0
@@ -98,6 +101,7 @@ def test_what_is_learned_does_not_depend_on_the_threads():
         two.advance()
 
 
+@pytest.mark.usefixtures("quick_warm_up")
 @pytest.mark.parametrize("method", ["marlms", "mappo"])
 def test_torch_has_one_thread_wherever_it_computes(method, monkeypatch):
     """However many the worlds have, whose thread pool sets the number for torch too: sums must not depend on it."""
@@ -106,7 +110,7 @@ def test_torch_has_one_thread_wherever_it_computes(method, monkeypatch):
     monkeypatch.setattr(TeamNetwork, "heads", lambda *inputs: (threads.append(torch.get_num_threads()), heads(*inputs))[1])
     fit = StateHash.fit
     monkeypatch.setattr(StateHash, "fit", lambda *inputs: (threads.append(torch.get_num_threads()), fit(*inputs))[1])
-    config = small(**{**changes, "method": method, "threads": numba.config.NUMBA_NUM_THREADS})
+    config = small(**{**FEW, **changes, "method": method, "threads": numba.config.NUMBA_NUM_THREADS})
     trainer = make_trainer(config)
     for _ in range(45):  # past the fit of the hash
         trainer.advance()

@@ -174,12 +174,13 @@ def test_cooling_reads_the_ring_where_it_wraps(seed, length, first):
     assert (plain.table == ring.table).all() and np.isfinite(plain.table).any()
 
 
-def test_the_leniency_that_is_stored_is_that_of_the_action_before_it_cooled():
+def test_the_leniency_that_is_stored_is_that_of_the_action_before_it_cooled(monkeypatch):
     """Also in decisions whose episode ends in them, so that their temperature falls at once."""
     config = make_config(
-        "fast", worlds=250, interval=2, hidden=(4,), batch=8, updates=1, capacity=10_000, threads=1, exploring_starts=1.0,
+        "fast", worlds=100, interval=2, hidden=(4,), batch=8, updates=1, capacity=10_000, threads=1, exploring_starts=1.0,
         start_length=0.5, hash="plain", bits=4,
     )  # fmt: skip
+    monkeypatch.setattr(trainer_module, "WARM_UP", 2_000)  # transitions: 20 decisions of 100 teams
     trainer, cooled = Trainer(config), 0
     for _ in range(32):
         table, row = trainer.temperatures.table.copy(), trainer.replay.count % trainer.replay.rows
@@ -591,16 +592,16 @@ def test_unknown_preset():
         make_config("slow")
 
 
-@pytest.mark.parametrize(("exploring_starts", "capacity", "rows"), [(0.0, 1_500, 100), (0.0, 900, 90), (0.5, 1_500, 84)])
+@pytest.mark.parametrize(("exploring_starts", "capacity", "rows"), [(0.0, 600, 100), (0.0, 360, 90), (0.5, 600, 84)])
 def test_states_are_hashed_once_the_buffer_has_seen_the_mission(exploring_starts, capacity, rows, monkeypatch):
     """After a whole mission's decisions where all episodes begin at the start, after the warm-up otherwise; only decisions that
     have a code of their own cool a temperature.
     """
     config = make_config(
-        "fast", worlds=10, interval=20, hidden=(4,), batch=8, updates=1, capacity=capacity, threads=1,
+        "fast", worlds=4, interval=20, hidden=(4,), batch=8, updates=1, capacity=capacity, threads=1,
         exploring_starts=exploring_starts, start_length=20.0, hash="plain",
     )  # fmt: skip
-    monkeypatch.setattr(trainer_module, "WARM_UP", 840)  # transitions: 84 decisions of 10 teams
+    monkeypatch.setattr(trainer_module, "WARM_UP", 336)  # transitions: 84 decisions of 4 teams
     trainer = Trainer(config)
     for _ in range(rows):
         trainer.advance()

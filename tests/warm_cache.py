@@ -1,12 +1,19 @@
-"""Compiles what many tests need before they share it: parallel workers that start without a cache would each compile it all."""
+"""Compiles what many tests need before they share it: parallel workers that start without a cache would each compile it all.
 
+Nothing is done where no source is newer than the last time.
+"""
+
+import os
 import sys
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
+from pathlib import Path
 
 import numpy as np
 
+ROOT = Path(__file__).parents[1]
+DONE = ROOT / ".cache" / "warm"  # what state() was the last time
 LOCAL = ("set-based-rule", "lookahead", "orca", "cbf-qp", "marlms-general")
 RULES = ("scripted", "fsams", "fms", "mpcms", "layered", "motor-schema", "fuzzy-blend", "marlms", "rollout")
 
@@ -60,8 +67,20 @@ def rest() -> None:
     best_actions(values, np.zeros((1, 4), dtype=np.int64), np.ones(1, dtype=bool), np.float32(0.1))
 
 
+def state() -> str:
+    """All that compiled code is kept for: sources, pinned packages, Python, and the folder where it is kept."""
+    sources = [path for folder in ("marlbc_mj", "tasks", "training") for path in (ROOT / folder).rglob("*.py")]
+    times = [path.stat().st_mtime_ns for path in (*sources, ROOT / "constraints.txt")]
+    return f"{len(times)} {max(times)} {sys.version} {os.environ.get('NUMBA_CACHE_DIR')}"
+
+
 if __name__ == "__main__":
+    before = state()
+    if DONE.is_file() and DONE.read_text() == before:
+        sys.exit(0)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # what one has compiled is kept for the others
         for part in [pool.submit(work) for work in (loop, decisions, rest)]:
             part.result()
+    DONE.parent.mkdir(exist_ok=True)
+    DONE.write_text(before)
     sys.exit(0)

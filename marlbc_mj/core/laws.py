@@ -162,15 +162,23 @@ def reading(function: Law | None = None, *, gains: Declared = (), state: Declare
 def address(law: Law, signature: Any) -> int:
     """Machine address of what the compiled loop calls for a law: its team form, and for a behavior the behavior itself.
 
+    It is looked for once: a compiled law keeps it.
+
     Raises:
         ConfigurationError: the law is plain Python, was declared as another kind of law, reads a name that it does not declare,
             raises errors, which threads would lose, or does not compile.
     """
-    name = name_of(law)
     if not isinstance(law, Dispatcher):
-        raise ConfigurationError(f"law {name!r} is not compiled; decorate it with marlbc_mj.core.laws")
+        raise ConfigurationError(f"law {name_of(law)!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
-    line = raising_line(law, set())
+    if not hasattr(law, "address"):
+        cast(Any, law).address = _find_address(law, signature)
+    return cast(int, cast(Any, law).address)
+
+
+def _find_address(law: Any, signature: Any) -> int:
+    """:func:`address` of a compiled law that was declared as this kind."""
+    name, line = name_of(law), raising_line(law, set())
     if line is not None:
         raise ConfigurationError(
             f"law {name!r} raises an error ({line}), which compiled code cannot; write NaN to an output instead: it ends the run"

@@ -56,7 +56,7 @@ class Names:
             if self.names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} names two numbers of a law")
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """The names alone."""
         return tuple(name for name, _ in self.shapes)
@@ -66,7 +66,7 @@ class Names:
         """The row as one NumPy record, which Python and compiled code read alike."""
         return np.dtype((np.record, [(name, np.float64, shape) for name, shape in self.shapes]))
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of the row."""
         return self.dtype.itemsize // 8 if self.shapes else 0

@@ -4,6 +4,7 @@ The engine compiles this text, and the dm_control arena is made from the same te
 """
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import mujoco
@@ -51,7 +52,7 @@ def assemble(scenario: Scenario, limit: float) -> str:
     if not limit > 0:
         raise ConfigurationError(f"force limit must be positive, got {limit}")
     fleet = scenario.fleet
-    spec = mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
+    spec = _arena().copy()
     spec.modelname = scenario.name
     spec.option.timestep = scenario.substep
     spec.memory = MEMORY + MEMORY_PER_AGENT * max(0, scenario.agents - 32)
@@ -67,6 +68,12 @@ def assemble(scenario: Scenario, limit: float) -> str:
             return str(spec.to_xml())
         except (ValueError, mujoco.FatalError) as error:
             raise unfit(scenario, error) from error
+
+
+@cache
+def _arena() -> mujoco.MjSpec:
+    """The MJCF that every assembly begins with."""
+    return mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
 
 
 def unfit(scenario: Scenario, error: Exception) -> ConfigurationError:
@@ -100,6 +107,8 @@ def _agreed(name: str, children: Sequence[tuple[str, Any]]) -> Any:
         ConfigurationError: two robots that say different things, or live in different media.
     """
     first, chosen = children[0][0], getattr(children[0][1], name)
+    if len(children) == 1:
+        return chosen
     default, strict = getattr(mujoco.MjSpec().option, name), name in MEDIUM
     for other, option in children[1:]:
         value = getattr(option, name)

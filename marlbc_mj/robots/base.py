@@ -141,23 +141,18 @@ class Robot:
         return self.mjcf.is_relative_to(MODELS)
 
     def spec(self) -> mujoco.MjSpec:
-        """The MJCF, ready to be attached. A user's file is read once, and brought into standard form.
+        """The MJCF, ready to be attached: a copy of what is read once. A user's file is brought into standard form.
 
         Raises:
             ConfigurationError: the file cannot be read, is no MJCF, or lacks what the robot names.
         """
-        if not self.shipped:
-            return self._prepared.copy()
-        try:
-            spec = mujoco.MjSpec.from_file(str(self.mjcf))
-        except (ValueError, FileNotFoundError) as error:
-            raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {one_line(error)}") from error
-        self.prepare(spec)
-        return spec
+        return self._prepared.copy()
 
     @cached_property
     def _prepared(self) -> mujoco.MjSpec:
-        """A user's MJCF in standard form; of a direct robot with planar forces for controls."""
+        """The MJCF of a shipped robot, or a user's in standard form; of a direct robot with planar forces for controls."""
+        if self.shipped:
+            return self._as_shipped()
         with quiet():
             spec = mujoco.MjSpec.from_string(standard_text(self.mjcf))
             self.prepare(spec)
@@ -169,6 +164,15 @@ class Robot:
                     check_slides(spec, self.joints)
             except ConfigurationError as error:
                 raise ConfigurationError(f"robot {self.name!r}, {self.mjcf.name}: {error}") from error
+        return spec
+
+    def _as_shipped(self) -> mujoco.MjSpec:
+        """The MJCF as its file has it."""
+        try:
+            spec = mujoco.MjSpec.from_file(str(self.mjcf))
+        except (ValueError, FileNotFoundError) as error:
+            raise ConfigurationError(f"robot {self.name!r}: cannot read {self.mjcf}: {one_line(error)}") from error
+        self.prepare(spec)
         return spec
 
     def _check_names(self, spec: mujoco.MjSpec) -> None:

@@ -14,7 +14,7 @@ Under the set-based composition avoidance is a constraint of every order, so the
 """
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from marlbc_mj.core.laws import allocation_free, compiled
 from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import grid_room, make_behaviors
+from marlbc_mj.engine.references import refer
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.util.errors import ConfigurationError
@@ -45,7 +46,7 @@ class LocalRule(NamedTuple):
 
 
 def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
-    """The rule for a scenario under its composition.
+    """The rule for a scenario under its composition, as compiled code takes it fastest: by reference.
 
     Raises:
         ConfigurationError: the scenario lacks an order, or a margin that is negative or not finite.
@@ -55,9 +56,11 @@ def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
     free = np.array([scenario.orders.index(name) for name in scenario.formation_names])
     behaviors, step, grid = make_behaviors(scenario), float(scenario.mission_step), np.zeros(grid_room(scenario))
     if avoids_by_itself(scenario):
-        return LocalRule(behaviors, free, free, -np.inf, step, GiveWay(0.0, np.arange(len(scenario.orders))), grid)
-    avoiding = np.array([scenario.orders.index(f"OA>{name}") for name in scenario.formation_names])
-    return LocalRule(behaviors, free, avoiding, float(scenario.safe_distance + margin), step, give_way(scenario), grid)
+        avoiding, least, way = free, -np.inf, GiveWay(0.0, np.arange(len(scenario.orders)))
+    else:
+        avoiding = np.array([scenario.orders.index(f"OA>{name}") for name in scenario.formation_names])
+        least, way = float(scenario.safe_distance + margin), give_way(scenario)
+    return cast(LocalRule, refer(LocalRule(behaviors, free, avoiding, least, step, way, grid)))
 
 
 def avoids_by_itself(scenario: Scenario) -> bool:

@@ -8,7 +8,7 @@ import platform
 import subprocess
 import sys
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,11 @@ PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gym
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that results depend on, by the names of their distributions."""
+    return dict(_versions())
+
+
+@cache
+def _versions() -> dict[str, str]:
     from importlib.metadata import PackageNotFoundError, version  # which takes longer than the rest of a refusal
 
     found = {"python": platform.python_version()}
