@@ -45,7 +45,7 @@ test: venv
 
 kills: venv
 	@$(BIN)/python tests/kills.py --kills 50 --out out/kills
-	@$(BIN)/python tests/kills.py --kills 25 --out out/kills --engine ray --commands bench evaluate
+	@$(BIN)/python tests/kills.py --kills 25 --out out/kills --engine ray --commands suite digests
 
 slurm-test: venv
 	@PYTHON=$(BIN)/python bash tests/slurm_test.sh
