@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from marlbc_mj.studies.packs import entries, packs
+from marlbc_mj.training.resuming import RESUME
 
 MOST_SECONDS = 400.0  # of one command
 ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
@@ -32,9 +33,9 @@ TIMES = ("decision", "wall", "cpu_s", "solver", "command", "seconds", "steps_per
 """What may differ between two runs: keys and columns with any of these in their names."""
 TEMPORARY = (".partial", ".old-", ".begun-", ".new-")
 """Parts of names that nothing has that is left in the end."""
-TINY = ["worlds=8", "hidden=8", "batch=16", "updates=1", "capacity=400", "start_length=1.0", "evaluate_every=800"]
-SMALL = ["families=field", "teams=wedge-4", "worlds=2", "hidden=8", "batch=16", "updates=2", "layouts=1", "evaluate_every=600"]
-SHORT = ["--duration", "4", "--overwrite"]
+TINY = "worlds=8 hidden=8 batch=16 updates=1 capacity=400 start_length=1.0 evaluate_every=800"
+SMALL = "families=field teams=wedge-4 worlds=2 hidden=8 batch=16 updates=2 layouts=1 evaluate_every=600"
+SHORT = "--duration 4 --overwrite"
 RAY_PARTS = ("ray::", "raylet", "gcs_server")
 
 
@@ -42,7 +43,7 @@ RAY_PARTS = ("ray::", "raylet", "gcs_server")
 class Target:
     """A command that is killed."""
 
-    arguments: tuple[str, ...]  # OUT stands for the output
+    arguments: str  # OUT stands for the output
     again: Callable[[Path], tuple[str, ...] | None] = lambda out: None
     """Arguments for going on, where they differ."""
     engines: bool = False  # whether it takes --engine
@@ -50,70 +51,29 @@ class Target:
 
 
 def _resumed(out: Path) -> tuple[str, ...] | None:
-    if (out / "resume.safetensors").exists():
+    if (out / RESUME).exists():
         return ("train", "--resume", str(out))
     return None
 
 
 DIGESTS = (str(Path(__file__).with_name("digests.py")),)
-METHODS = ("--supervisors", "scripted", "fsams", "fms", "--controllers", "sorlc", "pd")
+METHODS = "--supervisors scripted fsams fms --controllers sorlc pd"
+BOTH = "--compositions set-based null-space"
 TARGETS = {
-    "digests": Target(("OUT", "ENGINE", "WORKERS", "0.05"), engines=True, program=DIGESTS),
-    "bench": Target(
-        ("bench", "paper", *METHODS, "--no-figures", "--video", "none", *SHORT, "--out", "OUT"),
-        engines=True,
-    ),
-    "evaluate": Target(
-        ("evaluate", "field", "--supervisors", "fsams", "fms", "layered", "--seeds", "6", *SHORT, "--out", "OUT"),
-        engines=True,
-    ),
+    "digests": Target("OUT ENGINE WORKERS 0.05", engines=True, program=DIGESTS),
+    "bench": Target(f"bench paper {METHODS} --no-figures --video none {SHORT} --out OUT", engines=True),
+    "evaluate": Target(f"evaluate field --supervisors fsams fms layered --seeds 6 {SHORT} --out OUT", engines=True),
     "gate": Target(
-        (
-            "robot",
-            "gate",
-            "--robots",
-            "disc",
-            "omni",
-            "--supervisors",
-            "scripted",
-            "fsams-hysteresis",
-            "--no-clips",
-            "--overwrite",
-            "--out",
-            "OUT",
-        ),
-        engines=True,
+        "robot gate --robots disc omni --supervisors scripted fsams-hysteresis --no-clips --overwrite --out OUT", engines=True
     ),
     "suite": Target(
-        (
-            "suite",
-            "--missions",
-            "field",
-            "gates",
-            "--supervisors",
-            "fsams",
-            "fixed",
-            "--compositions",
-            "set-based",
-            "null-space",
-            "--layouts",
-            "4",
-            "--overwrite",
-            "--out",
-            "OUT",
-        ),
-        engines=True,
+        f"suite --missions field gates --supervisors fsams fixed {BOTH} --layouts 4 --overwrite --out OUT", engines=True
     ),
-    "study": Target(
-        ("study", "--variants", "marlms", "vdn", "--seeds", "1", "--budget", "3200", "--out", "OUT", "--set", *TINY),
-    ),
-    "train": Target(
-        ("train", "--budget", "6400", "--threads", "1", "--overwrite", "--out", "OUT", "--set", *TINY),
-        again=_resumed,
-    ),
-    "general": Target(("train", "marlms-general", "--budget", "2000", "--overwrite", "--out", "OUT", "--set", *SMALL)),
-    "run": Target(("run", "paper", "--supervisor", "fsams", "--duration", "20", "--overwrite", "--out", "OUT")),
-    "video": Target(("video", "LOG", "--size", "160x90", "--fps", "10", "--overwrite", "--out", "OUT.mp4")),
+    "study": Target(f"study --variants marlms vdn --seeds 1 --budget 3200 --out OUT --set {TINY}"),
+    "train": Target(f"train --budget 6400 --threads 1 --overwrite --out OUT --set {TINY}", again=_resumed),
+    "general": Target(f"train marlms-general --budget 2000 --overwrite --out OUT --set {SMALL}"),
+    "run": Target("run paper --supervisor fsams --duration 20 --overwrite --out OUT"),
+    "video": Target("video LOG --size 160x90 --fps 10 --overwrite --out OUT.mp4"),
 }
 """By name."""
 
@@ -129,7 +89,7 @@ class Killer:
     def arguments(self, name: str, out: Path) -> list[str]:
         """The command line of a target."""
         target = TARGETS[name]
-        given = [self._filled(word, out) for word in target.again(out) or target.arguments]
+        given = [self._filled(word, out) for word in target.again(out) or target.arguments.split()]
         if target.engines and target.program != DIGESTS:
             given += ["--engine", self.engine, "--workers", str(self.workers)]
         return given

@@ -26,7 +26,8 @@ from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.general.shipping import ship_mean
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.run import RESUME, Interrupted
+from marlbc_mj.training.resuming import RESUME
+from marlbc_mj.training.run import Interrupted
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import plain_data
 

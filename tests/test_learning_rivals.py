@@ -26,8 +26,9 @@ from marlbc_mj.training.mappo import MAPPO, ValueScale, advantages, clipped_loss
 from marlbc_mj.training.methods import METHODS, PPO
 from marlbc_mj.training.prioritised import ALPHA, BETA, LEAST_ERROR, PrioritisedReplay
 from marlbc_mj.training.replay import Batch
+from marlbc_mj.training.resuming import RESUME
 from marlbc_mj.training.rivals import LEARNERS, QMIX, RLMS, VDN, Central, Mixer, learner_class, own_entries
-from marlbc_mj.training.run import RESUME, Interrupted, make_trainer, resume, train
+from marlbc_mj.training.run import Interrupted, make_trainer, resume, train
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import plain_data
 

@@ -32,6 +32,7 @@ from marlbc_mj.studies.protocol import Stopped, Watch
 from marlbc_mj.training import run
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.methods import CARE
+from marlbc_mj.training.resuming import RESUME
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -133,7 +134,7 @@ def interrupted(job: TrainingJob, monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(Trainer, "advance", advance)
         with pytest.raises(Stopped):
             train_job(job, Watch(quiet))
-    assert (job.folder / run.RESUME).is_file() and not (job.folder / DONE_MARK).exists()
+    assert (job.folder / RESUME).is_file() and not (job.folder / DONE_MARK).exists()
 
 
 def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -149,7 +150,7 @@ def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr(run, "train", None)
         assert train_job(job, listening(said)).how == "finished"
-    assert said[0] == "marlms seed 0: goes on" and not (job.folder / run.RESUME).exists()
+    assert said[0] == "marlms seed 0: goes on" and not (job.folder / RESUME).exists()
     one, other = ([{**e, "wall_s": ""} for e in evaluations(out / "marlms" / "0")] for out in (finished, tmp_path))
     assert len(one) == 2 and one == other
 
@@ -157,8 +158,8 @@ def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch:
 def test_an_interrupted_run_of_other_code_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (job,) = jobs_of(tmp_path, "marlms")
     interrupted(job, monkeypatch)
-    arrays, description = read_arrays(job.folder / run.RESUME)
-    write_arrays(job.folder / run.RESUME, arrays, {**description, "versions": {}})
+    arrays, description = read_arrays(job.folder / RESUME)
+    write_arrays(job.folder / RESUME, arrays, {**description, "versions": {}})
     said: list[str] = []
     assert train_job(job, listening(said)).how == "finished"
     assert said[0] == "marlms seed 0: begins" and len(evaluations(job.folder)) == 2
@@ -213,7 +214,7 @@ def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
     finally:
         over.set()
         thread.join()
-    assert (tmp_path / "vdn" / "0" / run.RESUME).is_file()
+    assert (tmp_path / "vdn" / "0" / RESUME).is_file()
     assert [row["failure"] for row in collect(tmp_path)[0]] == [UNFINISHED]
 
 

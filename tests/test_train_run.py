@@ -32,7 +32,8 @@ from marlbc_mj.training.general.config import GeneralConfig
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.methods import METHODS
 from marlbc_mj.training.networks import TeamNetwork
-from marlbc_mj.training.run import RESUME, make_trainer, rank, resume, train
+from marlbc_mj.training.resuming import RESUME
+from marlbc_mj.training.run import make_trainer, rank, resume, train
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util import provenance
 from marlbc_mj.util.changes import with_settings

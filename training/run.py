@@ -23,13 +23,13 @@ from marlbc_mj.training.base import BaseTrainer
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.curves import TensorBoard
 from marlbc_mj.training.mappo import MAPPO
+from marlbc_mj.training.resuming import RESUME, saved_run
 from marlbc_mj.training.saved import CONFIG_FILE, check_origin, restore_trainer, saved_config, saved_rows
 from marlbc_mj.training.trainer import Trainer
 from marlbc_mj.util.errors import ConfigurationError, enough_memory
 from marlbc_mj.util.files import alone_in, remove_leftovers, staged_file, write_json, writing
 from marlbc_mj.util.provenance import provenance
 
-RESUME = "resume.safetensors"
 TABLES = ("eval.csv", "progress.csv")
 COUNTED = ("wall_s", "mission_steps")
 """First columns of both tables."""
@@ -174,18 +174,6 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
     path = saved_run(out)
     with training_in(out, overwrite=True):
         return _restored(path).go(progress)
-
-
-def saved_run(out: Path) -> Path:
-    """The file of the run that was saved in a folder.
-
-    Raises:
-        ConfigurationError: there is none.
-    """
-    path = out / RESUME
-    if not path.is_file():
-        raise ConfigurationError(f"{out} holds no run to resume: there is no {RESUME}")
-    return path
 
 
 def _restored(path: Path) -> "TrainingRun":

@@ -184,22 +184,17 @@ def _existing(text: str) -> Path:
     return Path(text)
 
 
-def check_holds(folder: Path, file: str, said: str) -> Path:
-    """The folder, if it holds the file.
+def _folder_of(file: str, lacks: str = "") -> PrimitiveConstructorSpec[Any]:
+    """A folder that holds a file; ``lacks`` says what a folder without it does not hold."""
 
-    Raises:
-        ConfigurationError: it does not; ``said`` is what is wrong with ``{folder}`` where ``{path}`` is not there.
-    """
-    try:
-        check_there(folder / file, str(folder))
-    except ConfigurationError:
-        raise ConfigurationError(said.format(folder=folder, path=folder / file)) from None
-    return folder
+    def check(text: str) -> Path:
+        try:
+            check_there(Path(text, file), text)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{text} holds no {lacks}: {error}" if lacks else str(error)) from None
+        return Path(text)
 
-
-def _folder_of(file: str, said: str) -> PrimitiveConstructorSpec[Any]:
-    """A folder that holds a file, see :func:`check_holds`."""
-    return _primitive(lambda text: check_holds(Path(text), file, said), "PATH")
+    return _primitive(check, "PATH")
 
 
 def _unset(metavar: str) -> Any:
@@ -244,10 +239,7 @@ VariantNames = Annotated[tuple[Annotated[str, _one(_VARIANT)], ...], _shown(_VAR
 CalibratedNames = Annotated[tuple[Annotated[str, _one(_CALIBRATED)], ...], _shown(_CALIBRATED)]
 SomeKind = Annotated[Annotated[str, _one(_LISTED)] | None, _shown(_LISTED, "KIND")]
 ExistingPath = Annotated[Path, _primitive(_existing, "PATH")]
-_MISSING = "cannot read {path}: No such file or directory"
-_SUITE_FOLDER = _folder_of("suite.json", f"{{folder}} holds no results of the suite: {_MISSING}")
-SuiteSource = Annotated[Annotated[Path, _SUITE_FOLDER] | None, arg(name="from", metavar="PATH", help_behavior_hint="")]
-StudySource = Annotated[
-    Annotated[Path, _folder_of("study.csv", _MISSING)] | None, arg(name="from", metavar="PATH", help_behavior_hint="")
-]
-TrainedRun = Annotated[Path, _folder_of("checkpoint/best.safetensors", _MISSING)]
+_FROM = arg(name="from", metavar="PATH", help_behavior_hint="")
+SuiteSource = Annotated[Annotated[Path, _folder_of("suite.json", "results of the suite")] | None, _FROM]
+StudySource = Annotated[Annotated[Path, _folder_of("study.csv")] | None, _FROM]
+TrainedRun = Annotated[Path, _folder_of("checkpoint/best.safetensors")]

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from tyro.conf import OmitArgPrefixes, Positional
 
-from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings, check_holds
+from marlbc_mj.cli.choices import MethodName, PresetName, SomeCount, SomeDevice, SomePath, TrainingSettings
 from marlbc_mj.cli.output import ReportOptions
+from marlbc_mj.training.resuming import saved_run
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class TrainCommand:
         """Train with a progress display; an interrupted run says how to continue it."""
         if self.resume is not None:
             self.refuse_others()
-            check_holds(self.resume, "resume.safetensors", "{folder} holds no run to resume: there is no resume.safetensors")
+            saved_run(self.resume)
         from marlbc_mj.cli.terminal import training_display
         from marlbc_mj.training import run
         from marlbc_mj.training.general.config import GENERAL

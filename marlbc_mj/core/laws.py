@@ -171,9 +171,10 @@ def address(law: Law, signature: Any) -> int:
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name_of(law)!r} is not compiled; decorate it with marlbc_mj.core.laws")
     require_kind(law, signature)
-    if not hasattr(law, "address"):
-        cast(Any, law).address = _find_address(law, signature)
-    return cast(int, cast(Any, law).address)
+    kept: Any = law
+    if not hasattr(kept, "address"):
+        kept.address = _find_address(law, signature)
+    return int(kept.address)
 
 
 def _find_address(law: Any, signature: Any) -> int:

@@ -11,15 +11,14 @@ from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.resuming import RESUME, saved_run
 from marlbc_mj.training.run import (
     CHECKPOINT,
     COUNTED,
-    RESUME,
     Interrupted,
     TrainingScores,
     begin_folder,
     decide_and_save,
-    saved_run,
     training_in,
     write_table,
 )

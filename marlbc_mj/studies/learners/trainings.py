@@ -20,6 +20,7 @@ from marlbc_mj.studies.protocol import Report, Stopped, Watch
 from marlbc_mj.studies.runner import run_jobs
 from marlbc_mj.training import run as training
 from marlbc_mj.training.config import TrainConfig, from_json, make_config
+from marlbc_mj.training.resuming import RESUME
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, unknown
 from marlbc_mj.util.files import alone_in, write_json
 from marlbc_mj.util.progress import Progress, silent
@@ -208,13 +209,13 @@ def _trained(folder: Path) -> str | None:
     """Hash of the configuration that the folder's run finished with, or goes on with."""
     if (folder / DONE_MARK).is_file():
         return str(read_json(folder / DONE_MARK, "config_hash"))
-    if (folder / training.RESUME).is_file():
+    if (folder / RESUME).is_file():
         return config_hash({"train": from_json(read_json(folder / "config.json", "train"))})
     return None
 
 
 def _prune(folder: Path) -> None:
     """Leave evaluations, progress, configuration and the best checkpoint of a finished run."""
-    for path in (folder / training.RESUME, folder / FAILED_MARK, *(folder / "checkpoint").glob("last.*")):
+    for path in (folder / RESUME, folder / FAILED_MARK, *(folder / "checkpoint").glob("last.*")):
         path.unlink(missing_ok=True)
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)
