@@ -91,6 +91,7 @@ class Reference:
     """
 
     def __init__(self, values: Any) -> None:
+        self.__dict__.update(values._asdict())  # Python finds a field as fast as any attribute
         self.values = values
         self.owner, self.address = _hold(values)
         self._numba_type_ = ReferenceType(self.owner._numba_type_.field_dict["values"])
