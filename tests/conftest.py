@@ -3,19 +3,17 @@
 import os
 import signal
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
 
-from marlbc_mj.controllers import make_controller
-from marlbc_mj.engine.world import World
-from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.scenarios import paper
-from marlbc_mj.supervisors import make_supervisor
+if TYPE_CHECKING:
+    from marlbc_mj.episode import Trajectory
 
 if find_spec("triton"):  # as builds of torch with CUDA have it; its LLVM crashes if a software renderer's is loaded first
     import_module("torch._dynamo")
@@ -52,33 +50,58 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=left)
 
 
-@pytest.fixture(scope="module")
-def coarse_figures() -> Iterator[None]:
-    """Figures of 75 dpi in the place of 300, whose fonts need no subsets, in a third of the time: for tests of what a command writes,
-    not of what its figures show.
+@pytest.fixture(scope="session", autouse=True)
+def plain_fonts() -> Iterator[None]:
+    """Fonts lose their tables for ligatures and kerning before a PDF takes a subset of them: neither is used, and reading them
+    takes most of that time.
     """
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in (("savefig.dpi", 75), ("pdf.fonttype", 3)):
-            patch.setitem(import_module("marlbc_mj.report.plotting")._STYLE, name, value)
+        options = import_module("fontTools.subset").Options
+        patch.setattr(options, "_drop_tables_default", [*options._drop_tables_default, "GDEF", "GPOS", "GSUB"])
         yield
 
 
+@pytest.fixture(scope="module")
+def coarse_figures() -> Iterator[None]:
+    """Figures of 75 dpi in the place of 300, which take a third of the time: for tests of what a command writes, not of what its
+    figures show.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(import_module("marlbc_mj.report.plotting")._STYLE, "savefig.dpi", 75)
+        yield
+
+
+@pytest.fixture(scope="session")
+def short_warm_up() -> Callable[[], AbstractContextManager[None]]:
+    """Returns a context that trains with the warm-up of a quarter of the worlds, and a tenth of the auto-encoder's training."""
+
+    @contextmanager
+    def shorter() -> Iterator[None]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("marlbc_mj.training.trainer.WARM_UP", 1_250)
+            patch.setattr("marlbc_mj.training.codes.MINIBATCHES", 50)
+            yield
+
+    return shorter
+
+
 @pytest.fixture
-def quick_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The warm-up of a quarter of the worlds, and a tenth of the auto-encoder's training: for tests that compare two learners."""
-    monkeypatch.setattr("marlbc_mj.training.trainer.WARM_UP", 1_250)
-    monkeypatch.setattr("marlbc_mj.training.codes.MINIBATCHES", 50)
+def quick_warm_up(short_warm_up: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
+    """A test that has :func:`short_warm_up` all the time: of those that compare two learners."""
+    with short_warm_up():
+        yield
 
 
-Episode = Callable[..., Trajectory]
+Episode = Callable[..., "Trajectory"]
 
 
 @pytest.fixture(scope="session")
 def episode() -> Episode:
     """``episode(supervisor, controller, native=None, **scenario changes)``: a whole case-study episode, kept for the session."""
+    from marlbc_mj import World, make_controller, make_supervisor, paper, run_episode  # not where pytest only shares tests out
 
     @cache
-    def run(supervisor: str, controller: str, native: bool | None = None, **changes: Any) -> Trajectory:
+    def run(supervisor: str, controller: str, native: bool | None = None, **changes: Any) -> "Trajectory":
         world = World(paper(**changes), make_controller(controller), record=True, native=native)
         return run_episode(world, make_supervisor(supervisor), names=(supervisor, controller))
 
