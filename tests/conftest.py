@@ -1,5 +1,6 @@
 """Shared by all tests: hypothesis settings, and the expensive episodes, each run once per session."""
 
+import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
@@ -37,6 +38,17 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--slow``: also the tests that take over about five seconds each, as ``make test-all`` does."""
     parser.addoption("--slow", action="store_true", help="also run tests marked slow")
+
+
+def pytest_sessionstart() -> None:
+    """While tests are collected nothing becomes garbage."""
+    gc.disable()
+
+
+def pytest_collection_finish() -> None:
+    """What was imported stays until the end, so that later searches for garbage need not look through it."""
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
