@@ -9,6 +9,10 @@ PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
 BIN := .venv/bin
 STAMP := .venv/installed
+INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
+# WARM=1 compiles what the tests need while pip, which uses one core, installs the rest. These packages are enough for that.
+WARM ?=
+COMPILING := cattrs glfw lazy-loader mujoco numba safetensors scipy
 
 # What the caller's shell may hold that would send an installation elsewhere or let foreign packages in.
 # Where packages come from (index, links, proxy, certificates, cache) stays the caller's business.
@@ -69,7 +73,7 @@ lint: venv
 wheel: venv
 	@rm -rf build dist
 	@$(BIN)/python -m build --no-isolation --outdir dist . >/dev/null
-	@$(BIN)/python -c 'import twine' 2>/dev/null || $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[release]'
+	@$(BIN)/python -c 'import twine' 2>/dev/null || $(INSTALL) -e '.[release]'
 	@$(BIN)/python -m twine check --strict dist/*
 	@$(BIN)/python tests/wheel.py dist
 
@@ -82,7 +86,7 @@ wheel-test: wheel
 # and --strict would refuse nothing.
 docs: venv
 	@$(BIN)/python -c 'import mkdocs, material, mkdocstrings_handlers.python' 2>/dev/null || \
-		$(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[docs]'
+		$(INSTALL) -e '.[docs]'
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir out/docs
 	@echo out/docs/index.html
 
@@ -116,5 +120,11 @@ venv:
 		rm -rf .venv; "$$python" -m venv .venv;; \
 	esac; \
 	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
-	rm -f $(STAMP); $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt -e '.[dev]'; \
+	rm -f $(STAMP); warming=; \
+	if [ -n '$(WARM)' ]; then \
+		$(INSTALL) $(COMPILING); \
+		PYTHONPATH="$$PWD" $(BIN)/python tests/warm_cache.py & warming=$$!; \
+	fi; \
+	$(INSTALL) -e '.[dev]'; \
+	if [ -n "$$warming" ]; then wait "$$warming"; fi; \
 	echo "$$wanted" > $(STAMP)
