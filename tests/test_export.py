@@ -20,12 +20,23 @@ from marlbc_mj.supervisors import LEARNED
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.export import IR, OPSET
 
-onnx = pytest.importorskip("onnx")
-pytest.importorskip("onnxscript")
-runtime = pytest.importorskip("onnxruntime")
-
 AGENTS, ACTIONS = 4, 4
 SIZE = make_state("extended", paper()).size
+
+
+@pytest.fixture(scope="module", autouse=True)
+def libraries():
+    """Loaded where these tests run, instead of in every process that collects them."""
+    for name in ("onnx", "onnxscript", "onnxruntime"):
+        pytest.importorskip(name)
+
+
+def session_of(path):
+    """An exported policy as a runtime on one thread has it."""
+    runtime = pytest.importorskip("onnxruntime")
+    options = runtime.SessionOptions()
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    return runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
 
 
 def random_policy(dueling, risk, margin=1.1, networks=AGENTS, actions=ACTIONS, hidden=(16, 12), seed=0):
@@ -40,9 +51,7 @@ def export(policy, folder, actions="commands"):
     checkpoint, out = folder / "policy.safetensors", folder / "policy.onnx"
     write_policy(checkpoint, policy, {"signature": signature(paper(), "extended", actions, 10), "train": TrainConfig()})
     main(["export", str(checkpoint), str(out)])
-    options = runtime.SessionOptions()
-    options.intra_op_num_threads = options.inter_op_num_threads = 1
-    return runtime.InferenceSession(str(out), options, providers=["CPUExecutionProvider"])
+    return session_of(out)
 
 
 @pytest.mark.slow
@@ -76,7 +85,7 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     policy, _ = read_policy(shipped(name))
     out = tmp_path / "policy.onnx"
     main(["export", str(shipped(name)), str(out)])
-    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
+    session = session_of(out)
     rng = np.random.default_rng(2)
     states = rng.uniform(-1.0, 1.0, (500, len(policy.scale))).astype(np.float32)
     last, fresh = rng.integers(policy.columns, size=(500, AGENTS)), rng.random(500) < 0.1
@@ -94,7 +103,7 @@ def test_the_general_policy_is_exported_as_it_decides(tmp_path):
     policy, _ = read_general(shipped("marlms-general"))
     out, rng = tmp_path / "agent.onnx", np.random.default_rng(3)
     main(["export", str(shipped("marlms-general")), str(out)])
-    session = runtime.InferenceSession(str(out), providers=["CPUExecutionProvider"])
+    session = session_of(out)
     assert json.loads(session.get_modelmeta().custom_metadata_map["layout"]) == INPUT_LAYOUT
     for teams, agents in ((1, 4), (7, 9), (2, 1)):
         features = rng.normal(size=(teams, agents, FEATURES)).astype(np.float32)
@@ -121,7 +130,7 @@ def test_the_file_says_what_it_is_for(tmp_path, capsys):
     assert json.loads(said["signature"]) == signature(paper(), "extended", "avoidance", 10)
     assert [name.split(">")[0] for name in json.loads(said["actions"])] == ["FM", "OA"]
     assert float(said["margin"]) == 1.1 and float(said["risk"]) == 0.1
-    model = onnx.load(tmp_path / "policy.onnx")
+    model = pytest.importorskip("onnx").load(tmp_path / "policy.onnx")
     assert (model.ir_version, [one.version for one in model.opset_import]) == (IR, [OPSET])
     assert str(Path(__file__).parents[1]).encode() not in model.SerializeToString()  # nor any other path of this computer
     line = capsys.readouterr().out

@@ -16,7 +16,11 @@ from marlbc_mj.scenarios import Scenario, make_scenario
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
-chunk: Any = pytest.importorskip("rerun.chunk")
+
+@pytest.fixture(scope="module", autouse=True)
+def rerun() -> None:
+    """Loaded where these tests run, instead of in every process that collects them."""
+    pytest.importorskip("rerun.chunk")
 
 
 def logged(path: Path, scenario: Scenario) -> Path:
@@ -28,6 +32,7 @@ def logged(path: Path, scenario: Scenario) -> Path:
 def entities(path: Path) -> dict[str, dict[str, Any]]:
     """Columns by entity: of what changes in time and of what does not."""
     found: dict[str, dict[str, Any]] = {}
+    chunk: Any = pytest.importorskip("rerun.chunk")
     for each in chunk.RrdReader(str(path)).stream():
         batch = each.to_record_batch()
         for name in batch.schema.names:
