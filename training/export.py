@@ -42,11 +42,12 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     more than the margin. A network over joint actions has ``values`` (batch, 1, A^N). The metadata are texts: ``signature``
     (JSON: what the policy is tied to), ``actions`` (JSON: the order that each index stands for), ``margin`` and ``risk``.
 
-    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent has of its own; ``heard`` (batch,
-    agents, M) float32, the last vector heard of each agent, its own included: the first M of its F; ``age`` (batch, agents)
-    float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action in force,
-    negative for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata are
-    ``layout`` (JSON, what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and ``margin``.
+    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent has of its own; ``heard``
+    (batch, agents, M) float32, the last vector heard of each agent, its own included: the first M of its F; ``age`` (batch,
+    agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
+    in force, negative for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata
+    are ``layout`` (JSON, what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and
+    ``margin``.
 
     Args:
         checkpoint: the checkpoint's file.
