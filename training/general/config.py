@@ -106,7 +106,7 @@ class GeneralConfig:
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that is out of its slot's tolerance when the mission ends."""
-    switching_margin: float = 0.3
+    switching_margin: float = 0.05
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
