@@ -11,7 +11,7 @@ import pytest
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
 from marlbc_mj.policies.general import Sensed, read_general
-from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, join_inputs
+from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.policies.states import make_state
@@ -107,7 +107,7 @@ def test_the_general_policy_is_exported_as_it_decides(tmp_path):
     assert json.loads(session.get_modelmeta().custom_metadata_map["layout"]) == INPUT_LAYOUT
     for teams, agents in ((1, 4), (7, 9), (2, 1)):
         features = rng.normal(size=(teams, agents, FEATURES)).astype(np.float32)
-        heard = rng.normal(size=(teams, agents, agents, FEATURES)).astype(np.float32)
+        heard = rng.normal(size=(teams, agents, agents, SENT)).astype(np.float32)
         age = np.where(rng.random((teams, agents, agents)) < 0.3, np.inf, rng.uniform(0.0, 5.0, (teams, agents, agents)))
         last, fresh = rng.integers(2, size=(teams, agents)), np.arange(teams) % 2 == 1
         rows = teams * agents

@@ -49,7 +49,7 @@ def sight_of(length: float, time: float, speed=(1.0, 0.3)) -> inputs.Sight:
     """Slots, path and bins in units of ``length`` and ``time``."""
     slots = length * np.random.default_rng(1).normal(scale=4.0, size=(2, 3, 2))
     path = np.array([(0.0, 1.0), np.array(speed) / time]) * length
-    return inputs.Sight(slots, path, time * np.array(inputs.EDGES), length, time, np.array([False, True]))
+    return inputs.Sight(slots, path, time * np.array(inputs.EDGES), length, time, 20.0 * time, np.array([False, True]))
 
 
 def sensed(sight: inputs.Sight, length: float, time: float, moving: bool) -> np.ndarray:
@@ -100,14 +100,14 @@ def test_the_way_to_a_slot_sees_what_is_between() -> None:
 
 def test_all_hearing_all_is_the_limit_of_hearing_each() -> None:
     features = np.random.default_rng(0).normal(size=(3, 5, inputs.FEATURES)).astype(np.float32)
-    one = inputs.join_inputs(features, features[:, None], np.zeros((3, 1, 5)))
-    each = inputs.join_inputs(features, np.repeat(features[:, None], 5, axis=1), np.zeros((3, 5, 5)))
+    one = inputs.join_inputs(features, features[:, None, :, : inputs.SENT], np.zeros((3, 1, 5)))
+    each = inputs.join_inputs(features, np.repeat(features[:, None, :, : inputs.SENT], 5, axis=1), np.zeros((3, 5, 5)))
     np.testing.assert_array_equal(one, each)
 
 
 def test_pooling_does_not_ask_who_spoke() -> None:
     rng = np.random.default_rng(0)
-    heard, age = rng.normal(size=(2, 1, 6, inputs.FEATURES)).astype(np.float32), rng.uniform(0.0, 9.0, (2, 1, 6))
+    heard, age = rng.normal(size=(2, 1, 6, inputs.SENT)).astype(np.float32), rng.uniform(0.0, 9.0, (2, 1, 6))
     order = rng.permutation(6)
     np.testing.assert_allclose(
         inputs.pool_heard(heard[:, :, order], age[:, :, order]), inputs.pool_heard(heard, age), rtol=1e-6, atol=1e-6
@@ -117,7 +117,7 @@ def test_pooling_does_not_ask_who_spoke() -> None:
 def test_what_was_never_heard_counts_for_nothing() -> None:
     """And says so: the share of agents heard is an input."""
     rng = np.random.default_rng(0)
-    heard, age = rng.normal(size=(1, 1, 4, inputs.FEATURES)).astype(np.float32), np.array([[[0.0, 2.0, np.inf, np.inf]]])
+    heard, age = rng.normal(size=(1, 1, 4, inputs.SENT)).astype(np.float32), np.array([[[0.0, 2.0, np.inf, np.inf]]])
     other = heard.copy()
     other[..., 2:, :] = 1e6
     pooled = inputs.pool_heard(heard, age)
@@ -131,7 +131,7 @@ def test_who_hears_nothing_decides_by_itself() -> None:
     features = rng.normal(size=(1, 3, inputs.FEATURES)).astype(np.float32)
     age = np.where(np.eye(3, dtype=bool), 0.0, np.inf)[None]
     policy, now = random_policy(), Sensed(features, np.zeros((1, 3), np.int64), np.array([True]))
-    heard = np.repeat(features[:, None], 3, axis=1)
+    heard = np.repeat(features[:, None, :, : inputs.SENT], 3, axis=1)
     alone = policy.decide(now, heard, age)
     heard[:, 0, 1:], heard[:, 1, ::2], heard[:, 2, :2] = 7.0, -7.0, 3.0
     np.testing.assert_array_equal(policy.decide(now, heard, age), alone)
@@ -157,10 +157,10 @@ def test_teams_do_not_depend_on_each_other() -> None:
     seen = world.reset(3)
     sight, policy = inputs.make_sight(scenario), random_policy()
     features = inputs.sense_features(seen, sight)
-    whole = inputs.join_inputs(features, features[:, None], np.zeros((5, 1, 4)))
+    whole = inputs.join_inputs(features, policy.messages(features)[:, None], np.zeros((5, 1, 4)))
     for b in range(5):
         part = features[b : b + 1]
-        alone = inputs.join_inputs(part, part[:, None], np.zeros((1, 1, 4)))
+        alone = inputs.join_inputs(part, policy.messages(part)[:, None], np.zeros((1, 1, 4)))
         np.testing.assert_array_equal(policy.values(alone[0]), policy.values(whole.reshape(-1, inputs.INPUTS))[4 * b : 4 * b + 4])
 
 
@@ -175,6 +175,19 @@ def test_the_column_and_its_age_are_inputs() -> None:
     features = inputs.sense_features(after, inputs.make_sight(scenario))[0]
     assert (features[:, inputs.COLUMN_ENTRY] == 0.0).all()
     assert (features[:, inputs.AGE_ENTRIES] < 0.1).all()
+
+
+def test_the_end_of_the_mission_is_known_and_not_sent() -> None:
+    """1 at the end, 1/e the coarser scale before it, nothing long before."""
+    scenario = field()
+    sight, world = inputs.make_sight(scenario), World(scenario)
+    observation = world.observe()
+    for left, wanted in ((0.0, (1.0, 1.0)), (inputs.COARSEST, (np.exp(-inputs.COARSEST / inputs.COARSE), np.exp(-1.0)))):
+        now = observation._replace(time=np.array([scenario.duration - left * sight.time]))
+        features = inputs.sense_features(now, sight)
+        np.testing.assert_allclose(features[0, :, inputs.ENDING :], np.tile(wanted, (4, 1)), rtol=1e-5)
+    assert inputs.sense_features(observation, sight)[..., inputs.ENDING :].max() < 2e-3
+    assert random_policy().messages(features).shape == (1, 4, inputs.SENT)
 
 
 @pytest.mark.parametrize(

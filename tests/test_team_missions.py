@@ -66,11 +66,29 @@ def test_an_episode_ends_where_an_agent_is_lost() -> None:
     squad.end[:] = squad.scenario.mission_steps
     greedy = np.full((1, 6), FORMATION)
     outcomes = [squad.step(greedy, 0.0) for _ in range(90)]
-    first = next(k for k, outcome in enumerate(outcomes) if outcome.lost.any())
+    first = next(k for k, outcome in enumerate(outcomes) if outcome.terminal.any())
     assert first > LOST_AFTER
     assert outcomes[first].ended.all()
     np.testing.assert_allclose(outcomes[first].reward, -1.3 / (1.0 - config.gamma), rtol=1e-6)
     assert all(outcome.reward.min() >= -1.3 for outcome in outcomes[:first])
+
+
+def test_a_mission_is_over_at_its_end_and_who_is_late_pays() -> None:
+    """The last decision of a whole mission is terminal; where an episode is cut short, to begin in another phase, it is not."""
+    config = GeneralConfig(families=("field",), teams=("wedge-4",), lossy=0.0, guided=0.0, least_exploration=0.0)
+    mission = team_mission("field", "wedge", 4, composition="set-based", substep=0.01, duration=6.0)
+    squad = Squad(mission, config, learner_config(config), 0)
+    squad.end[:] = 3 * squad.interval
+    early = [squad.step(np.full((1, 4), FORMATION), 0.0) for _ in range(3)]
+    assert early[-1].ended.all() and not any(outcome.terminal.any() for outcome in early)
+    action, last = np.full((1, 4), COLUMN_ACTION), -(-mission.mission_steps // squad.interval) - 1
+    column = [squad.step(action, 0.0) for _ in range(last + 1)]
+    assert [bool(outcome.terminal.all()) for outcome in column] == [False] * last + [True]
+    late = column[-1].final[0, :, WAYS] > np.tanh(mission.formation_tolerance / mission.safe_distance)
+    assert late.any()
+    costs = -column[-1].reward[0]
+    assert (costs[late] >= config.late_cost).all() and (costs[~late] <= 1.0 + config.stray_cost).all()
+    assert (np.array([-outcome.reward for outcome in column[:-1]]) <= 1.0 + config.stray_cost + config.switch_cost).all()
 
 
 @pytest.mark.parametrize("approach", ["straight", "line"])

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.general import ACTIONS_OF_AGENT, INTERVAL, GeneralPolicy, is_general, read_general
-from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, WAYS
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
@@ -42,11 +42,12 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     more than the margin. A network over joint actions has ``values`` (batch, 1, A^N). The metadata are texts: ``signature``
     (JSON: what the policy is tied to), ``actions`` (JSON: the order that each index stands for), ``margin`` and ``risk``.
 
-    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent sensed, which it also sends;
-    ``heard`` (batch, agents, F) float32, the last vector heard of each agent, its own included; ``age`` (batch, agents) float32,
-    how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action in force, negative
-    for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata are ``layout`` (JSON,
-    what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and ``margin``.
+    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent has of its own; ``heard``
+    (batch, agents, M) float32, the last vector heard of each agent, its own included: the first M of its F; ``age`` (batch,
+    agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
+    in force, negative for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata
+    are ``layout`` (JSON, what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and
+    ``margin``.
 
     Args:
         checkpoint: the checkpoint's file.
@@ -96,7 +97,7 @@ def _general_model(checkpoint: Path) -> tuple[Any, str]:
         "margin": repr(policy.network.margin),
     }
     return build_general(policy, metadata), (
-        f"features (batch, {FEATURES}), heard (batch, agents, {FEATURES}), age (batch, agents) and last (batch,) give "
+        f"features (batch, {FEATURES}), heard (batch, agents, {SENT}), age (batch, agents) and last (batch,) give "
         f"values (batch, {ACTIONS_OF_AGENT}) and action (batch,)"
     )
 
@@ -164,7 +165,7 @@ class AgentPolicy(nn.Module):
         self.team = TeamPolicy(policy.network, 1)
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, 2) and chosen actions (B,) from features (B, F), vectors heard (B, N, F), their ages (B, N), last actions
+        """Values (B, 2) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
         (B,), negative for none.
         """
         values, chosen = self.team(torch.cat([features, pool(heard, age)], dim=-1), last[:, None])
@@ -172,7 +173,7 @@ class AgentPolicy(nn.Module):
 
 
 def pool(heard: Tensor, age: Tensor) -> Tensor:
-    """(B, P) of vectors heard (B, N, F) and their ages (B, N)."""
+    """(B, P) of vectors heard (B, N, M) and their ages (B, N)."""
     known = torch.isfinite(age)[..., None]
     count = known.sum(dim=1).clamp(min=1)
     counted = torch.cat([(heard[..., :WAYS] < 0.0).to(heard.dtype), heard[..., WAYS:]], dim=-1)
@@ -212,7 +213,7 @@ def build_general(policy: GeneralPolicy, metadata: dict[str, str]) -> Any:
     """The ``onnx.ModelProto`` of one agent under a general policy, checked; see :func:`export_policy`."""
     inputs = {
         "features": torch.zeros(2, FEATURES),
-        "heard": torch.zeros(2, 3, FEATURES),
+        "heard": torch.zeros(2, 3, SENT),
         "age": torch.zeros(2, 3),
         "last": torch.zeros(2, dtype=torch.int64),
     }

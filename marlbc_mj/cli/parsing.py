@@ -18,8 +18,10 @@ from marlbc_mj.cli.choices import WrongWord
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import nearest_word, one_line
 
-LEAST = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1}
+LEAST = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1, "--agents": 2}
 """Smallest numbers of options that mean the same in every command."""
+ABOVE_ZERO = ("--duration", "--substep")
+"""Options that take times above zero in every command."""
 
 
 class Refusal(NamedTuple):
@@ -112,12 +114,22 @@ def check_words(chosen: Chosen) -> None:
 
 
 def check_least(option: str, word: str) -> None:
-    """Raise WrongWord for a number below what the option takes in every command. Studies check it, too, once they are loaded."""
+    """Raise WrongWord for a number below what the option takes in every command. What it is for checks it, too, once loaded."""
+    if option in ABOVE_ZERO and (number := _number(word)) is not None and number <= 0.0:
+        raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} must be positive and finite, got {number}"))
     least = LEAST.get(option)
     if least is None or not word.removeprefix("-").isdecimal() or int(word) >= least:
         return
     bound = f"must be at least {least}" if least else "must not be negative"
     raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} {bound}, got {int(word)}"))
+
+
+def _number(word: str) -> float | None:
+    """A word as a number; None if it is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return None
 
 
 def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:

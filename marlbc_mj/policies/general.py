@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general_inputs import INPUT_LAYOUT, INPUTS, Sight, join_inputs
+from marlbc_mj.policies.general_inputs import INPUT_LAYOUT, INPUTS, SENT, Sight, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -40,15 +40,15 @@ class GeneralPolicy(NamedTuple):
     network: Policy  # of one network, INPUTS wide, with two action values
 
     def messages(self, features: np.ndarray) -> np.ndarray:
-        """(B, N, F) what each agent sends to the others: what it sensed."""
-        return features
+        """(B, N, M) what each agent sends to the others: what it sensed."""
+        return features[..., :SENT]
 
     def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
         """(B, N) actions: the better one if its value leads by more than the margin, else the one in force.
 
         Args:
             sensed: by each agent.
-            heard: (B, N, N, F) or (B, 1, N, F), see :func:`join_inputs`; row i is what agent i has heard of each agent.
+            heard: (B, N, N, M) or (B, 1, N, M), see :func:`join_inputs`; row i is what agent i has heard of each agent.
             age: (B, N, N) or (B, 1, N) of these [T]; infinite where nothing was heard.
         """
         inputs = join_inputs(sensed.features, heard, age)

@@ -2,8 +2,8 @@
 
 Everything is relative and free of scale: lengths count in safe distances d_OA, times in settling times
 T = d_OA / v_max + 1 / min(Lambda, alpha), the time in which a reference covers d_OA and settles. So a larger robot, a slower one
-and a team of another size all see the same numbers. An agent needs its own position, its two slots, the path and the obstacles
-around its lanes; no place on the map, no time and no list of obstacles are among the inputs.
+and a team of another size all see the same numbers. An agent needs its own position, its two slots, the path with its end and the
+obstacles around its lanes; no place on the map and no list of obstacles are among the inputs.
 
 A *lane* is the way of a slot along the path. Its profile is the least clearance from obstacles, beyond d_OA, within each of a
 number of time bins around now; slot and obstacle both move in straight lines, so nothing is sampled.
@@ -37,14 +37,18 @@ ERRORS = WAYS + 4
 """Entries from WAYS to ERRORS - 1: distances from both slots, each on two scales."""
 COLUMN_ENTRY, AGE_ENTRIES, CLEARANCE_ENTRY = ERRORS, ERRORS + 1, ERRORS + 3
 """Entries after these: whether the agent is in the column, the age of that on two scales, and its clearance now."""
-FEATURES = CLEARANCE_ENTRY + 1
-"""F, entries that an agent senses; it sends all of them."""
-POOLED = 2 * FEATURES + (AGE_ENTRIES + 2 - WAYS) + 2
+SENT = CLEARANCE_ENTRY + 1
+"""M, entries that an agent senses and sends."""
+ENDING = SENT
+"""Entries from ENDING on are not sent, as everybody knows them: how near the end of the mission is, on two scales."""
+FEATURES = ENDING + 2
+"""F, entries that an agent has of its own."""
+POOLED = 2 * SENT + (AGE_ENTRIES + 2 - WAYS) + 2
 """Entries that are pooled of what was heard: minima, means, maxima of errors and ages, share heard, age of the oldest."""
 INPUTS = FEATURES + POOLED
 """S, entries of a network's input."""
 INPUT_LAYOUT: dict[str, float | list[float]] = {
-    **{"version": 1, "features": FEATURES, "pooled": POOLED, "edges": list(EDGES)},
+    **{"version": 2, "features": FEATURES, "sent": SENT, "pooled": POOLED, "edges": list(EDGES)},
     **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
 }
 """Layout of the inputs, on which a network's weights depend; ``version`` is raised when entries change their meaning."""
@@ -58,6 +62,7 @@ class Sight(NamedTuple):
     edges: np.ndarray  # (LANE_BINS + 1,) of the lanes' time bins [s]
     length: float  # d_OA [m]
     time: float  # T [s]
+    end: float  # of the mission [s]
     is_column: np.ndarray  # (C,) bool, commands that end in the column
 
 
@@ -83,7 +88,7 @@ def make_sight(scenario: Scenario) -> Sight:
         raise ConfigurationError(f"scenario {scenario.name!r} has no column: the slots of {second} are those of {first}")
     unit = settling_time(scenario)
     columns = [name.endswith(scenario.formation_names[1]) for name in scenario.orders.commands]
-    return Sight(slots, path, unit * np.array(EDGES), float(scenario.safe_distance), unit, np.array(columns))
+    return Sight(slots, path, unit * np.array(EDGES), float(scenario.safe_distance), unit, scenario.duration, np.array(columns))
 
 
 def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
@@ -116,6 +121,9 @@ def _fill_features(sight, column, time, position, clearance, age, obstacles, fea
             row[AGE_ENTRIES] = 1.0 - np.exp(-age[b, i] / (COARSE * sight.time))
             row[AGE_ENTRIES + 1] = 1.0 - np.exp(-age[b, i] / (COARSEST * sight.time))
             row[CLEARANCE_ENTRY] = _beyond(clearance[b, i], sight.length)
+            left = max(sight.end - time[b], 0.0) / sight.time
+            row[ENDING] = np.exp(-left / COARSE)
+            row[ENDING + 1] = np.exp(-left / COARSEST)
 
 
 @allocation_free
@@ -164,7 +172,7 @@ def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
     Minima and means are over the senders heard so far; the means of clearances are shares of negative ones: of blocked lanes.
 
     Args:
-        heard: (B, R, N, F) last feature vectors heard of each sender.
+        heard: (B, R, N, M) last vectors heard of each sender.
         age: (B, R, N) how old they are [T]; infinite where nothing was heard.
     """
     known = np.isfinite(age)[..., None]
@@ -185,7 +193,7 @@ def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
 def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
     """(B, N, S) float32 inputs of the network: an agent's features (B, N, F), and what it heard, pooled.
 
-    ``heard`` (B, N, N, F) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, F) and (B, 1, N) where all hear all.
+    ``heard`` (B, N, N, M) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, M) and (B, 1, N) where all hear all.
     """
     pooled = pool_heard(heard, age)
     return np.concatenate([features, np.broadcast_to(pooled, (*features.shape[:2], POOLED))], axis=-1)

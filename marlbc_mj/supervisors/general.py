@@ -19,7 +19,7 @@ import numpy as np
 from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.policies.general import FORMATION, GeneralPolicy, Sensed, decision_steps, motion_orders, read_general
-from marlbc_mj.policies.general_inputs import FEATURES, Sight, make_sight, sense_features
+from marlbc_mj.policies.general_inputs import SENT, Sight, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
 
@@ -66,7 +66,7 @@ class General:
         if scenario.communication == IDEAL:
             return memory
         layer = make_layer(scenario)
-        return memory._replace(layer=layer, network=layer.start(teams, FEATURES))
+        return memory._replace(layer=layer, network=layer.start(teams, SENT))
 
     def decide(self, observation: Observation, memory: GeneralMemory) -> tuple[np.ndarray, GeneralMemory]:
         """Formation or column for every agent; the one in force unless the other is better by more than the margin."""

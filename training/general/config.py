@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES, SENT
 from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
@@ -104,6 +104,8 @@ class GeneralConfig:
     """Cost of an agent's own switch; a decision in formation costs nothing, in column 0.5, in neither 1."""
     stray_cost: Annotated[float, NOT_NEGATIVE] = 0.3
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
+    late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
+    """Cost of an agent that is out of its slot's tolerance when the mission ends."""
     switching_margin: float = 0.05
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
@@ -182,7 +184,7 @@ def input_mask(config: GeneralConfig) -> np.ndarray | None:
     if not config.hide:
         return None
     mask = np.ones((1, INPUTS), dtype=np.float32)
-    offsets = (0, FEATURES, 2 * FEATURES)  # own, minima, means
+    offsets = (0, FEATURES, FEATURES + SENT)  # own, minima, means
     for name in config.hide:
         if name == "pooled":
             mask[:, FEATURES:] = 0.0

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from marlbc_mj.policies.general import mean_policy, read_general, write_general
-from marlbc_mj.policies.general_inputs import FEATURES, INPUTS
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, SENT
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.training.config import flat_settings
@@ -19,7 +19,8 @@ from marlbc_mj.util.provenance import plain_data, provenance
 
 _WHAT = (
     "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself between "
-    f"formation and column, from {FEATURES} numbers that it senses and {INPUTS - FEATURES} that it pools of what it heard. It "
+    f"formation and column, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} that it pools "
+    "of what it heard. It "
     "needs the set-based composition, a formation with a column and a path that moves."
 )
 

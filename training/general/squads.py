@@ -9,7 +9,7 @@ from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, decision_steps, motion_orders
-from marlbc_mj.policies.general_inputs import COARSE, LANE_BINS, LANES, WAYS, join_inputs, make_sight, sense_features
+from marlbc_mj.policies.general_inputs import COARSE, LANE_BINS, LANES, SENT, WAYS, join_inputs, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
@@ -31,12 +31,12 @@ class SquadOutcome(NamedTuple):
     reward: np.ndarray  # (W, N) float32
     final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
     ended: np.ndarray  # (W,) bool, a new episode has begun
-    lost: np.ndarray  # (W,) bool, because an agent was lost: the reward has the cost of the time after that, too
+    terminal: np.ndarray  # (W,) bool, nothing comes after: the mission is over, or the reward has the cost of the time after, too
     steps: int  # mission steps made, over all worlds
 
 
 class Squad:
-    """W worlds of one scenario. Missions end without a terminal state: agents do not know the time.
+    """W worlds of one scenario.
 
     Args:
         scenario: that layouts are drawn of.
@@ -54,14 +54,16 @@ class Squad:
         self.explore = Exploration(learning, scenario.agents, len(self.orders))
         self.rng = stream(config.seed, number)
         self.last = np.full((config.worlds, scenario.agents), FORMATION, dtype=np.int64)
-        self.heard = np.zeros((config.worlds, scenario.agents, *self._sense().shape[1:]), dtype=np.float32)
+        self.heard = np.zeros((config.worlds, scenario.agents, self._sense().shape[1], SENT), dtype=np.float32)
         self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
         self.loss = np.zeros(config.worlds)  # share of messages missed
         self.bins = np.zeros(config.worlds, dtype=np.int64)  # of lanes, that a guided episode looks at; 0: not guided
         self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
-        self.end = np.full(config.worlds, scenario.mission_steps)  # mission step from which no decision is left
+        self.last_decision = scenario.mission_steps - self.interval + 1  # mission step from which no decision is left
+        self.end = np.full(config.worlds, self.last_decision)  # mission step at which an episode ends
         self._restart(np.ones(config.worlds, dtype=bool))
-        self.end = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that phases differ
+        phases = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that they differ
+        self.end = np.minimum(phases, self.last_decision)
         self.inputs = self._exchange()  # (W, N, S) of the next decision
 
     @property
@@ -79,7 +81,7 @@ class Squad:
         arrives |= np.eye(features.shape[1], dtype=bool)
         if only is not None:
             arrives &= only[:, None, None]
-        np.copyto(self.heard, features[:, None], where=arrives[..., None])
+        np.copyto(self.heard, features[:, None, :, :SENT], where=arrives[..., None])
         self.age = np.where(arrives, 0.0, self.age + (1.0 if only is None else only[:, None, None]))
         return join_inputs(features, self.heard, self.age * self.interval * self.scenario.mission_step / self.sight.time)
 
@@ -93,6 +95,8 @@ class Squad:
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()
         reward = team[:, None] - self.config.switch_cost * switched - self.config.stray_cost * final[..., WAYS + 1]
+        over = self.world.state.steps >= self.last_decision
+        reward -= self.config.late_cost * (over[:, None] & self._late(final))
         lost = self._lost(final)
         reward[lost] = -(1.0 + self.config.stray_cost) / (1.0 - self.config.gamma)
         ended = lost | (self.world.state.steps >= self.end)
@@ -100,7 +104,11 @@ class Squad:
         if ended.any():
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
-        return SquadOutcome(reward.astype(np.float32), final, ended, lost, self.interval * len(actions))
+        return SquadOutcome(reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
+
+    def _late(self, inputs: np.ndarray) -> np.ndarray:
+        """(W, N) bool: agents beyond the tolerance of their slots in the formation; ``inputs`` (W, N, S)."""
+        return np.asarray(inputs[..., WAYS] > np.tanh(self.scenario.formation_tolerance / self.sight.length))
 
     def _lost(self, inputs: np.ndarray) -> np.ndarray:
         """(W,) bool: an agent has been shut out for LOST_AFTER decisions, and neither its line nor moving obstacles let it in."""
@@ -132,7 +140,7 @@ class Squad:
         self.world.reset(int(self.rng.integers(2**31)), ended)
         self.explore.forget(ended)
         self.last[ended] = FORMATION
-        self.end[ended] = self.scenario.mission_steps - self.interval + 1
+        self.end[ended] = self.last_decision
         self.age[ended] = np.inf
         self.astray[ended] = 0
         lossy = self.rng.random(count) < config.lossy

@@ -109,7 +109,7 @@ class GeneralTrainer:
             lost=np.zeros((rows, 1), dtype=bool),
             code=np.zeros(rows, dtype=np.int64),
             ended=np.concatenate([np.repeat(o.ended, o.reward.shape[1]) for o in outcomes]),
-            terminal=np.concatenate([np.repeat(o.lost, o.reward.shape[1]) for o in outcomes])[:, None],
+            terminal=np.concatenate([np.repeat(o.terminal, o.reward.shape[1]) for o in outcomes])[:, None],
         )
         self.steps += sum(outcome.steps for outcome in outcomes)
 
