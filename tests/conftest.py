@@ -4,7 +4,6 @@ import gc
 import os
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -83,25 +82,11 @@ def coarse_figures() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session")
-def short_warm_up() -> Callable[[], AbstractContextManager[None]]:
-    """Returns a context that trains with the warm-up of a quarter of the worlds, and a tenth of the auto-encoder's training."""
-
-    @contextmanager
-    def shorter() -> Iterator[None]:
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("marlbc_mj.training.trainer.WARM_UP", 1_250)
-            patch.setattr("marlbc_mj.training.codes.MINIBATCHES", 50)
-            yield
-
-    return shorter
-
-
 @pytest.fixture
-def quick_warm_up(short_warm_up: Callable[[], AbstractContextManager[None]]) -> Iterator[None]:
-    """A test that has :func:`short_warm_up` all the time: of those that compare two learners."""
-    with short_warm_up():
-        yield
+def quick_warm_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The warm-up of a quarter of the worlds, and a tenth of the auto-encoder's training: for tests that compare two learners."""
+    monkeypatch.setattr("marlbc_mj.training.trainer.WARM_UP", 1_250)
+    monkeypatch.setattr("marlbc_mj.training.codes.MINIBATCHES", 50)
 
 
 Episode = Callable[..., "Trajectory"]

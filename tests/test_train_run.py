@@ -26,7 +26,6 @@ from marlbc_mj.scenarios.base import Perturbation, standard_behaviors
 from marlbc_mj.scenarios.case_study import COLUMN, SLOTS
 from marlbc_mj.studies.learners.trainings import LearnerStudy, train_learners
 from marlbc_mj.supervisors.learned import Learned
-from marlbc_mj.training import codes, trainer
 from marlbc_mj.training.codes import StateHash
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.general.config import GeneralConfig
@@ -45,14 +44,7 @@ SMALL = {
     "worlds": 128, "interval": 2, "hidden": (16,), "batch": 32, "updates": 1, "capacity": 7_000, "threads": 1,
     "start_length": 2.0,
 }  # fmt: skip
-FEW = {"worlds": 32, "capacity": 1_750, "budget": 12_000, "evaluate_every": 6_000}  # with a warm-up as short
-QUICK = """
-from marlbc_mj.cli import main
-from marlbc_mj.training import codes, trainer
-trainer.WARM_UP, codes.MINIBATCHES = {}
-main()
-"""
-"""The command line in another process, with a warm-up as short as it is here."""
+FEW = {"worlds": 32, "capacity": 1_750}  # with a warm-up as short
 
 
 def small(**changes) -> TrainConfig:
@@ -136,10 +128,9 @@ def test_seeds_differ_and_repeat():
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory, short_warm_up):
+def finished(tmp_path_factory):
     folder = tmp_path_factory.mktemp("train") / "run"
-    with short_warm_up():
-        train(small(**FEW), folder)
+    train(small(), folder)
     return folder
 
 
@@ -149,7 +140,7 @@ def test_a_run_leaves_what_the_design_fixes(finished):
     assert list(rows[0]) == [
         "wall_s", "mission_steps", "return", *(f"switches_{i}" for i in range(1, 5)), "violation_time", "clearance_min"
     ]  # fmt: skip
-    assert [float(r["mission_steps"]) for r in rows][-1] >= FEW["budget"]
+    assert [float(r["mission_steps"]) for r in rows][-1] >= 24_000
     config = json.loads((finished / "config.json").read_text())
     assert config["train"]["seed"] == 0 and "torch" in config["versions"]
     assert {p.name for p in (finished / "checkpoint").iterdir()} == {
@@ -168,14 +159,12 @@ def test_a_checkpoint_gives_the_evaluated_episode(finished):
     assert (held == held[:, :1]).all()
 
 
-@pytest.mark.usefixtures("quick_warm_up")
 def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     """kill -9 at any moment while it learns: what was saved last is enough to end with the same networks, to the bit."""
-    changes = {**SMALL, **FEW, "save_every": 0.1}
-    settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in changes.items() if k != "threads"]
+    settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in SMALL.items() if k != "threads"]
     folder = tmp_path / "run"
-    code = QUICK.format((trainer.WARM_UP, codes.MINIBATCHES))
-    command = [sys.executable, "-c", code, "train", "--out", str(folder), "--threads", "1", "--set", *settings]
+    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "24000"]
+    command += ["--set", *settings, "evaluate_every=12000", "save_every=0.3"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def updates():
@@ -187,7 +176,7 @@ def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     process.kill()
     assert process.wait() == -signal.SIGKILL
     saved = read_arrays(folder / RESUME)[1]["scalars"]
-    assert saved["updates"] > 0 and saved["steps"] < FEW["budget"]
+    assert saved["updates"] > 0 and saved["steps"] < 24_000
     config = json.loads((folder / "config.json").read_text())
     resume(folder)
     assert json.loads((folder / "config.json").read_text()) == config and not list(folder.rglob("*partial*"))
@@ -396,7 +385,7 @@ def test_overwriting_leaves_nothing_of_the_old_run(finished, tmp_path):
     (folder / "checkpoint" / ".best.partial-1.json").write_text("torn")
     (folder / "notes.txt").write_text("mine")
     with pytest.raises(Stopped):
-        train(small(seed=9, **FEW), folder, overwrite=True, progress=stop)
+        train(small(seed=9), folder, overwrite=True, progress=stop)
     assert json.loads((folder / "config.json").read_text())["train"]["seed"] == 9
     assert not (folder / "tensorboard" / "events.old").exists() and not list(folder.rglob("*partial*"))
     assert len((folder / "eval.csv").read_text().splitlines()) == 2 and (folder / "notes.txt").read_text() == "mine"
@@ -434,7 +423,7 @@ DAMAGED_RUNS = {
     "number": (lambda a, d: (a, put(d, "many", "scalars", "steps")), "scalars.steps is 'many'"),
     "negative": (lambda a, d: (a, put(d, -1, "scalars", "rows")), "scalars.rows is -1"),
     "missing number": (lambda a, d: (a, without(d, "scalars", "updates")), "scalars must have"),
-    "streams": (lambda a, d: (a, put(d, [], "scalars", "starts_rngs")), "starts_rngs must have 32"),
+    "streams": (lambda a, d: (a, put(d, [], "scalars", "starts_rngs")), "starts_rngs must have 128"),
     "other stream": (lambda a, d: (a, put(d, "MT19937", "scalars", "rng", "bit_generator")), "MT19937"),
     "no scalars": (lambda a, d: (a, without(d, "scalars")), "not a saved run: it says no scalars"),
     "no versions": (lambda a, d: (a, without(d, "versions")), "not a saved run: it says no versions"),
@@ -443,7 +432,7 @@ DAMAGED_RUNS = {
     "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
     "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
     "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
-    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 12000 instead of 7"),
+    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 24000 instead of 7"),
 }
 
 
