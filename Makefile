@@ -10,9 +10,6 @@ CANDIDATES := python3.12 python3.11 python3 python
 BIN := .venv/bin
 STAMP := .venv/installed
 INSTALL := $(BIN)/python -m pip install --quiet --no-compile -c constraints.txt
-# WARM=1 compiles what the tests need while pip, which uses one core, installs the rest. These packages are enough for that.
-WARM ?=
-COMPILING := cattrs glfw lazy-loader mujoco numba safetensors scipy
 
 # What the caller's shell may hold that would send an installation elsewhere or let foreign packages in.
 # Where packages come from (index, links, proxy, certificates, cache) stays the caller's business.
@@ -120,11 +117,5 @@ venv:
 		rm -rf .venv; "$$python" -m venv .venv;; \
 	esac; \
 	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
-	rm -f $(STAMP); warming=; \
-	if [ -n '$(WARM)' ]; then \
-		$(INSTALL) $(COMPILING); \
-		PYTHONPATH="$$PWD" $(BIN)/python tests/warm_cache.py & warming=$$!; \
-	fi; \
-	$(INSTALL) -e '.[dev]'; \
-	if [ -n "$$warming" ]; then wait "$$warming"; fi; \
+	rm -f $(STAMP); $(INSTALL) -e '.[dev]'; \
 	echo "$$wanted" > $(STAMP)

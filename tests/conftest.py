@@ -61,17 +61,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         config.hook.pytest_deselected(items=left)
 
 
-@pytest.fixture(scope="session", autouse=True)
-def plain_fonts() -> Iterator[None]:
-    """Fonts lose their tables for ligatures and kerning before a PDF takes a subset of them: neither is used, and reading them
-    takes most of that time.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        options = import_module("fontTools.subset").Options
-        patch.setattr(options, "_drop_tables_default", [*options._drop_tables_default, "GDEF", "GPOS", "GSUB"])
-        yield
-
-
 @pytest.fixture(scope="module")
 def coarse_figures() -> Iterator[None]:
     """Figures of 75 dpi in the place of 300, which take a third of the time: for tests of what a command writes, not of what its

@@ -20,8 +20,7 @@ from marlbc_mj.util.provenance import plain_data, provenance
 _WHAT = (
     "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself between "
     f"formation and column, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} that it pools "
-    "of what it heard. It "
-    "needs the set-based composition, a formation with a column and a path that moves."
+    "of what it heard. It needs the set-based composition, a formation with a column and a path that moves."
 )
 
 

@@ -36,7 +36,7 @@ class SquadOutcome(NamedTuple):
 
 
 class Squad:
-    """W worlds of one scenario.
+    """W worlds of one scenario. A mission's end is terminal; where an episode is cut short, so that phases differ, it is not.
 
     Args:
         scenario: that layouts are drawn of.
@@ -54,16 +54,16 @@ class Squad:
         self.explore = Exploration(learning, scenario.agents, len(self.orders))
         self.rng = stream(config.seed, number)
         self.last = np.full((config.worlds, scenario.agents), FORMATION, dtype=np.int64)
-        self.heard = np.zeros((config.worlds, scenario.agents, self._sense().shape[1], SENT), dtype=np.float32)
+        self.heard = np.zeros((config.worlds, scenario.agents, scenario.agents, SENT), dtype=np.float32)
         self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
         self.loss = np.zeros(config.worlds)  # share of messages missed
         self.bins = np.zeros(config.worlds, dtype=np.int64)  # of lanes, that a guided episode looks at; 0: not guided
         self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
-        self.last_decision = scenario.mission_steps - self.interval + 1  # mission step from which no decision is left
-        self.end = np.full(config.worlds, self.last_decision)  # mission step at which an episode ends
+        self.finish = scenario.mission_steps - self.interval + 1  # mission step from which no decision is left
+        self.end = np.full(config.worlds, self.finish)  # mission step at which an episode ends
         self._restart(np.ones(config.worlds, dtype=bool))
         phases = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that they differ
-        self.end = np.minimum(phases, self.last_decision)
+        self.end = np.minimum(phases, self.finish)
         self.inputs = self._exchange()  # (W, N, S) of the next decision
 
     @property
@@ -95,7 +95,7 @@ class Squad:
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()
         reward = team[:, None] - self.config.switch_cost * switched - self.config.stray_cost * final[..., WAYS + 1]
-        over = self.world.state.steps >= self.last_decision
+        over = self.world.state.steps >= self.finish
         reward -= self.config.late_cost * (over[:, None] & self._late(final))
         lost = self._lost(final)
         reward[lost] = -(1.0 + self.config.stray_cost) / (1.0 - self.config.gamma)
@@ -140,7 +140,7 @@ class Squad:
         self.world.reset(int(self.rng.integers(2**31)), ended)
         self.explore.forget(ended)
         self.last[ended] = FORMATION
-        self.end[ended] = self.last_decision
+        self.end[ended] = self.finish
         self.age[ended] = np.inf
         self.astray[ended] = 0
         lossy = self.rng.random(count) < config.lossy
