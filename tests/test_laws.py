@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import dataclass, replace
+from types import ModuleType
 from typing import NamedTuple
 
 import numba
@@ -13,6 +14,7 @@ import pytest
 from marlbc_mj.controllers import CONTROLLERS, PD, make_controller
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation
+from marlbc_mj.core.compiling import Index
 from marlbc_mj.core.disturbances import DISTURBANCES, make_disturbance
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import make_robot
@@ -268,6 +270,7 @@ import numpy as np
 from marlbc_mj.controllers import SORLC, PD
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation
+from marlbc_mj.core.compiling import Index
 sys.path.insert(0, sys.argv[1])
 import own_law
 found = {}
@@ -302,3 +305,28 @@ def test_a_second_process_compiles_no_law(tmp_path):
         misses.append(json.loads(done.stdout))
     assert set(misses[0].values()) == {1}
     assert set(misses[1].values()) == {0}
+
+
+def test_a_signature_of_a_type_that_is_gone_hides_no_other(tmp_path, monkeypatch):
+    """A script's NamedTuple among the signatures of a shared function: other processes find theirs, and the script its own."""
+    index, module = Index(str(tmp_path), "law", 1), ModuleType("a_script")
+    monkeypatch.setitem(sys.modules, "a_script", module)
+    module.Pair = type("Pair", (), {"__module__": "a_script"})
+    index.save((int,), "of int")
+    index.save((module.Pair,), "of the script")
+    monkeypatch.delitem(sys.modules, "a_script")
+    assert index.load((int,)) == "of int" and index.load((module.Pair,)) is None
+    index.save((float,), "of float")
+    assert [index.load((kind,)) for kind in (int, float)] == ["of int", "of float"]
+    monkeypatch.setitem(sys.modules, "a_script", module)
+    assert [index.load((kind,)) for kind in (int, module.Pair, float)] == ["of int", "of the script", "of float"]
+
+
+def test_a_torn_index_begins_anew(tmp_path):
+    """What is compiled then is kept again."""
+    index = Index(str(tmp_path), "law", 1)
+    index.save((int,), "of int")
+    (tmp_path / "law.nbi").write_bytes((tmp_path / "law.nbi").read_bytes()[:-5])
+    assert index.load((int,)) is None
+    index.save((int,), "again")
+    assert index.load((int,)) == "again"

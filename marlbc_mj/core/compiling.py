@@ -2,8 +2,10 @@
 
 import dis
 import os
+import pickle
 import zlib
 from collections.abc import Callable, Iterator
+from functools import lru_cache
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, cast
@@ -14,6 +16,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
 import numpy as np
+from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
@@ -128,11 +131,41 @@ def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
         _unkept.append(numba.njit(**options)(function))
         return cast(Law, _unkept[-1])
     if cache and is_compiled(law):
-        index = law._cache._cache_file
-        index._source_stamp = (index._source_stamp, *_stamp(function))
-        law._cache.load_overload = _forgiving(law._cache.load_overload)
-        law._cache.save_overload = _forgiving(law._cache.save_overload)
+        kept = law._cache
+        stamp = (kept._cache_file._source_stamp, *_stamp(function))
+        kept._cache_file = Index(kept._cache_path, kept._impl.filename_base, stamp)
+        kept.load_overload, kept.save_overload = _forgiving(kept.load_overload), _forgiving(kept.save_overload)
     return cast(Law, law)
+
+
+class Index(IndexDataCacheFile):
+    """numba's index of a function's compiled code on disk, in which each signature is pickled by itself.
+
+    A signature may name a type that only some processes can import, such as a NamedTuple of a script. numba pickles all
+    signatures together. One that cannot be read would keep other processes from finding or adding any. Here it stays for those
+    who can read it.
+    """
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            kept = super()._load_index()
+        except Exception:  # torn, or pickled together by numba
+            return {}
+        return {_signature(key): name for key, name in kept.items()}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        super()._save_index({key if isinstance(key, bytes) else self._dump(key): name for key, name in overloads.items()})
+
+
+def _signature(pickled: Any) -> Any:
+    """What was pickled; the bytes themselves where this process lacks a type that they name."""
+    try:
+        return _unpickled(pickled) if isinstance(pickled, bytes) else pickled
+    except Exception:
+        return pickled
+
+
+_unpickled = lru_cache(maxsize=None)(pickle.loads)
 
 
 _unkept: list[Any] = []
