@@ -272,8 +272,8 @@ def test_reference_velocity_is_equation_8_at_the_reference_or_at_the_measured_po
 
 @pytest.mark.parametrize("controller", ["sorlc", "sorlc-scaled"])
 def test_compiled_loop_and_python_path_agree_to_the_bit(episode, controller):
-    """Every array of the scripted 2000-step episode (500 steps with the scaled basis)."""
-    changes = {} if controller == "sorlc" else {"duration": 25.0}
+    """Every array of the scripted episode of 2000 mission steps, five substeps each (500, of ten, with the scaled basis)."""
+    changes = {"substep": 0.01} if controller == "sorlc" else {"duration": 25.0}
     compiled, python = (episode("scripted", controller, native, **changes) for native in (None, False))
     assert_same_bits([getattr(compiled, name) for name in ARRAYS], [getattr(python, name) for name in ARRAYS])
 

@@ -9,7 +9,7 @@ from marlbc_mj.cli.benchmark import BenchCommand, EvaluateCommand, RunCommand, S
 from marlbc_mj.cli.cache import suggest_cache
 from marlbc_mj.cli.ending import in_one_line
 from marlbc_mj.cli.export import ExportCommand
-from marlbc_mj.cli.learners import StudyCommand
+from marlbc_mj.cli.learners import ArmsCommand, StudyCommand
 from marlbc_mj.cli.listing import ListCommand
 from marlbc_mj.cli.measuring import (
     AblationCommand,
@@ -38,6 +38,7 @@ Command = (
     | Annotated[ShipCommand, subcommand("ship")]
     | Annotated[ExportCommand, subcommand("export")]
     | Annotated[StudyCommand, subcommand("study")]
+    | Annotated[ArmsCommand, subcommand("arms")]
     | Annotated[VideoCommand, subcommand("video")]
     | Annotated[ViewCommand, subcommand("view")]
     | Annotated[LogCommand, subcommand("log")]

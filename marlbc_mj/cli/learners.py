@@ -1,13 +1,14 @@
-"""``marlbc study``: train every variant of the learner on several seeds, in worker processes, and compare them."""
+"""``marlbc study`` and ``marlbc arms``: train variants of a learner on several seeds, in worker processes, and compare them."""
 
 import sys
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
 
-from marlbc_mj.cli.choices import SomeCount, SomePath, StudySource, TrainingSettings, VariantNames
+from marlbc_mj.cli.choices import ArmNames, SomeCount, SomePath, StudySource, TrainingSettings, VariantNames
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import note
@@ -61,3 +62,40 @@ class StudyCommand:
         failed = failed_runs(study)
         if failed:
             raise SimulationError(f"{len(failed)} of {len(study.jobs())} runs failed: {', '.join(failed)}")
+
+
+@dataclass(frozen=True)
+class ArmsCommand:
+    """Ablations of marlms-general: one setting changed at a time, trained on several seeds, flown on held-out layouts."""
+
+    arms: ArmNames = ()
+    """Arms to train; all of them by default."""
+    seeds: int = 5
+    """Trainings of each, with seeds from 1 on."""
+    budget: int = 400_000
+    """Mission steps of a training."""
+    layouts: int = 40
+    """Held-out layouts of every mission."""
+    seed: int = 70_000
+    """Seed of the first layout."""
+    workers: int = 1
+    """Processes that share the trainings, or tasks of a SLURM array."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where they run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    out: Path = Path("out/arms")
+    """Folder for arms.csv, arms.md, and the figure as PDF and PNG."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
+
+    def run(self) -> None:
+        """Train and fly what is missing, then write and print the comparison."""
+        from marlbc_mj.studies.learners.arms import ArmStudy
+        from marlbc_mj.studies.runner import counting, run_study
+
+        study = ArmStudy(self.arms, self.seeds, self.budget, self.layouts, self.seed)
+        with self.output.progress() as told:
+            ended = counting(study.jobs(), lambda job: job.arm, told.progress)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, ended=ended)
+        self.output.report(done.report.text, done.report.document)
+        self.output.say(f"{self.out / 'arms.pdf'} shows it")

@@ -60,6 +60,7 @@ def _lines(registry: dict[str, Any]) -> dict[str, str]:
 def _of_studies() -> dict[str, dict[str, str]]:
     from marlbc_mj.studies.ablation import QUESTIONS
     from marlbc_mj.studies.calibration import CALIBRATED
+    from marlbc_mj.studies.learners.arms import ARMS
     from marlbc_mj.studies.learners.variants import VARIANTS
     from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, GATE_SUPERVISORS
     from marlbc_mj.studies.safety import DRAG_DRAWS
@@ -71,6 +72,7 @@ def _of_studies() -> dict[str, dict[str, str]]:
         "suite missions": missions,
         "ablation studies": {name: question.caption for name, question in QUESTIONS.items()},
         "study variants": {name: variant.line for name, variant in VARIANTS.items()},
+        "arms of the general policy": {name: arm.line for name, arm in ARMS.items()},
         "calibrated controllers": dict.fromkeys(CALIBRATED, "its velocity gain"),
         "supervisors of the gate": dict.fromkeys(GATE_SUPERVISORS, "with thresholds of the robot's size"),
         "controllers of the gate": dict.fromkeys(GATE_CONTROLLERS, "with the robot's gains"),

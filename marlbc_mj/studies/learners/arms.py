@@ -1,0 +1,207 @@
+"""Ablations of the general policy: one setting changed at a time, each trained on several seeds and flown on held-out layouts."""
+
+import csv
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.formats import fixed
+from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.scenarios.teams import read_team, team_mission
+from marlbc_mj.studies.protocol import Report, Stopped, Watch
+from marlbc_mj.supervisors.general import General
+from marlbc_mj.training.general.config import DRAWN, JUDGED_WITH, GeneralConfig
+from marlbc_mj.training.general.judging import Judge
+from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.palette import METHOD_COLORS
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import provenance
+
+
+class Arm(NamedTuple):
+    """One way to train the general policy."""
+
+    line: str
+    changes: Mapping[str, Any] = {}
+
+
+ARMS: dict[str, Arm] = {
+    "full": Arm("the defaults"),
+    "no-pooling": Arm("an agent hears nobody", {"hide": ("pooled",)}),
+    "no-lanes": Arm("no clearance along the lanes of the slots, own or heard", {"hide": ("lanes",)}),
+    "plain": Arm("negative TD errors count fully from the start", {"learner": "plain"}),
+    "lenient": Arm("leniency in the place of hysteresis", {"learner": "lenient"}),
+    "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
+    "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
+    "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),
+    **{
+        f"without-{left}": Arm(f"never trained on {left}", {"families": tuple(f for f in GeneralConfig().families if f != left)})
+        for left in DRAWN
+    },
+}
+"""Changes of the defaults by name; the last five leave a family out each."""
+MISSIONS = (*((family, "wedge-4", "straight") for family in DRAWN), ("corridor", "grid-9", "line"))
+"""Family, team and approach to the column of the missions that every policy is flown on."""
+
+
+class ArmJob(NamedTuple):
+    """One training, and the layouts after it."""
+
+    arm: str
+    config: GeneralConfig
+    first: int  # seed of the first layout of every mission
+    layouts: int
+
+    @property
+    def key(self) -> str:
+        """The job's name in messages."""
+        return f"{self.arm} seed {self.config.seed}"
+
+
+class Flown(NamedTuple):
+    """The layouts of one mission under one policy: how many, how many succeeded and violated, median return and switches."""
+
+    mission: str
+    layouts: int
+    succeeded: int
+    violated: int
+    total: float
+    switches: float  # of an agent
+
+
+@dataclass(frozen=True)
+class ArmStudy:
+    """Every arm on training seeds 1 to ``seeds``, on the same held-out layouts. The policy is the last one of its training.
+
+    Raises:
+        ConfigurationError: an unknown arm or one named twice, or a number below 1.
+    """
+
+    arms: tuple[str, ...] = ()
+    """Names in ARMS; none stands for all."""
+    seeds: int = 5
+    budget: int = 400_000
+    """Mission steps of a training."""
+    layouts: int = 40
+    """Held-out layouts of every mission."""
+    first: int = 70_000
+    """Seed of the first of them."""
+
+    def __post_init__(self) -> None:
+        for name in self.arms:
+            if name not in ARMS:
+                raise unknown("arm", name, ARMS)
+        if len(set(self.arms)) != len(self.arms):
+            raise ConfigurationError(f"an arm is named twice: {', '.join(self.arms)}")
+        if self.layouts < 1:
+            raise ConfigurationError(f"layouts must be at least 1, got {self.layouts}")
+        self.jobs()  # a number that cannot be run is refused here
+
+    def jobs(self) -> list[ArmJob]:
+        """Seed by seed, so that a study that is stopped compares all arms."""
+        return [
+            ArmJob(name, GeneralConfig(**ARMS[name].changes, seed=seed, budget=self.budget), self.first, self.layouts)
+            for seed in seed_range(self.seeds, 1)
+            for name in self.arms or ARMS
+        ]
+
+    def run(self, job: ArmJob, watch: Watch) -> list[Flown]:
+        trainer = GeneralTrainer(job.config)
+        while not trainer.finished:
+            trainer.advance()
+            watch.progress(job.key, min(trainer.steps, job.config.budget), job.config.budget)
+            if watch.stopping():
+                raise Stopped
+        supervisor = General(trainer.policy())
+        return [_flown(mission, supervisor, job) for mission in MISSIONS]
+
+    def report(self, results: Sequence[list[Flown]], out: Path | None, progress: Progress = silent) -> Report:
+        """Write arms.csv, arms.md, arms.pdf and arms.png, and the configuration."""
+        rows = [
+            {"arm": job.arm, "seed": job.config.seed, "mission_steps": job.config.budget, **flown._asdict()}
+            for job, flights in zip(self.jobs(), results, strict=True)
+            for flown in flights
+        ]
+        text = to_markdown(arms_table(rows))
+        if out is not None:
+            with (out / "arms.csv").open("w", newline="") as stream:
+                table = csv.DictWriter(stream, rows[0], lineterminator="\n")
+                table.writeheader()
+                table.writerows(rows)
+            (out / "arms.md").write_text(text + "\n", encoding="utf-8")
+            with pl.style():
+                figure = draw_arms(rows)
+                figure.savefig(out / "arms.pdf", metadata={"CreationDate": None})
+                figure.savefig(out / "arms.png")
+            write_json(out / "config.json", {"study": self, **provenance()})
+        return Report(text, rows)
+
+
+def _flown(mission: tuple[str, str, str], supervisor: General, job: ArmJob) -> Flown:
+    family, team, approach = mission
+    scenario = team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach)
+    verdict = Judge(scenario, JUDGED_WITH, job.layouts)(supervisor, job.first)
+    counts = int(verdict.success.sum()), int(verdict.violated.sum())
+    switches = float(np.median(verdict.switches)) / scenario.agents
+    return Flown(f"{family}, {team}", job.layouts, *counts, float(np.median(verdict.total)), switches)
+
+
+def _by_arm(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
+    found = {name: [row for row in rows if row["arm"] == name] for name in ARMS}
+    return {name: lines for name, lines in found.items() if lines}
+
+
+def success_of_seeds(lines: Sequence[Mapping[str, Any]], missions: Sequence[str]) -> list[float]:
+    """Share of successes over some missions together, of every training [%]."""
+    shares = []
+    for seed in dict.fromkeys(row["seed"] for row in lines):
+        own = [row for row in lines if row["seed"] == seed and row["mission"] in missions]
+        shares.append(100.0 * sum(row["succeeded"] for row in own) / sum(row["layouts"] for row in own))
+    return shares
+
+
+def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
+    """A row per arm: success in % over its seeds, on all families and on each mission; violations of all flights."""
+    missions = list(dict.fromkeys(row["mission"] for row in rows))
+    families = missions[: len(DRAWN)]
+    cells = []
+    for name, lines in _by_arm(rows).items():
+        every = success_of_seeds(lines, families)
+        each = [fixed(float(np.mean(success_of_seeds(lines, [mission]))), 1) for mission in missions]
+        violated, flights = (sum(row[key] for row in lines) for key in ("violated", "layouts"))
+        spread = f"{np.mean(every):.1f} [{min(every):.1f}, {max(every):.1f}]"
+        cells.append((name, str(len(every)), spread, *each, f"{violated} of {flights}"))
+    columns = (
+        *(Column("", "arm"), Column("", "trainings"), Column("five families", "mean [least, greatest]", "%")),
+        *(Column("success", mission, "%") for mission in missions),
+        Column("", "violated"),
+    )
+    notes = tuple(f"{name}: {ARMS[name].line}" for name in _by_arm(rows))
+    return Table("arms", "Ablations of the general policy", columns, tuple(cells), notes)
+
+
+def draw_arms(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Failures over the five families: a dot per training, a bar at the mean, an arm per line."""
+    arms = _by_arm(rows)
+    families = list(dict.fromkeys(row["mission"] for row in rows))[: len(DRAWN)]
+    figure = Figure(figsize=(pl.SINGLE, 0.55 + 0.17 * len(arms)), layout="constrained")
+    axes = figure.add_subplot(xlabel="layouts that failed [%]")
+    for k, lines in enumerate(arms.values()):
+        failed = [100.0 - share for share in success_of_seeds(lines, families)]
+        axes.plot(failed, [k] * len(failed), "o", color=METHOD_COLORS[0], markersize=3, alpha=0.6, markeredgewidth=0)
+        axes.plot(np.mean(failed), k, "|", color=METHOD_COLORS[1], markersize=9, markeredgewidth=1.4)
+    axes.set_xscale("symlog", linthresh=1.0)
+    axes.set_xticks([0, 0.5, 1, 10, 100], ["0", "0.5", "1", "10", "100"])
+    axes.set_xlim(-0.08, 110)
+    axes.set_yticks(range(len(arms)), list(arms))
+    axes.set_ylim(len(arms) - 0.5, -0.5)
+    axes.grid(axis="x", linewidth=0.3)
+    return figure

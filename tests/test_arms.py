@@ -1,0 +1,63 @@
+"""Ablations of the general policy: what a study of arms trains, flies and leaves."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from marlbc_mj.cli import main
+from marlbc_mj.studies.learners.arms import ARMS, ArmStudy, arms_table, success_of_seeds
+from marlbc_mj.training.general.config import DRAWN, GeneralConfig
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import MANIFEST
+
+
+def test_every_arm_changes_what_it_says():
+    """One setting each; a family that is left out is named nowhere."""
+    for name, arm in ARMS.items():
+        config = GeneralConfig(**arm.changes)
+        assert (config == GeneralConfig()) == (name == "full") and len(arm.changes) <= 1
+    for family in DRAWN:
+        assert set(GeneralConfig(**ARMS[f"without-{family}"].changes).families) == set(DRAWN) - {family}
+
+
+@pytest.mark.usefixtures("coarse_figures")
+def test_a_study_trains_flies_and_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    """From the command line, with a small team: a line per training and mission, table and figure."""
+    small = {"teams": ("wedge-4",), "families": ("gates",), "batch": 16, "updates": 1, "hidden": (8,), "capacity": 500}
+    monkeypatch.setitem(ARMS, "no-pooling", ARMS["no-pooling"]._replace(changes={**ARMS["no-pooling"].changes, **small}))
+    monkeypatch.setattr("marlbc_mj.studies.learners.arms.MISSIONS", (("field", "wedge-4", "straight"),))
+    out = tmp_path / "out"
+    main(["arms", "--arms", "no-pooling", "--seeds", "2", "--budget", "100", "--layouts", "1", "--out", str(out)])
+    assert "no-pooling" in capsys.readouterr().out
+    assert {path.name for path in out.iterdir()} == {"arms.csv", "arms.md", "arms.pdf", "arms.png", "config.json", MANIFEST}
+    with (out / "arms.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["seed"], row["mission"]) for row in rows] == [("1", "field, wedge-4"), ("2", "field, wedge-4")]
+    assert all((row["arm"], row["mission_steps"], row["layouts"]) == ("no-pooling", "100", "1") for row in rows)
+
+
+def test_shares_are_of_all_layouts_of_a_training():
+    """Two trainings of one arm on two missions, by hand."""
+    rows = [
+        {"arm": "full", "seed": seed, "mission": mission, "layouts": 4, "succeeded": count, "violated": 1}
+        for seed, mission, count in ((1, "a", 4), (1, "b", 2), (2, "a", 3), (2, "b", 0))
+    ]
+    assert success_of_seeds(rows, ["a", "b"]) == [75.0, 37.5]
+    cells = arms_table(rows).rows[0]
+    assert cells == ("full", "2", "56.2 [37.5, 75.0]", "87.5", "25.0", "4 of 16")
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"arms": ("no-pool",)}, "unknown arm 'no-pool'"),
+        ({"arms": ("full", "full")}, "an arm is named twice: full, full"),
+        ({"seeds": 0}, "seeds must be at least 1, got 0"),
+        ({"budget": 0}, "budget must be at least 1, got 0"),
+        ({"layouts": 0}, "layouts must be at least 1, got 0"),
+    ],
+)
+def test_what_cannot_be_studied_is_refused(changes, said):
+    with pytest.raises(ConfigurationError, match=said):
+        ArmStudy(**changes)
