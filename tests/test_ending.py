@@ -76,7 +76,7 @@ def compiled_before(tmp_path_factory):
 @pytest.mark.skipif(sys.platform == "win32", reason="no such signals")
 @pytest.mark.usefixtures("compiled_before")
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("workers", [[], ["--seeds", "4000", "--workers", "2"]])
+@pytest.mark.parametrize("workers", [[], ["--seeds", "40", "--workers", "2"]])
 def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers):
     """In this process or in workers: nothing beside the output folder, no process, one line."""
     command = [*COMMAND, "bench", *QUICK[:-2], *LONG, *workers, "--out", str(tmp_path / "out")]

@@ -267,15 +267,14 @@ def test_drive_and_reading_of_a_robot_share_their_names():
 SCRIPT = """
 import json, sys
 import numpy as np
-from marlbc_mj.controllers import SORLC, PD
+from marlbc_mj.controllers import PD
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation
 from marlbc_mj.core.compiling import Index
 sys.path.insert(0, sys.argv[1])
 import own_law
 found = {}
-for law, kind in ((SORLC.law, laws.CONTROLLER), (PD.law, laws.CONTROLLER), (Formation.law, laws.BEHAVIOR),
-                  (own_law.law, laws.CONTROLLER)):
+for law, kind in ((PD.law, laws.CONTROLLER), (Formation.law, laws.BEHAVIOR), (own_law.law, laws.CONTROLLER)):
     laws.address(law, kind)
     for name, function in ((law.__name__, law), (law.__name__ + " entry", law.entry)):
         found[name] = sum(function.stats.cache_misses.values())

@@ -139,11 +139,11 @@ def test_metrics_measure_from_where_obstacles_are_at_every_substep(episode):
 
 def test_logs_and_pictures_show_obstacles_at_the_right_time(episode, tmp_path):
     """Through the file and back: the same motions, and the drawn model has its discs where they are."""
-    scenario, law = episode.scenario, SORLC()
+    scenario, law = replace(episode.scenario, duration=8.0), SORLC()
     path = tmp_path / "traffic.mcap"
     with LogWriter(path, scenario, law, names=("fsams", "sorlc"), seed=2, config={}) as log:
-        run_episode(World(scenario, law, record=True), make_supervisor("fsams"), seed=2, on_frame=log.write)
-    written, derived = read_log(path), from_trajectory(episode, law)
+        flown = run_episode(World(scenario, law, record=True), make_supervisor("fsams"), seed=2, on_frame=log.write)
+    written, derived = read_log(path), from_trajectory(flown, law)
     for name in ("obstacles", "motions", "position", "clearance", "formation"):
         np.testing.assert_allclose(getattr(written, name), getattr(derived, name), atol=1e-12)
     stage = make_stage(written)

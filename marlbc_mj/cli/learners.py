@@ -95,7 +95,7 @@ class ArmsCommand:
 
         study = ArmStudy(self.arms, self.seeds, self.budget, self.layouts, self.seed)
         with self.output.progress() as told:
-            ended = counting(study.jobs(), lambda job: job.arm, told.progress)
+            ended = counting(study.jobs(), lambda _: "trainings", told.progress)
             done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, ended=ended)
         self.output.report(done.report.text, done.report.document)
         self.output.say(f"{self.out / 'arms.pdf'} shows it")
