@@ -66,7 +66,7 @@ class ArmJob(NamedTuple):
         return f"{self.arm} seed {self.config.seed}"
 
 
-class Flown(NamedTuple):
+class ArmScore(NamedTuple):
     """The layouts of one mission under one policy: how many, how many succeeded and violated, median return and switches."""
 
     mission: str
@@ -113,7 +113,7 @@ class ArmStudy:
             for name in self.arms or ARMS
         ]
 
-    def run(self, job: ArmJob, watch: Watch) -> list[Flown]:
+    def run(self, job: ArmJob, watch: Watch) -> list[ArmScore]:
         trainer = GeneralTrainer(job.config)
         while not trainer.finished:
             trainer.advance()
@@ -123,7 +123,7 @@ class ArmStudy:
         supervisor = General(trainer.policy())
         return [_flown(mission, supervisor, job) for mission in MISSIONS]
 
-    def report(self, results: Sequence[list[Flown]], out: Path | None, progress: Progress = silent) -> Report:
+    def report(self, results: Sequence[list[ArmScore]], out: Path | None, progress: Progress = silent) -> Report:
         """Write arms.csv, arms.md, arms.pdf and arms.png, and the configuration."""
         rows = [
             {"arm": job.arm, "seed": job.config.seed, "mission_steps": job.config.budget, **flown._asdict()}
@@ -145,13 +145,13 @@ class ArmStudy:
         return Report(text, rows)
 
 
-def _flown(mission: tuple[str, str, str], supervisor: General, job: ArmJob) -> Flown:
+def _flown(mission: tuple[str, str, str], supervisor: General, job: ArmJob) -> ArmScore:
     family, team, approach = mission
     scenario = team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach)
     verdict = Judge(scenario, JUDGED_WITH, job.layouts)(supervisor, job.first)
     counts = int(verdict.success.sum()), int(verdict.violated.sum())
     switches = float(np.median(verdict.switches)) / scenario.agents
-    return Flown(f"{family}, {team}", job.layouts, *counts, float(np.median(verdict.total)), switches)
+    return ArmScore(f"{family}, {team}", job.layouts, *counts, float(np.median(verdict.total)), switches)
 
 
 def _by_arm(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
