@@ -270,7 +270,6 @@ import numpy as np
 from marlbc_mj.controllers import PD
 from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Formation
-from marlbc_mj.core.compiling import Index
 sys.path.insert(0, sys.argv[1])
 import own_law
 found = {}

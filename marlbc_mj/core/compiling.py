@@ -149,7 +149,7 @@ class Index(IndexDataCacheFile):
     def _load_index(self) -> dict[Any, str]:
         try:
             kept = super()._load_index()
-        except Exception:  # torn, or pickled together by numba
+        except Exception:  # torn
             return {}
         return {_signature(key): name for key, name in kept.items()}
 
@@ -157,10 +157,10 @@ class Index(IndexDataCacheFile):
         super()._save_index({key if isinstance(key, bytes) else self._dump(key): name for key, name in overloads.items()})
 
 
-def _signature(pickled: Any) -> Any:
+def _signature(pickled: bytes) -> Any:
     """What was pickled; the bytes themselves where this process lacks a type that they name."""
     try:
-        return _unpickled(pickled) if isinstance(pickled, bytes) else pickled
+        return _unpickled(pickled)
     except Exception:
         return pickled
 

@@ -1,10 +1,12 @@
-"""A table as data, and two renderings, Markdown and LaTeX (booktabs); the third, HTML, is the template table.html."""
+"""A table as data, and its renderings: CSV, Markdown and LaTeX (booktabs). HTML is the template table.html."""
 
+import csv
 import re
 import unicodedata
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from marlbc_mj.util.text import one_line
@@ -87,6 +89,14 @@ def table_document(table: Table) -> dict[str, Any]:
     heads = [column.text for column in table.columns]
     rows = [dict(zip(heads, row, strict=True)) for row in table.rows]
     return {"name": table.name, "caption": table.caption, "rows": rows, "notes": list(table.notes)}
+
+
+def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Rows as a CSV file, with one column per key of the first."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def to_markdown(table: Table) -> str:

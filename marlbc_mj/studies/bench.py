@@ -21,7 +21,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.studies.so_far import SoFar
 from marlbc_mj.supervisors import CHECKPOINT_SUFFIX, ON_REQUEST, SUPERVISORS
-from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, check_named_once, unknown
 from marlbc_mj.util.files import check_folder, write_json
 from marlbc_mj.util.modules import names_attribute
 from marlbc_mj.util.progress import Progress, silent
@@ -88,8 +88,7 @@ def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None
     for name in names:
         if name not in known and not names_attribute(name) and not name.endswith(CHECKPOINT_SUFFIX):
             raise unknown(kind, name, known)
-    if len(set(names)) != len(names):
-        raise ConfigurationError(f"a {kind} is named twice: {', '.join(names)}")
+    check_named_once(kind, names)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Costs of communication for a distributed supervisor, and the time that agents take to agree."""
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.core.communication import Communication
-from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.report.table import Column, Table, to_markdown, write_rows
 from marlbc_mj.results.metrics import Metrics
 from marlbc_mj.results.outcomes import outcome_rates
 from marlbc_mj.scenarios import Scenario
@@ -86,10 +85,7 @@ class CommunicationStudy:
     def report(self, results: Sequence[list[Metrics | None]], out: Path | None, progress: Progress = silent) -> Report:
         rows = [case_row(mission, case, metrics) for (mission, case), metrics in zip(self.pairs(), results, strict=True)]
         if out is not None:
-            with open(out / "communication.csv", "w", newline="") as stream:
-                table = csv.DictWriter(stream, rows[0], lineterminator="\n")
-                table.writeheader()
-                table.writerows(rows)
+            write_rows(rows, out / "communication.csv")
             facts = {"supervisor": self.supervisor, "controller": self.controller, "seeds": self.seeds, "shield": self.shield}
             write_json(out / "config.json", {**facts, "missions": self.missions, **provenance()})
         return Report(to_markdown(case_table(rows)), rows)

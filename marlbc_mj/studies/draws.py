@@ -19,7 +19,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_jobs, run_study
 from marlbc_mj.studies.so_far import SoFar
 from marlbc_mj.supervisors import make_supervisor
-from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.errors import ConfigurationError, check_named_once
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 
@@ -65,8 +65,7 @@ class DrawsStudy:
         keys = [method_key(*method) for method in self.methods]
         if not keys:
             raise ConfigurationError("name at least one supervisor and one controller")
-        if len(set(keys)) != len(keys):
-            raise ConfigurationError(f"a method is named twice: {', '.join(keys)}")
+        check_named_once("method", keys)
         if not self.seeds:
             raise ConfigurationError("name at least one seed")
         if len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:

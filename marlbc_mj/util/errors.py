@@ -1,6 +1,6 @@
 """The errors that this package raises on purpose; every message names the value and the valid ones."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 
 from marlbc_mj.util.text import nearest_word
@@ -34,6 +34,16 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError
     like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"
     return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")
+
+
+def check_named_once(kind: str, names: Sequence[str]) -> None:
+    """Refuse names of which one is given twice; ``kind`` says what they name.
+
+    Raises:
+        ConfigurationError: showing the names.
+    """
+    if len(set(names)) != len(names):
+        raise ConfigurationError(f"a{'n' if kind[0] in 'aeiou' else ''} {kind} is named twice: {', '.join(names)}")
 
 
 @contextmanager

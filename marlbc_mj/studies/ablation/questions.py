@@ -11,7 +11,7 @@ from marlbc_mj.scenarios import Scenario, cruise, paper
 from marlbc_mj.scenarios.base import REFERENCE_MODES
 from marlbc_mj.scenarios.case_study import SLOTS
 from marlbc_mj.studies.ablation.cases import AblationRow, Case, Figures, Question
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import check_named_once, unknown
 
 DRAG_SCALES = (0.0, 1.0, 5.0, 20.0)
 RATES = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0)
@@ -213,6 +213,5 @@ def select_questions(names: Sequence[str]) -> tuple[Question, ...]:
     for name in names:
         if name not in QUESTIONS:
             raise unknown("study", name, QUESTIONS)
-    if len(set(names)) != len(names):
-        raise ConfigurationError(f"a study is named twice: {', '.join(names)}")
+    check_named_once("study", names)
     return tuple(QUESTIONS[name] for name in names or QUESTIONS)

@@ -1,6 +1,5 @@
 """Ablations of the general policy: one setting changed at a time, each trained on several seeds and flown on held-out layouts."""
 
-import csv
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +9,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from marlbc_mj.report import plotting as pl
+from marlbc_mj.report.figures import save_figure
 from marlbc_mj.report.formats import fixed
-from marlbc_mj.report.table import Column, Table, to_markdown
+from marlbc_mj.report.table import Column, Table, to_markdown, write_rows
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.scenarios.teams import read_team, team_mission
+from marlbc_mj.studies.learners.records import lines_by
 from marlbc_mj.studies.protocol import Report, Stopped, Watch
 from marlbc_mj.supervisors.general import General
 from marlbc_mj.training.general.config import DRAWN, JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, check_named_once, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.palette import METHOD_COLORS
 from marlbc_mj.util.progress import Progress, silent
@@ -60,11 +61,6 @@ class ArmJob(NamedTuple):
     first: int  # seed of the first layout of every mission
     layouts: int
 
-    @property
-    def key(self) -> str:
-        """The job's name in messages."""
-        return f"{self.arm} seed {self.config.seed}"
-
 
 class ArmScore(NamedTuple):
     """The layouts of one mission under one policy: how many, how many succeeded and violated, median return and switches."""
@@ -99,8 +95,7 @@ class ArmStudy:
         for name in self.arms:
             if name not in ARMS:
                 raise unknown("arm", name, ARMS)
-        if len(set(self.arms)) != len(self.arms):
-            raise ConfigurationError(f"an arm is named twice: {', '.join(self.arms)}")
+        check_named_once("arm", self.arms)
         if self.layouts < 1:
             raise ConfigurationError(f"layouts must be at least 1, got {self.layouts}")
         self.jobs()  # a number that cannot be run is refused here
@@ -117,7 +112,6 @@ class ArmStudy:
         trainer = GeneralTrainer(job.config)
         while not trainer.finished:
             trainer.advance()
-            watch.progress(job.key, min(trainer.steps, job.config.budget), job.config.budget)
             if watch.stopping():
                 raise Stopped
         supervisor = General(trainer.policy())
@@ -132,15 +126,9 @@ class ArmStudy:
         ]
         text = to_markdown(arms_table(rows))
         if out is not None:
-            with (out / "arms.csv").open("w", newline="") as stream:
-                table = csv.DictWriter(stream, rows[0], lineterminator="\n")
-                table.writeheader()
-                table.writerows(rows)
+            write_rows(rows, out / "arms.csv")
             (out / "arms.md").write_text(text + "\n", encoding="utf-8")
-            with pl.style():
-                figure = draw_arms(rows)
-                figure.savefig(out / "arms.pdf", metadata={"CreationDate": None})
-                figure.savefig(out / "arms.png")
+            save_figure(lambda: draw_arms(rows), out / "arms")
             write_json(out / "config.json", {"study": self, **provenance()})
         return Report(text, rows)
 
@@ -154,9 +142,10 @@ def _flown(mission: tuple[str, str, str], supervisor: General, job: ArmJob) -> A
     return ArmScore(f"{family}, {team}", job.layouts, *counts, float(np.median(verdict.total)), switches)
 
 
-def _by_arm(rows: Sequence[Mapping[str, Any]]) -> dict[str, list[Mapping[str, Any]]]:
-    found = {name: [row for row in rows if row["arm"] == name] for name in ARMS}
-    return {name: lines for name, lines in found.items() if lines}
+def _missions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
+    """Names of all missions, and of the families, which come first."""
+    missions = list(dict.fromkeys(row["mission"] for row in rows))
+    return missions, missions[: len(DRAWN)]
 
 
 def success_of_seeds(lines: Sequence[Mapping[str, Any]], missions: Sequence[str]) -> list[float]:
@@ -170,10 +159,9 @@ def success_of_seeds(lines: Sequence[Mapping[str, Any]], missions: Sequence[str]
 
 def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     """A row per arm: success in % over its seeds, on all families and on each mission; violations of all flights."""
-    missions = list(dict.fromkeys(row["mission"] for row in rows))
-    families = missions[: len(DRAWN)]
-    cells = []
-    for name, lines in _by_arm(rows).items():
+    missions, families = _missions(rows)
+    arms, cells = lines_by("arm", ARMS, rows), []
+    for name, lines in arms.items():
         every = success_of_seeds(lines, families)
         each = [fixed(float(np.mean(success_of_seeds(lines, [mission]))), 1) for mission in missions]
         violated, flights = (sum(row[key] for row in lines) for key in ("violated", "layouts"))
@@ -184,14 +172,13 @@ def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
         *(Column("success", mission, "%") for mission in missions),
         Column("", "violated"),
     )
-    notes = tuple(f"{name}: {ARMS[name].line}" for name in _by_arm(rows))
+    notes = tuple(f"{name}: {ARMS[name].line}" for name in arms)
     return Table("arms", "Ablations of the general policy", columns, tuple(cells), notes)
 
 
 def draw_arms(rows: Sequence[Mapping[str, Any]]) -> Figure:
     """Failures over the five families: a dot per training, a bar at the mean, an arm per line."""
-    arms = _by_arm(rows)
-    families = list(dict.fromkeys(row["mission"] for row in rows))[: len(DRAWN)]
+    arms, (_, families) = lines_by("arm", ARMS, rows), _missions(rows)
     figure = Figure(figsize=(pl.SINGLE, 0.55 + 0.17 * len(arms)), layout="constrained")
     axes = figure.add_subplot(xlabel="layouts that failed [%]")
     for k, lines in enumerate(arms.values()):

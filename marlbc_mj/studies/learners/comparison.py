@@ -16,7 +16,7 @@ from marlbc_mj.report import plotting as pl
 from marlbc_mj.report.formats import DASH, fixed, grouped, interval
 from marlbc_mj.report.table import Column, Table, to_latex, to_markdown
 from marlbc_mj.results.statistics import Estimate, Statistic, bootstrap, iqm, median
-from marlbc_mj.studies.learners.records import GOAL_SWITCHES, UNFINISHED, CsvLine
+from marlbc_mj.studies.learners.records import GOAL_SWITCHES, UNFINISHED, CsvLine, lines_by
 from marlbc_mj.studies.learners.variants import VARIANTS
 from marlbc_mj.util.files import staged_file
 from marlbc_mj.util.palette import METHOD_COLORS
@@ -49,8 +49,7 @@ def write_comparison(folder: Path, rows: Sequence[CsvLine], curves: Sequence[Csv
 
 def by_variant(lines: Sequence[CsvLine]) -> dict[str, list[CsvLine]]:
     """Lines by variant, in the order of VARIANTS."""
-    found = {name: [line for line in lines if line["variant"] == name] for name in VARIANTS}
-    return {name: lines for name, lines in found.items() if lines}
+    return lines_by("variant", VARIANTS, lines)
 
 
 def learners_table(rows: Sequence[CsvLine]) -> Table:

@@ -2,11 +2,11 @@
 
 import csv
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.engine.world import World
@@ -29,6 +29,8 @@ UNFINISHED = "unfinished"
 
 CsvLine = dict[str, str]
 """A line of a CSV file: what is shown of a run is exactly what its file says."""
+Line = TypeVar("Line", bound=Mapping[str, Any])
+"""A line of any table."""
 RUN_COLUMNS = (
     *("variant", "seed", "budget", "goal_return", "best_mission_steps"),
     *("best_return", "best_switches", "best_violation_time", "best_clearance_min", "goal_mission_steps", "goal_wall_s"),
@@ -45,6 +47,12 @@ RUN_COLUMNS = (
 """Columns of study.csv. Switches per agent, clearances [m], times [s]; ``goal_*`` is empty for a run that never met the goal."""
 CURVE_COLUMNS = ("variant", "seed", "mission_steps", "return", "violation_time", "switches")
 """Columns of curves.csv: violation of the worst agent [s], switches of the whole team."""
+
+
+def lines_by(column: str, names: Iterable[str], lines: Sequence[Line]) -> dict[str, list[Line]]:
+    """Lines by what a column says, in the order of ``names``; a name without lines is left out."""
+    found = {name: [line for line in lines if line[column] == name] for name in names}
+    return {name: own for name, own in found.items() if own}
 
 
 def read_json(path: Path, key: str) -> Any:

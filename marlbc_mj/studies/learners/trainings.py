@@ -21,7 +21,7 @@ from marlbc_mj.studies.runner import run_jobs
 from marlbc_mj.training import run as training
 from marlbc_mj.training.config import TrainConfig, from_json, make_config
 from marlbc_mj.training.resuming import RESUME
-from marlbc_mj.util.errors import ConfigurationError, MarlbcError, unknown
+from marlbc_mj.util.errors import ConfigurationError, MarlbcError, check_named_once, unknown
 from marlbc_mj.util.files import alone_in, write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import config_hash
@@ -83,8 +83,7 @@ class LearnerStudy:
         for name in self.variants:
             if name not in VARIANTS:
                 raise unknown("variant", name, VARIANTS)
-        if len(set(self.variants)) != len(self.variants):
-            raise ConfigurationError(f"a variant is named twice: {', '.join(self.variants)}")
+        check_named_once("variant", self.variants)
         budget = make_config("fast").budget if self.budget is None else self.budget
         jobs = [
             TrainingJob(name, self.adjust(VARIANTS[name].config(seed, budget)), self.out / name / str(seed))

@@ -19,7 +19,7 @@ from marlbc_mj.scenarios.base import YOUNG
 from marlbc_mj.scenarios.robot_gate import AIR_DRAG
 from marlbc_mj.scenarios.teams import team_mission
 from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, check_named_once, unknown
 from marlbc_mj.util.provenance import plain_data
 
 VERSION = "v1"
@@ -192,8 +192,7 @@ def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layou
         ConfigurationError: an unknown or repeated name, or fewer than one layout.
     """
     for kind, given in (("track", tracks), ("mission", names)):
-        if len(set(given)) != len(given):
-            raise ConfigurationError(f"a {kind} is named twice: {', '.join(given)}")
+        check_named_once(kind, given)
     if layouts is not None and layouts < 1:
         raise ConfigurationError(f"layouts must be at least 1, got {layouts}")
     found = [mission for track in tracks or TRACKS for mission in missions_of(track)]

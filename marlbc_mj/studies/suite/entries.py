@@ -8,7 +8,7 @@ from marlbc_mj.results.layout_runs import Method
 from marlbc_mj.scenarios.base import COMPOSITIONS
 from marlbc_mj.studies.suite.definition import TRACKS
 from marlbc_mj.supervisors import SUPERVISORS, make_supervisor
-from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.errors import ConfigurationError, check_named_once, unknown
 from marlbc_mj.util.method_names import short_name
 
 SUITE_SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
@@ -81,8 +81,7 @@ def _named(kind: str, names: Sequence[str] | None, default: tuple[str, ...]) -> 
         return default
     if not names:
         raise ConfigurationError(f"name at least one {kind}: {', '.join(default)}")
-    if len(set(names)) != len(names):
-        raise ConfigurationError(f"a {kind} is named twice: {', '.join(names)}")
+    check_named_once(kind, names)
     return tuple(names)
 
 
