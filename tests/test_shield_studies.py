@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from marlbc_mj.controllers import PD
+from marlbc_mj.core.lookout import LISTED
 from marlbc_mj.core.stopping import ForceBound
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import make_scenario
@@ -35,11 +36,14 @@ def test_no_mission_fails_with_a_shield_and_some_do_without(family):
     assert free.failed > 0
 
 
-SCRATCH_OF_A_SHIELD = {"grid": (1, 0), "looked": (1, 0, 3)}
+SCRATCH_OF_A_SHIELD = {"grid": (1, 0), "looked": (1, 0, 3), "around": (1, 0, 1 + LISTED)}
 """Parts of a team that only save time, and their shapes where there are none."""
 
 
-@pytest.mark.parametrize(("agents", "missing"), [(48, ("grid",)), (48, ("grid", "looked")), (48, ("looked",)), (5, ("looked",))])
+LOOK_OUT = ("looked", "around")
+
+
+@pytest.mark.parametrize(("agents", "missing"), [(48, ("grid",)), (48, ("grid", *LOOK_OUT)), (48, LOOK_OUT), (5, LOOK_OUT)])
 def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agents, missing):
     """Bit for bit: both only say early that nothing is near."""
     large = {"radius": (0.3, 0.6), "gap": 2.5, "length": 140.0} if agents == 48 else {}
@@ -47,7 +51,9 @@ def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agent
     worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
     for name in missing:
         assert getattr(worlds[0].state, name).size > 0
-    worlds[1].state = worlds[1].state._replace(**{name: np.zeros(SCRATCH_OF_A_SHIELD[name]) for name in missing})
+    worlds[1].state = worlds[1].state._replace(
+        **{name: np.zeros(SCRATCH_OF_A_SHIELD[name], getattr(worlds[1].state, name).dtype) for name in missing}
+    )
     worlds[1]._hand_over()
     for name in missing:
         assert getattr(worlds[1]._loop.arguments.team, name).size == 0  # the loop's own

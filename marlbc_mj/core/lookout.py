@@ -1,76 +1,159 @@
-"""Room that every agent had at the last look at everything: while it lasts, a shield need not look again.
+"""What was around every agent when it last looked: while nobody has moved far since, a shield need not look at the rest again.
 
-The idea is that of Verlet's neighbor lists (1967). At a look, agent i has room m_i: no obstacle and no other agent is nearer than
-that, beyond the distance to keep. If since then i has moved by s_i and nobody by more than s, then it has m_i - s_i - s at least.
+The idea is that of Verlet's neighbor lists (1967), except that each agent looks again by itself, so that one fast agent does not
+make all others look. Agent i looked from x_i. Things k that left it at most the room R there, |x_i - x_k| - kept <= R, are in
+its list; an agent that looks puts itself into the lists of others, too. If i has moved by s_i since, and no agent by more than s,
+then what is not listed leaves it more than R - s_i - s, and what is listed no less than the least room then, less s_i + s.
 Obstacles are at rest; where they move, or messages are late, there is no look-out.
 """
 
 import numpy as np
 
-from marlbc_mj.core.cells import nearest, room
-from marlbc_mj.core.laws import allocation_free
+from marlbc_mj.core.laws import allocation_free, inlined
+from marlbc_mj.core.stopping import anything_near, concerns, near, thing_count
 
 SKIN = 0.1
-"""Share of the distances to keep that agents may move before everything is looked at again."""
+"""Share of R that an agent may move before it looks again."""
+LISTED = 24
+"""Things that are listed for an agent; where more are around, all are tried."""
 ROOM_ERROR = 1e-9  # of what is computed here [m]
 X, Y, FREE = 0, 1, 2
-"""Columns of ``looked``: where the agent was, the room that it had [m]."""
+"""Columns of ``looked``: where the agent was, the least room that it had, at most R [m]."""
 
 
 @allocation_free
-def forget(looked):
-    """Have everything looked at again: between mission steps anybody may have moved obstacles. ``looked`` (N, 3), in place."""
-    for i in range(looked.shape[0]):
-        looked[i, X] = np.inf
+def forget_moved(obstacles, looked, seen):
+    """Have all agents look again if ``obstacles`` (K, 3) are not those of the last look: between mission steps anybody may have
+    moved them. ``looked`` (N, 3) and ``seen`` (K, 3) are changed in place.
+    """
+    same = True
+    for k in range(seen.shape[0]):
+        for column in range(3):
+            if obstacles[k, column] != seen[k, column]:
+                same = False
+                seen[k, column] = obstacles[k, column]
+    if not same:
+        for i in range(looked.shape[0]):
+            looked[i, X] = np.inf
 
 
-@allocation_free
+@inlined
+def vicinity(numbers):
+    """R [m]: the distances to keep, once more."""
+    return numbers.clearance + numbers.agent_distance
+
+
+@inlined
 def displacement(view, i):
-    """How far agent ``i`` is from where it was at the last look [m]."""
+    """How far agent ``i`` is from where it looked [m]."""
     x, y = view.p[i, 0] - view.looked[i, X], view.p[i, 1] - view.looked[i, Y]
     return np.sqrt(x * x + y * y)
 
 
 @allocation_free
-def most_moved(numbers, view):
-    """The farthest that an agent has moved since the last look [m]; infinite where it is time for another."""
-    farthest, skin = 0.0, SKIN * (numbers.clearance + numbers.agent_distance)
+def look_out(numbers, view):
+    """Agents that have moved far look again; returns the farthest that an agent is now from where it looked [m]."""
+    farthest, skin = 0.0, SKIN * vicinity(numbers)
     for i in range(view.p.shape[0]):
-        farthest = max(farthest, displacement(view, i))
-    return farthest if farthest <= skin else np.inf
+        moved = displacement(view, i)
+        if moved <= skin:
+            farthest = max(farthest, moved)
+        else:
+            look(numbers, view, i)
+    return farthest
 
 
 @allocation_free
-def look(numbers, view):
-    """Fill ``view.looked``; grids, where there are any, are those of this moment."""
-    split = room(view.obstacles.shape[0])
-    for i in range(view.p.shape[0]):
-        view.looked[i, X], view.looked[i, Y], view.looked[i, FREE] = view.p[i, 0], view.p[i, 1], np.inf
-        k = nearest(view.p[i], view.obstacles, view.grid[:split], -1)
-        if k >= 0:
-            see(view, i, view.obstacles[k], view.obstacles[k, 2] + numbers.clearance)
-        j = nearest(view.p[i], view.p, view.grid[split:], i)
-        if j >= 0:
-            see(view, i, view.p[j], numbers.agent_distance)
+def look(numbers, view, i):
+    """Agent ``i`` looks from where it is: its row of ``view.looked`` and its list are made anew, and it is put into others'."""
+    count, around = view.obstacles.shape[0], vicinity(numbers)
+    view.looked[i, X], view.looked[i, Y], view.looked[i, FREE] = view.p[i, 0], view.p[i, 1], around
+    view.around[i, 0] = 0
+    for k in range(count + view.p.shape[0]):
+        j = k - count
+        if j < 0:
+            x, y, kept = view.obstacles[k, 0], view.obstacles[k, 1], view.obstacles[k, 2] + numbers.clearance
+        else:
+            x, y, kept = view.looked[j, X], view.looked[j, Y], numbers.agent_distance
+        x, y = view.p[i, 0] - x, view.p[i, 1] - y
+        if x * x + y * y <= (kept + around) ** 2 and j != i:
+            free = np.sqrt(x * x + y * y) - kept
+            view.looked[i, FREE] = min(view.looked[i, FREE], free)
+            enter(view.around[i], k)
+            if j >= 0:
+                view.looked[j, FREE] = min(view.looked[j, FREE], free)
+                enter(view.around[j], count + i)
 
 
 @allocation_free
-def see(view, i, place, kept):
-    """Agent ``i`` has no more room than a thing at ``place`` leaves, from which ``kept`` [m] is to be kept."""
-    x, y = view.p[i, 0] - place[0], view.p[i, 1] - place[1]
-    view.looked[i, FREE] = min(view.looked[i, FREE], np.sqrt(x * x + y * y) - kept)
+def enter(listed, k):
+    """Put thing ``k`` into a list (1 + LISTED,): its length, or -1 where things do not fit, then things in ascending order."""
+    length = listed[0]
+    if length < 0:
+        return
+    place = length
+    while place > 0 and listed[place] > k:
+        place -= 1
+    if place > 0 and listed[place] == k:
+        return
+    if length == LISTED:
+        listed[0] = -1
+        return
+    for n in range(length, place, -1):
+        listed[n + 1] = listed[n]
+    listed[place + 1] = k
+    listed[0] = length + 1
 
 
-@allocation_free
+@inlined
+def most_room(view, i, longest, need):
+    """Things with more room than this [m] leave agent ``i`` more than ``need`` [m], whatever they are."""
+    return 2.0 * need - view.stopping[i] + longest + ROOM_ERROR
+
+
+@inlined
 def is_alone(view, i, longest, need, farthest):
-    """Whether the last look says that nothing leaves agent ``i`` less room than ``need`` [m].
+    """Whether the look-out says that nothing leaves agent ``i`` less room than ``need`` [m].
 
     Args:
         view: with what was seen.
         i: the agent.
         longest: the team's greatest stopping distance [m].
         need: at least the agent's own stopping distance [m].
-        farthest: that an agent has moved since [m].
+        farthest: that of :func:`look_out` [m].
     """
-    left = view.looked[i, FREE] - displacement(view, i) - farthest
-    return left > 2.0 * need - view.stopping[i] + longest + ROOM_ERROR
+    return view.looked[i, FREE] - displacement(view, i) - farthest > most_room(view, i, longest, need)
+
+
+@inlined
+def is_listed(numbers, view, i, longest, need, farthest):
+    """Whether the list has all that may leave agent ``i`` less room than ``need`` [m]; arguments of :func:`is_alone`."""
+    left = vicinity(numbers) - displacement(view, i) - farthest
+    return view.around[i, 0] >= 0 and left > most_room(view, i, longest, need)
+
+
+@allocation_free
+def gather(numbers, view, i, longest, need, farthest):
+    """Fill ``view.near`` with all things that leave agent ``i`` less room than ``need`` [m], in ascending order.
+
+    Args:
+        numbers: the shield's.
+        view: to fill; where there is no look-out, grids are those of this moment.
+        i: the agent.
+        longest: the team's greatest stopping distance [m].
+        need: see above [m].
+        farthest: that of :func:`look_out` [m].
+    """
+    found, watched = 0, view.looked.shape[0] > 0
+    if watched and is_listed(numbers, view, i, longest, need, farthest):
+        for n in range(view.around[i, 0]):
+            k = view.around[i, 1 + n]
+            if near(numbers, view, i, k, need):
+                found += 1
+                view.near[found] = k
+    elif watched or anything_near(numbers, view, i, longest, need):
+        for k in range(thing_count(view)):
+            if concerns(view, i, k) and near(numbers, view, i, k, need):
+                found += 1
+                view.near[found] = k
+    view.near[0] = found

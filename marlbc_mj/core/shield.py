@@ -21,11 +21,10 @@ from marlbc_mj.core.barriers import Barrier
 from marlbc_mj.core.braking import restrain
 from marlbc_mj.core.cells import fill, room
 from marlbc_mj.core.laws import allocation_free, clip
-from marlbc_mj.core.lookout import is_alone, look, most_moved
+from marlbc_mj.core.lookout import gather, is_alone, look_out
 from marlbc_mj.core.stopping import (
     TINY,
     ForceBound,
-    anything_near,
     braking,
     disc_of,
     force_bound,
@@ -244,14 +243,22 @@ def target_of(numbers, view, i, force):
 
 
 @allocation_free
-def shield_agent(numbers, view, i, longest, target, force, counts):
+def most_needed(numbers, view, i, worst, need):
+    """How near things matter to agent ``i`` whatever is done about its force [m]: at least ``need`` [m] of :func:`target_of`."""
+    authority = view.h * numbers.force_limit / numbers.mass
+    fastest = speed_of(numbers, view, i) + authority + spread_of(numbers, view, i) + TINY
+    return max(need, reach_of(numbers, view, max(worst, fastest)))
+
+
+@allocation_free
+def shield_agent(numbers, view, i, target, force, counts):
     """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit.
 
-    ``longest`` [m] is the team's greatest stopping distance, ``target`` that of :func:`target_of`.
+    ``view.near`` has all that may matter; ``target`` is that of :func:`target_of`.
     """
     per = view.h / numbers.mass
     x, y, worst, need = target
-    k = most_pressing(numbers, view, i, need) if anything_near(numbers, view, i, longest, need) else -1
+    k = most_pressing(numbers, view, i, need)
     if k >= 0 and gap_to(numbers, view, i, k)[0] < -numbers.slack - TINY:
         counts.breaches[i, MOTION_BROKEN if moves(view, k) else STATE_BROKEN] += 1.0
     if (k < 0 and worst <= numbers.speed_cap) or stays_safe(numbers, view, i, x, y):
@@ -285,25 +292,20 @@ def shield_team(numbers, view, last, force, counts):
         force: (N, 2) the controllers' forces; changed in place.
         counts: rows of this team; added to.
     """
-    longest = fill_stopping(numbers, view)
-    farthest, filled = np.inf, False
-    if view.looked.shape[0] > 0:
-        farthest = most_moved(numbers, view)
-        if farthest == np.inf:
-            fill_grids(view)
-            look(numbers, view)
-            farthest, filled = 0.0, True
+    longest, farthest, watched = fill_stopping(numbers, view), 0.0, view.looked.shape[0] > 0
+    if watched:
+        farthest = look_out(numbers, view)
+    else:
+        fill_grids(view)
     for i in range(view.p.shape[0]):
         watch_assumptions(numbers, view, i, last[i], counts.breaches[i])
         for axis in range(2):
             force[i, axis] = clip(force[i, axis], numbers.box)
         target = target_of(numbers, view, i, force[i])
         worst, need = target[2], target[3]
-        if farthest == np.inf or worst > numbers.speed_cap or not is_alone(view, i, longest, need, farthest):
-            if not filled:
-                fill_grids(view)
-                filled = True
-            shield_agent(numbers, view, i, longest, target, force[i], counts)
+        if worst > numbers.speed_cap or not (watched and is_alone(view, i, longest, need, farthest)):
+            gather(numbers, view, i, longest, most_needed(numbers, view, i, worst, need), farthest)
+            shield_agent(numbers, view, i, target, force[i], counts)
         for axis in range(2):
             last[i, 0, axis], last[i, 1, axis] = view.moving[i, axis], force[i, axis]
 

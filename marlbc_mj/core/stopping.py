@@ -90,6 +90,8 @@ class ShieldView(NamedTuple):
     grid: np.ndarray  # room for a grid of the obstacles, filled, and one of the team; empty where trying all pairs costs less
     planes: np.ndarray  # (N, N, 2, 3) half-planes in the place of agents, see marlbc_mj.core.stamps; (0, 0, 2, 3): all know all
     looked: np.ndarray  # (N, 3) the last look at everything, see marlbc_mj.core.lookout; (0, 3): none is of use
+    around: np.ndarray  # (N, 1 + LISTED) int64, what was around each agent when it looked; (0, 1 + LISTED)
+    near: np.ndarray  # (1 + things,) int64 scratch: how many things may be too near to the agent at hand, then which
 
 
 @inlined
@@ -269,8 +271,9 @@ def stays_safe(numbers, view, i, x, y):
     if worst > max(numbers.speed_cap, speed_of(numbers, view, i)) + TINY or not a > 0.0:
         return False
     need = reach_of(numbers, view, worst)
-    for k in range(thing_count(view)):
-        if concerns(view, i, k) and near(numbers, view, i, k, need) and excess(numbers, view, i, k, a, x, y) > TINY:
+    for n in range(view.near[0]):
+        k = view.near[1 + n]
+        if near(numbers, view, i, k, need) and excess(numbers, view, i, k, a, x, y) > TINY:
             return False
     return True
 
@@ -279,8 +282,9 @@ def stays_safe(numbers, view, i, x, y):
 def most_pressing(numbers, view, i, need):
     """The thing with the least gap among those that leave less room than ``need`` [m]; -1: there is none."""
     least, found = np.inf, -1
-    for k in range(thing_count(view)):
-        if concerns(view, i, k) and near(numbers, view, i, k, need):
+    for n in range(view.near[0]):
+        k = view.near[1 + n]
+        if near(numbers, view, i, k, need):
             gap = gap_to(numbers, view, i, k)[0]
             if gap < least:
                 least, found = gap, k
@@ -291,8 +295,9 @@ def most_pressing(numbers, view, i, need):
 def most_violated(numbers, view, i, a, need, x, y):
     """(thing, excess): the disc that w = (x, y) is farthest out of [m/s]; -1 where it is in all of them."""
     worst, found = 0.0, -1
-    for k in range(thing_count(view)):
-        if concerns(view, i, k) and near(numbers, view, i, k, need):
+    for n in range(view.near[0]):
+        k = view.near[1 + n]
+        if near(numbers, view, i, k, need):
             over = excess(numbers, view, i, k, a, x, y)
             if over > worst:
                 worst, found = over, k

@@ -17,7 +17,7 @@ from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.core.imperfections import sense, weaken
-from marlbc_mj.core.lookout import forget
+from marlbc_mj.core.lookout import forget_moved
 from marlbc_mj.core.motion import move
 from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_stopping, restrain_references, shield_team
@@ -110,7 +110,7 @@ def begin(b, orders, given, mission, behaviors, team):
         t = team.steps[b] * mission.mission_step
         compose_team(t, orders[b], behaviors, at, team.obstacles[b], team.grid[b], team.workspace[b], v_r)
     team.reward[b] = count_switches(b, orders, behaviors, team)
-    forget(team.looked[b])
+    forget_moved(team.obstacles[b], team.looked[b], team.seen[b])
     limit(behaviors, mission.mission_step, previous, v_r)
 
 
@@ -186,7 +186,8 @@ def shield_forces(b, t, h, plant, team):
     if team.tracks.shape[1] > 0:
         obstacles = team.tracks[b]
         move(t, team.anchors[b], team.motions[b], obstacles)
-    view = ShieldView(h, p, v, team.velocity[b], obstacles, team.stopping[b], team.grid[b], team.planes[b], team.looked[b])
+    stopping, grid, planes, near = team.stopping[b], team.grid[b], team.planes[b], team.near[b]
+    view = ShieldView(h, p, v, team.velocity[b], obstacles, stopping, grid, planes, team.looked[b], team.around[b], near)
     if team.stamps.shape[1] > 0:
         exchange_messages(b, round(t / h), view, plant.shield[0], team)
     counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])

@@ -91,6 +91,9 @@ class Team(NamedTuple):
     last_substep: np.ndarray  # (B, N, 2, 2) v and u of the substep before [m/s], [N]
     stopping: np.ndarray  # (B, N) scratch: stopping distances [m]
     looked: np.ndarray  # (B, N, 3) scratch of a shield, see marlbc_mj.core.lookout; (B, 0, 3) where it is of no use
+    seen: np.ndarray  # (B, K, 3) scratch of a shield, obstacles at the last look; (B, 0, 3) likewise
+    around: np.ndarray  # (B, N, L) int64 scratch of a shield, what is around each agent; (B, 0, L) likewise
+    near: np.ndarray  # (B, M) int64 scratch of a shield, what may be too near to the agent at hand; (B, 0) without one
     stamps: np.ndarray  # (B, N, N, 2) live stamps, see marlbc_mj.core.stamps; (B, 0, 0, 2) where all agents know all
     planes: np.ndarray  # (B, N, N, 2, 3) their half-planes
     memory: np.ndarray  # (B, R, N, 3) the past of a shield: p, stopping distance [m]

@@ -9,6 +9,7 @@ import numpy as np
 
 from marlbc_mj.core import laws
 from marlbc_mj.core.imperfections import sense
+from marlbc_mj.core.lookout import LISTED
 from marlbc_mj.core.motion import MOVING, NUMBERS
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts
 from marlbc_mj.core.stamps import NEVER_STAMPED, REMEMBERED
@@ -20,7 +21,7 @@ from marlbc_mj.engine.records import Record, Team
 from marlbc_mj.engine.shielding import check_draw
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
-SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "looked", "tracks")
+SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "looked", "seen", "around", "near", "tracks")
 """Fields of a team that carry nothing from one mission step to the next."""
 
 
@@ -34,6 +35,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
     numbers = plan.plant.shield[0]
     each_other = agents if forces[1] and plan.mailed else 0
     mailed, ring = (worlds, each_other, each_other), int(numbers.latency) + REMEMBERED if each_other else 0
+    outlooks = (worlds, 0 if moving or each_other else forces[1])
     return Team(
         steps=np.zeros(worlds, dtype=np.int64),
         position=np.zeros(pairs),
@@ -64,7 +66,10 @@ def make_team(plan: Plan, worlds: int) -> Team:
         breaches=np.zeros((*shielded, len(ASSUMPTIONS))),
         last_substep=np.full((*forces, 2, 2), np.nan),
         stopping=np.zeros(forces),
-        looked=np.zeros((worlds, 0 if moving or mailed[1] else forces[1], 3)),
+        looked=np.full((*outlooks, 3), np.inf),
+        seen=np.zeros((worlds, count if outlooks[1] else 0, 3)),
+        around=np.zeros((*outlooks, 1 + LISTED), dtype=np.int64),
+        near=np.zeros((worlds, 1 + count + agents + 2 * mailed[1] if forces[1] else 0), dtype=np.int64),
         stamps=np.full((*mailed, 2), NEVER_STAMPED),
         planes=np.zeros((*mailed, 2, 3)),
         memory=np.zeros((worlds, ring, mailed[1], 3)),

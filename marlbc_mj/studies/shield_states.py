@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from marlbc_mj.core.laws import compiled
+from marlbc_mj.core.lookout import LISTED
 from marlbc_mj.core.shield import ASSUMPTIONS, ShieldCounts, shield_team
 from marlbc_mj.core.stopping import (
     ForceBound,
@@ -68,7 +69,8 @@ def _leave_rate(numbers, truth, h, things, states, rng):
     left, agents, obstacles = 0, 2, np.zeros((max(things - 1, 1), 5 if truth.obstacle_speed > 0.0 else 3))
     p, v, stopping, force = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, ASSUMED))
-    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)), np.zeros((0, 3)))
+    around, near = np.zeros((0, 1 + LISTED), dtype=np.int64), np.zeros(1 + len(obstacles) + agents, dtype=np.int64)
+    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)), np.zeros((0, 3)), around, near)
     counts = ShieldCounts(interventions, change, breaches)
     for _ in range(states):
         _draw_state(rng, numbers, h, things, view)
