@@ -17,6 +17,7 @@ class Batch(NamedTuple):
     weight: np.ndarray | None = None  # (M, N) importance weights of the TD errors; 1 by default
     place: np.ndarray | None = None  # (M, N) where the transitions begin in the buffer: row times B plus world
     lost: np.ndarray | None = None  # (M, N) bool, the agent came too close in the first of the decisions
+    team: np.ndarray | None = None  # (M,) number of the team that each transition belongs to, where whole teams are drawn
 
 
 class Replay:
@@ -60,9 +61,13 @@ class Replay:
             rng: random numbers of the draws.
             share: share of the budget that is spent; for prioritised replays only.
         """
-        first = rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
+        first = self.draw_rows(size, steps, rng)
         world = rng.integers(self.arrays["ended"].shape[1], size=size)
         return self.gather(first, world, steps, gamma)
+
+    def draw_rows(self, size: int, steps: int, rng: np.random.Generator) -> np.ndarray:
+        """(M,) rows, counted from the start of the run, that a transition over ``steps`` decisions may begin with."""
+        return rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
 
     def learnt(self, batch: Batch, errors: np.ndarray) -> None:
         """Take note of the absolute TD errors (K, M) of an update with ``batch``; only a prioritised replay uses them."""

@@ -86,8 +86,9 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain"] = "hysteretic"
-    """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
+    learner: Literal["lenient", "hysteretic", "plain", "vdn"] = "hysteretic"
+    """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count); vdn
+    has one error for each whole team, and all count."""
     settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
     cool_by: Annotated[float, POSITIVE] = 0.5
@@ -158,10 +159,11 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
     """The parts of a configuration that learner and exploration use, under their names."""
+    treatment: Any = "plain" if config.learner == "vdn" else config.learner
     return make_config(
         "fast",
-        **{"method": "marlms" if config.learner == "lenient" else {"hysteretic": "hysteretic", "plain": "iql"}[config.learner]},
-        learner=config.learner,
+        method={"lenient": "marlms", "hysteretic": "hysteretic", "plain": "iql"}[treatment],
+        learner=treatment,
         seed=config.seed,
         worlds=config.worlds,
         hidden=config.hidden,

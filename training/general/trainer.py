@@ -12,6 +12,7 @@ from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
 from marlbc_mj.training.general.squads import Squad
+from marlbc_mj.training.general.vdn import TeamReplay, TeamValues
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
 from marlbc_mj.training.replay import Replay
@@ -38,12 +39,16 @@ class GeneralTrainer:
         self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
-        self.learner = Learner(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        self.treatment = learning.learner
+        kind = TeamValues if config.learner == "vdn" else Learner
+        self.learner = kind(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
         rows = sum(squad.rows for squad in self.squads)
-        self.replay = Replay(max(config.capacity // rows, 2 * config.n_step), rows, 1, INPUTS)
+        kept = max(config.capacity // rows, 2 * config.n_step)
+        sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])
+        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner == "vdn" else Replay(kept, rows, 1, INPUTS)
         self.steps = 0  # mission steps made, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         single_thread()
@@ -116,7 +121,7 @@ class GeneralTrainer:
     def _learn(self) -> None:
         config = self.config
         rate = config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * (1.0 - self.share)
-        self.learner.treatment = "plain" if self.share >= config.settle else config.learner
+        self.learner.treatment = "plain" if self.share >= config.settle else self.treatment
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
             self.error = self.learner.update(batch, rate)

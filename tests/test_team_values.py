@@ -1,0 +1,65 @@
+"""VDN for teams of any size: whole teams are drawn, and their one error is that of the mean of their agents' values."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from marlbc_mj.policies.general_inputs import INPUTS
+from marlbc_mj.training.general.config import GeneralConfig, learner_config
+from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.general.vdn import TeamReplay, TeamValues
+from marlbc_mj.training.replay import Batch
+
+SMALL = GeneralConfig(
+    families=("gates",), teams=("wedge-4", "line-6"), hidden=(8,), batch=20, updates=1, capacity=400, budget=2_000, learner="vdn"
+)
+
+
+def test_a_draw_is_of_whole_teams_at_one_time() -> None:
+    """Every team once or not at all, each agent in its place; here an agent's reward names it and its time."""
+    sizes = np.array([2, 3, 1])
+    replay = TeamReplay(5, sizes, 4)
+    for k in range(7):
+        rows = {name: np.zeros(array.shape[1:], array.dtype) for name, array in replay.arrays.items()}
+        replay.store(**{**rows, "reward": (100 * k + np.arange(6, dtype=np.float32))[:, None]})
+    drawn = replay.sample(8, 1, 0.9, np.random.default_rng(0))
+    assert drawn.team is not None
+    assert drawn.team.max() == 3  # four teams have eight agents in the mean
+    for team in range(4):
+        reward = drawn.reward[drawn.team == team, 0]
+        time, agents = np.unique(reward // 100), (reward % 100).tolist()
+        assert agents in ([0, 1], [2, 3, 4], [5])
+        assert len(time) == 1 and 2 <= time[0] <= 6
+
+
+def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
+    """Teams of two and of one, by hand."""
+    learner = TeamValues(learner_config(SMALL), 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
+    state, one = np.zeros((3, INPUTS), dtype=np.float32), np.ones((3, 1), dtype=np.float32)
+    reward, discount = np.array([[1.0], [3.0], [-1.0]], dtype=np.float32), np.array([[0.5], [0.5], [0.0]], dtype=np.float32)
+    batch = Batch(state, np.array([[0], [1], [1]]), reward, discount, state, one, team=np.array([0, 0, 1]))
+    now = torch.tensor([[[1.0, 2.0], [4.0, 6.0], [7.0, 9.0]]])
+    ahead = torch.tensor([[[2.0, 4.0], [8.0, 6.0], [5.0, 5.0]]])
+    chosen, target = learner.estimates(batch, now, ahead)
+    assert chosen.tolist() == [[(1.0 + 6.0) / 2, 9.0]]
+    assert target.tolist() == [[((1.0 + 0.5 * 4.0) + (3.0 + 0.5 * 8.0)) / 2, -1.0]]
+
+
+@pytest.mark.parametrize("settle", [0.0, 1.0])
+def test_it_learns_and_goes_on_bit_for_bit(settle: float) -> None:
+    """All errors count alike before values settle and after."""
+    config = replace(SMALL, settle=settle)
+    one, other = GeneralTrainer(config), GeneralTrainer(replace(config, seed=3))
+    for _ in range(4):
+        one.advance()
+    assert one.learner.treatment == "plain" and one.learner.errors.shape == (1, 4)  # 4 teams of 5 agents in the mean
+    arrays, scalars = one.snapshot()
+    other.restore({name: array.copy() for name, array in arrays.items()}, scalars)
+    for _ in range(3):
+        one.advance()
+        other.advance()
+    assert one.error == other.error > 0.0
+    after = other.snapshot()[0]
+    assert all(np.array_equal(array, after[name], equal_nan=True) for name, array in one.snapshot()[0].items())
