@@ -1,6 +1,7 @@
-"""VDN for teams of any size: whole teams are drawn, and their one error is that of the mean of their agents' values."""
+"""VDN and QMIX for teams of any size: whole teams are drawn, and each has one error."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ import torch
 
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
+from marlbc_mj.training.general.team_values import TeamMixer, TeamReplay, TeamVDN
 from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.general.vdn import TeamReplay, TeamValues
 from marlbc_mj.training.replay import Batch
 
 SMALL = GeneralConfig(
@@ -36,7 +37,7 @@ def test_a_draw_is_of_whole_teams_at_one_time() -> None:
 
 def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
     """Teams of two and of one, by hand."""
-    learner = TeamValues(learner_config(SMALL), 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
+    learner = TeamVDN(learner_config(SMALL), 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
     state, one = np.zeros((3, INPUTS), dtype=np.float32), np.ones((3, 1), dtype=np.float32)
     reward, discount = np.array([[1.0], [3.0], [-1.0]], dtype=np.float32), np.array([[0.5], [0.5], [0.0]], dtype=np.float32)
     batch = Batch(state, np.array([[0], [1], [1]]), reward, discount, state, one, team=np.array([0, 0, 1]))
@@ -47,10 +48,28 @@ def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
     assert target.tolist() == [[((1.0 + 0.5 * 4.0) + (3.0 + 0.5 * 8.0)) / 2, -1.0]]
 
 
-@pytest.mark.parametrize("settle", [0.0, 1.0])
-def test_it_learns_and_goes_on_bit_for_bit(settle: float) -> None:
+def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:
+    """And a team's value depends on no other team."""
+    mixer, rng = TeamMixer(5, torch.Generator().manual_seed(1)), np.random.default_rng(2)
+    inputs, values = (torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in ((5, 5), (1, 5)))
+    team = torch.tensor([0, 0, 1, 1, 1])
+    mixed = mixer(values, inputs, team)
+    for agent in range(5):
+        raised = values.clone()
+        raised[0, agent] += 1.0
+        after = mixer(raised, inputs, team)
+        assert after[0, team[agent]] > mixed[0, team[agent]]
+        assert after[0, 1 - team[agent]] == mixed[0, 1 - team[agent]]
+    turned = torch.tensor([1, 0, 4, 2, 3])
+    torch.testing.assert_close(mixer(values[:, turned], inputs[turned], team[turned]), mixed)
+    alone = mixer(values[:, :2], inputs[:2], team[:2])
+    torch.testing.assert_close(alone, mixed[:, :1])
+
+
+@pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0)])
+def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix"], settle: float) -> None:
     """All errors count alike before values settle and after."""
-    config = replace(SMALL, settle=settle)
+    config = replace(SMALL, learner=learner, settle=settle)
     one, other = GeneralTrainer(config), GeneralTrainer(replace(config, seed=3))
     for _ in range(4):
         one.advance()

@@ -47,10 +47,10 @@ class Mixer(nn.Module):
         self.scale: Tensor
         self.register_buffer("scale", scale.to(torch.float32))
         size = len(scale)
-        self.weight1 = _linear(size, agents * EMBEDDING, generator)
-        self.bias1 = _linear(size, EMBEDDING, generator)
-        self.weight2 = _linear(size, EMBEDDING, generator)
-        self.bias2 = nn.Sequential(_linear(size, EMBEDDING, generator), nn.ReLU(), _linear(EMBEDDING, 1, generator))
+        self.weight1 = drawn_linear(size, agents * EMBEDDING, generator)
+        self.bias1 = drawn_linear(size, EMBEDDING, generator)
+        self.weight2 = drawn_linear(size, EMBEDDING, generator)
+        self.bias2 = nn.Sequential(drawn_linear(size, EMBEDDING, generator), nn.ReLU(), drawn_linear(EMBEDDING, 1, generator))
 
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
         """(1, M) values of the team from the agents' values (N, M) in states (M, S)."""
@@ -61,7 +61,8 @@ class Mixer(nn.Module):
         return mixed[None]
 
 
-def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+def drawn_linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A linear layer whose weights are drawn by ``generator``, uniform within 1 / sqrt(inputs)."""
     layer = nn.Linear(inputs, outputs)
     bound = 1.0 / np.sqrt(inputs)
     for parameter in layer.parameters():
@@ -69,11 +70,10 @@ def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     return layer
 
 
-class QMIX(Learner):
-    """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
+class Mixing(Learner):
+    """A learner with a mixer, which makes the team's value of its agents' and is trained with the networks by one error.
 
-    The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
-    max_b Q_i(s', b), Q_i averaged over the past networks. The mixer of targets is copied whenever a network joins the past ones.
+    The mixer of targets is copied whenever a network joins the past ones.
     """
 
     joint = True
@@ -88,16 +88,13 @@ class QMIX(Learner):
         mask: np.ndarray | None = None,
     ) -> None:
         super().__init__(config, agents, actions, scale, generator, mask)
-        self.mixer = Mixer(agents, torch.from_numpy(scale), generator).to(config.device)
+        self.mixer = self.make_mixer(agents, torch.from_numpy(scale), generator).to(config.device)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
         self.optimise([*self.network.parameters(), *self.mixer.parameters()])
 
-    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, M) values of the team's actions and their targets."""
-        reward, discount = team_return(batch)
-        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
-        target = self.tensor(reward) + self.tensor(discount) * mixed
-        return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
+    def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
+        """The mixer, with initial weights drawn by ``generator``."""
+        raise NotImplementedError
 
     def push(self) -> None:
         """Add the present networks to those that targets are averaged over, and copy the mixer."""
@@ -114,6 +111,25 @@ class QMIX(Learner):
         super().restore(arrays)
         for k, p in enumerate(self.target_mixer.parameters()):
             p.data.copy_(torch.from_numpy(arrays[f"past_mixer{k}"]))
+
+
+class QMIX(Mixing):
+    """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
+
+    The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
+    max_b Q_i(s', b), Q_i averaged over the past networks.
+    """
+
+    def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
+        """A mixer for N agents."""
+        return Mixer(agents, scale, generator)
+
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """(1, M) values of the team's actions and their targets."""
+        reward, discount = team_return(batch)
+        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
+        target = self.tensor(reward) + self.tensor(discount) * mixed
+        return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
 
 
 class Central(Learner):

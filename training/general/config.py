@@ -22,6 +22,8 @@ DRAWN = ("field", "forest", "gates", "corridor", "traffic")
 """Families of missions that draw layouts."""
 HIDEABLE = ("pooled", "lanes", "column-lane", "ways")
 """Groups of inputs that an ablation can hide from the network."""
+TEAM_ERRORS = ("vdn", "qmix")
+"""Learners with one error for a whole team."""
 _NAMED = Rule("must name at least one", bool)
 _LAYERS = Rule("layers must have at least one unit", lambda widths: bool(widths) and min(widths) >= 1)
 _DISCOUNT = Rule("must be at least 0 and below 1", lambda gamma: 0 <= gamma < 1)
@@ -86,9 +88,9 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain", "vdn"] = "hysteretic"
+    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix"] = "hysteretic"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count); vdn
-    has one error for each whole team, and all count."""
+    and qmix have one error for each whole team, and all count."""
     settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
     cool_by: Annotated[float, POSITIVE] = 0.5
@@ -159,7 +161,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
     """The parts of a configuration that learner and exploration use, under their names."""
-    treatment: Any = "plain" if config.learner == "vdn" else config.learner
+    treatment: Any = "plain" if config.learner in TEAM_ERRORS else config.learner
     return make_config(
         "fast",
         method={"lenient": "marlms", "hysteretic": "hysteretic", "plain": "iql"}[treatment],

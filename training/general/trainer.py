@@ -12,7 +12,7 @@ from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
 from marlbc_mj.training.general.squads import Squad
-from marlbc_mj.training.general.vdn import TeamReplay, TeamValues
+from marlbc_mj.training.general.team_values import TEAM_LEARNERS, TeamReplay
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
 from marlbc_mj.training.replay import Replay
@@ -40,15 +40,16 @@ class GeneralTrainer:
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
         self.treatment = learning.learner
-        kind = TeamValues if config.learner == "vdn" else Learner
-        self.learner = kind(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        self.learner = TEAM_LEARNERS.get(config.learner, Learner)(
+            learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config)
+        )
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
         rows = sum(squad.rows for squad in self.squads)
         kept = max(config.capacity // rows, 2 * config.n_step)
         sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])
-        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner == "vdn" else Replay(kept, rows, 1, INPUTS)
+        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner in TEAM_LEARNERS else Replay(kept, rows, 1, INPUTS)
         self.steps = 0  # mission steps made, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         single_thread()

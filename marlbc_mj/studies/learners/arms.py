@@ -41,6 +41,7 @@ ARMS: dict[str, Arm] = {
     "plain": Arm("negative TD errors count fully from the start", {"learner": "plain"}),
     "lenient": Arm("leniency in the place of hysteresis", {"learner": "lenient"}),
     "vdn": Arm("VDN: one TD error for the mean of a team's values", {"learner": "vdn"}),
+    "qmix": Arm("QMIX: one TD error for a monotonic mixture of them", {"learner": "qmix"}),
     "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
     "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
     "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),

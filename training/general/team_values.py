@@ -1,0 +1,101 @@
+"""Values of whole teams of any size: the rivals of the general policy whose one error is that of a team, VDN and QMIX."""
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.replay import Batch, Replay
+from marlbc_mj.training.rivals import EMBEDDING, Mixing, drawn_linear
+
+
+def team_means(rows: Tensor, team: Tensor) -> Tensor:
+    """(K, F) means over each of K teams of ``rows`` (M, F), whose teams are ``team`` (M,), 0 to K - 1."""
+    count = torch.bincount(team).to(rows.dtype)
+    return torch.zeros((len(count), rows.shape[1]), device=rows.device).index_add(0, team, rows) / count[:, None]
+
+
+class TeamVDN(Learner):
+    """VDN (Sunehag et al., AAMAS 2018) with one network for all agents of all teams, each of its own size.
+
+    The team's value is the mean of its agents', so that large teams do not outweigh small ones; so are reward and target.
+    """
+
+    joint = True
+
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """(1, K) values of the actions of K teams and their targets; ``batch`` has their agents one after the other."""
+        chosen, target = super().estimates(batch, now, ahead)
+        team = _teams_of(batch, chosen)
+        return team_means(chosen.T, team).T, team_means(target.T, team).T
+
+
+class TeamMixer(nn.Module):
+    """The mixture of QMIX for teams of any size: w2(x) . elu(mean_i |W1(x_i)| Q_i + b1(x)) + b2(x), x the mean of the inputs x_i.
+
+    The layer that gives an agent's weights sees that agent's inputs, and is the same for all; the others see the team's mean.
+    """
+
+    def __init__(self, inputs: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.weight1 = drawn_linear(inputs, EMBEDDING, generator)
+        self.bias1 = drawn_linear(inputs, EMBEDDING, generator)
+        self.weight2 = drawn_linear(inputs, EMBEDDING, generator)
+        self.bias2 = nn.Sequential(drawn_linear(inputs, EMBEDDING, generator), nn.ReLU(), drawn_linear(EMBEDDING, 1, generator))
+
+    def forward(self, values: Tensor, inputs: Tensor, team: Tensor) -> Tensor:
+        """(1, K) values of the teams ``team`` (M,) from their agents' values (1, M) and inputs (M, S)."""
+        x = team_means(inputs, team)
+        hidden = nn.functional.elu(team_means(self.weight1(inputs).abs() * values.T, team) + self.bias1(x))
+        mixed: Tensor = (hidden * self.weight2(x).abs()).sum(dim=-1) + self.bias2(x)[:, 0]
+        return mixed[None]
+
+
+class TeamQMIX(Mixing):
+    """QMIX (Rashid et al., ICML 2018) with one network for all agents and a :class:`TeamMixer`; reward as in :class:`TeamVDN`."""
+
+    def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
+        """A mixer for any number of agents; inputs are not scaled."""
+        return TeamMixer(len(scale), generator)
+
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """(1, K) values of the actions of K teams and their targets."""
+        chosen = self.chosen(batch, now)
+        team = _teams_of(batch, chosen)
+        reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
+        target = reward + discount * self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state), team)
+        return self.mixer(chosen, self.tensor(batch.state), team), target
+
+
+TEAM_LEARNERS: dict[str, type[Learner]] = {"vdn": TeamVDN, "qmix": TeamQMIX}
+"""Learners that learn from whole teams, by the setting ``learner``."""
+
+
+def _teams_of(batch: Batch, like: Tensor) -> Tensor:
+    """(M,) the team of each transition, on the device of another tensor."""
+    assert batch.team is not None
+    return torch.from_numpy(batch.team).to(like.device)
+
+
+class TeamReplay(Replay):
+    """A ring of rows whose draws are whole teams: decisions of all agents of one team at one time.
+
+    Args:
+        rows: decisions kept.
+        sizes: (T,) agents of each team, in the order of their columns.
+        state: S, size of an agent's inputs.
+    """
+
+    def __init__(self, rows: int, sizes: np.ndarray, state: int) -> None:
+        super().__init__(rows, int(sizes.sum()), 1, state)
+        self.sizes = sizes
+        self.begins = np.cumsum(sizes) - sizes  # (T,) first column of each
+
+    def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
+        """Draw teams with ``size`` agents in the mean; see :meth:`Replay.sample`."""
+        teams = max(1, round(size / self.sizes.mean()))
+        drawn, first = rng.integers(len(self.sizes), size=teams), self.draw_rows(teams, steps, rng)
+        sizes = self.sizes[drawn]
+        team = np.repeat(np.arange(teams), sizes)
+        within = np.arange(len(team)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        return self.gather(first[team], self.begins[drawn][team] + within, steps, gamma)._replace(team=team)
