@@ -33,7 +33,8 @@ def small(threads: int) -> TrainConfig:
 @pytest.mark.slow
 def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     """All keys of the file's schema, positive and finite, and lines that show them."""
-    for name, value in {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1}.items():
+    small_numbers = {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1, "SUPERVISED_WORLDS": 2, "SUPERVISED_STEPS": 3}
+    for name, value in small_numbers.items():
         monkeypatch.setattr(perf, name, value)
     for module in (perf, perf_episode):
         monkeypatch.setattr(module, "paper", lambda: paper(duration=2.0))
@@ -48,6 +49,8 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert set(physics) == {"bare_mj_step", "closed_loop", "python_loop", "python_loop_compiled_laws"}
     rates = [*physics["bare_mj_step"].values(), *physics["closed_loop"].values(), physics["python_loop"]]
     rates += [rate for batch in figures["mission_steps_per_s"].values() for rate in batch.values()]
+    assert set(figures["supervised_steps_per_s"]) == {"alone", *perf.SUPERVISED}
+    rates += figures["supervised_steps_per_s"].values()
     for key in ("environment_mission_steps_per_s", "training_mission_steps_per_s"):
         assert set(figures[key]) == set(physics["bare_mj_step"])
         rates += figures[key].values()
@@ -66,7 +69,7 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
         assert 0 < taken["median"] <= taken["p99"]
     assert figures["decision_us"]["decision_step"]["median"] > figures["decision_us"]["all_mission_steps"]["median"]
     assert figures["ratios"]["training_over_environment_1"] > 0
-    assert len(perf.perf_lines(figures)) >= 19
+    assert len(perf.perf_lines(figures)) >= 26
 
 
 def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from statistics import median
+from time import process_time
 from typing import Any, NamedTuple
 
 import numba
@@ -20,12 +21,17 @@ from marlbc_mj.studies.perf_training import measure_training, training_lines
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_jobs
 from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
+from marlbc_mj.supervisors import Supervisor, carry_out, make_supervisor
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
 BATCH = 64  # worlds of the physics comparison
 BATCHES = (1, 64, 1024)  # worlds of the mission-step figures
+SUPERVISED = ("fsams", "fms", "marlms")
+"""Supervisors that decide for many worlds in one call."""
+SUPERVISED_WORLDS = 1024
+SUPERVISED_STEPS = 10  # mission steps in one measurement, as many as a decision of marlms holds for
 BURST = 12_800  # physics steps in one measurement of a variant
 PYTHON_STEPS = 20  # mission steps in one measurement of the Python loops
 
@@ -90,12 +96,32 @@ class Fleet:
         for _ in range(steps):
             self.world.advance(self._next_orders())
 
+    def advance_under(self, command: "Command", steps: int) -> None:
+        """``steps`` decisions of a supervisor for all worlds, each with its mission step."""
+        for _ in range(steps):
+            self._restart_finished()
+            command.advance(self.world)
+
     def _next_orders(self) -> np.ndarray:
-        state = self.world.state
-        finished = state.steps >= len(self.orders)
+        self._restart_finished()
+        return np.asarray(self.orders[self.world.state.steps])
+
+    def _restart_finished(self) -> None:
+        finished = self.world.state.steps >= len(self.orders)
         if finished.any():
             self.world.reset(mask=finished)
-        return np.asarray(self.orders[state.steps])
+
+
+class Command:
+    """A supervisor in charge of all teams of a world."""
+
+    def __init__(self, supervisor: Supervisor, world: World) -> None:
+        self.supervisor, self.memory = supervisor, supervisor.start(world.scenario, world.worlds)
+
+    def advance(self, world: World) -> None:
+        """One decision, and the mission step after it."""
+        decision, self.memory = self.supervisor.decide(world.observe(), self.memory)
+        carry_out(world, decision)
 
 
 def _bare(fleet: Fleet, threads: int) -> Callable[[], None]:
@@ -221,9 +247,28 @@ def measure_missions(threads: tuple[int, ...], rounds: int, progress: Progress =
     return {"mission_steps_per_s": rates}
 
 
+def measure_supervised(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Mission steps per second of many worlds, on one thread, with a supervisor that observes and decides before each."""
+    progress("mission steps with a supervisor", 0, 1)
+    scenario = paper()
+    orders = scripted_orders(scenario)
+    alone = Fleet(scenario, SUPERVISED_WORLDS, 1, orders)
+    variants: dict[Any, Callable[[], None]] = {"alone": partial(alone.advance, SUPERVISED_STEPS)}
+    for name in SUPERVISED:
+        fleet = Fleet(scenario, SUPERVISED_WORLDS, 1, orders)
+        variants[name] = partial(fleet.advance_under, Command(make_supervisor(name), fleet.world), SUPERVISED_STEPS)
+    taken = interleaved(variants, rounds, process_time)
+    done = SUPERVISED_WORLDS * SUPERVISED_STEPS
+    return {
+        "supervised_steps_per_s": {name: done / median(seconds) for name, seconds in taken.items()},
+        "ratios": {f"{name}_over_step_alone": ratio(taken["alone"], taken[name]) for name in SUPERVISED},
+    }
+
+
 PERF_PARTS: dict[str, Callable[[tuple[int, ...], int, Progress], dict[str, Any]]] = {
     "physics": measure_physics,
     "missions": measure_missions,
+    "supervised": measure_supervised,
     "episode": measure_episode,
     "training": measure_training,
 }
@@ -243,6 +288,10 @@ def perf_lines(figures: dict[str, Any]) -> list[str]:
         f"World.step, B = {batch}, {threads} thread(s): {rate:,.0f} mission steps/s"
         for batch, rates in figures["mission_steps_per_s"].items()
         for threads, rate in rates.items()
+    ]
+    lines += [
+        f"World.step, B = {SUPERVISED_WORLDS}, 1 thread, {name}: {rate:,.0f} mission steps/s"
+        for name, rate in figures["supervised_steps_per_s"].items()
     ]
     lines += [f"{name}: {ratio:.3f}" for name, ratio in ratios.items()]
     lines.append(f"100 s episode, B = 1, supervisor at every mission step: {figures['episode_s']:.3f} s")
