@@ -170,7 +170,7 @@ def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
         spread = f"{np.mean(every):.1f} [{min(every):.1f}, {max(every):.1f}]"
         cells.append((name, str(len(every)), spread, *each, f"{violated} of {flights}"))
     columns = (
-        *(Column("", "arm"), Column("", "trainings"), Column("five families", "mean [least, greatest]", "%")),
+        *(Column("", "arm"), Column("", "trainings"), Column("five families", "mean (least to greatest)", "%")),
         *(Column("success", mission, "%") for mission in missions),
         Column("", "violated"),
     )
