@@ -84,23 +84,10 @@ class Learner:
         return np.ascontiguousarray(q.transpose(0, 1).cpu().numpy())
 
     def update(self, batch: Batch, learning_rate: float) -> float:
-        """Make one gradient step and return the mean absolute TD error.
-
-        The loss is the sum over networks of the mean Huber loss of the TD errors, each weighted by :func:`td_weight`.
-        """
+        """Make one gradient step on :meth:`loss` and return the mean absolute error."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        now, logits = self.network.heads(self.tensor(batch.state))
-        ahead, least = self._masked(*self.targets.heads(self.tensor(batch.next_state)))
-        chosen, target = self.estimates(batch, now, ahead)
-        error = (target - chosen).detach()
-        weight = td_weight(error, self.tensor(batch.leniency.T), self.treatment, self.generator)
-        if batch.weight is not None:
-            weight = weight * self.tensor(batch.weight.T)
-        errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)
-        loss = (errors * weight).sum(dim=0).mean()
-        if self.network.risk:
-            loss = loss + self.risk_loss(batch, logits, least)
+        loss, error = self.loss(batch)
         self.optimiser.zero_grad()
         loss.backward()
         self.network.forget_unseen()
@@ -112,6 +99,23 @@ class Learner:
             self.push()
         self.errors = error.abs().cpu().numpy()
         return float(error.abs().mean())
+
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The loss, and the TD errors (K, M): the sum over networks of the mean Huber loss of the TD errors, each weighted by
+        :func:`td_weight`.
+        """
+        now, logits = self.network.heads(self.tensor(batch.state))
+        ahead, least = self._masked(*self.targets.heads(self.tensor(batch.next_state)))
+        chosen, target = self.estimates(batch, now, ahead)
+        error = (target - chosen).detach()
+        weight = td_weight(error, self.tensor(batch.leniency.T), self.treatment, self.generator)
+        if batch.weight is not None:
+            weight = weight * self.tensor(batch.weight.T)
+        errors = nn.functional.huber_loss(chosen, target, reduction="none", delta=self.config.huber)
+        loss = (errors * weight).sum(dim=0).mean()
+        if self.network.risk:
+            loss = loss + self.risk_loss(batch, logits, least)
+        return loss, error
 
     def _clip(self) -> None:
         if self.joint:

@@ -96,11 +96,11 @@ class Fleet:
         for _ in range(steps):
             self.world.advance(self._next_orders())
 
-    def advance_under(self, command: "Command", steps: int) -> None:
+    def advance_under(self, supervision: "InCharge", steps: int) -> None:
         """``steps`` decisions of a supervisor for all worlds, each with its mission step."""
         for _ in range(steps):
             self._restart_finished()
-            command.advance(self.world)
+            supervision.advance(self.world)
 
     def _next_orders(self) -> np.ndarray:
         self._restart_finished()
@@ -112,7 +112,7 @@ class Fleet:
             self.world.reset(mask=finished)
 
 
-class Command:
+class InCharge:
     """A supervisor in charge of all teams of a world."""
 
     def __init__(self, supervisor: Supervisor, world: World) -> None:
@@ -256,7 +256,7 @@ def measure_supervised(threads: tuple[int, ...], rounds: int, progress: Progress
     variants: dict[Any, Callable[[], None]] = {"alone": partial(alone.advance, SUPERVISED_STEPS)}
     for name in SUPERVISED:
         fleet = Fleet(scenario, SUPERVISED_WORLDS, 1, orders)
-        variants[name] = partial(fleet.advance_under, Command(make_supervisor(name), fleet.world), SUPERVISED_STEPS)
+        variants[name] = partial(fleet.advance_under, InCharge(make_supervisor(name), fleet.world), SUPERVISED_STEPS)
     taken = interleaved(variants, rounds, process_time)
     done = SUPERVISED_WORLDS * SUPERVISED_STEPS
     return {

@@ -88,9 +88,9 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix"] = "hysteretic"
+    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "imitation"] = "hysteretic"
     """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count); vdn
-    and qmix have one error for each whole team, and all count."""
+    and qmix have one error for each whole team, and all count; imitation learns to do what a look-ahead does in all episodes."""
     settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
     cool_by: Annotated[float, POSITIVE] = 0.5
@@ -161,7 +161,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
     """The parts of a configuration that learner and exploration use, under their names."""
-    treatment: Any = "plain" if config.learner in TEAM_ERRORS else config.learner
+    treatment: Any = "plain" if config.learner in (*TEAM_ERRORS, "imitation") else config.learner
     return make_config(
         "fast",
         method={"lenient": "marlms", "hysteretic": "hysteretic", "plain": "iql"}[treatment],

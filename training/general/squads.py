@@ -28,6 +28,7 @@ LOST_BEYOND = 8.0
 class SquadOutcome(NamedTuple):
     """Outcome of one decision of W teams."""
 
+    action: np.ndarray  # (W, N) taken, or where guides are imitated, what the guide would have taken
     reward: np.ndarray  # (W, N) float32
     final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
     ended: np.ndarray  # (W,) bool, a new episode has begun
@@ -87,7 +88,8 @@ class Squad:
 
     def step(self, greedy: np.ndarray, temperature: float) -> SquadOutcome:
         """One decision: ``greedy`` (W, N) actions, or what is explored instead; see :class:`Exploration` for the temperature."""
-        greedy = np.where(self.bins[:, None] > 0, look_ahead(self.inputs, self.last, self.bins)[:, None], greedy)
+        guide = np.broadcast_to(look_ahead(self.inputs, self.last, self.bins)[:, None], greedy.shape)
+        greedy = np.where(self.bins[:, None] > 0, guide, greedy)
         actions = self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
         self.last = actions
@@ -104,7 +106,8 @@ class Squad:
         if ended.any():
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
-        return SquadOutcome(reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
+        learnt = guide if self.config.learner == "imitation" else actions
+        return SquadOutcome(learnt, reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
 
     def _late(self, inputs: np.ndarray) -> np.ndarray:
         """(W, N) bool: agents beyond the tolerance of their slots in the formation; ``inputs`` (W, N, S)."""
@@ -145,7 +148,7 @@ class Squad:
         self.astray[ended] = 0
         lossy = self.rng.random(count) < config.lossy
         self.loss[ended] = np.where(lossy, self.rng.uniform(0.0, config.most_loss, count), 0.0)
-        guided = self.rng.random(count) < config.guided
+        guided = self.rng.random(count) < (1.0 if config.learner == "imitation" else config.guided)
         self.bins[ended] = np.where(guided, self.rng.integers(NEAREST_SIGHT, LANE_BINS, count, endpoint=True), 0)
 
 

@@ -10,9 +10,9 @@ import torch
 from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
-from marlbc_mj.training.general.config import GeneralConfig, input_mask, learner_config, training_scenarios
+from marlbc_mj.training.general.config import TEAM_ERRORS, GeneralConfig, input_mask, learner_config, training_scenarios
+from marlbc_mj.training.general.rivals import GENERAL_RIVALS, TeamReplay
 from marlbc_mj.training.general.squads import Squad
-from marlbc_mj.training.general.team_values import TEAM_LEARNERS, TeamReplay
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
 from marlbc_mj.training.replay import Replay
@@ -40,7 +40,7 @@ class GeneralTrainer:
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
         self.treatment = learning.learner
-        self.learner = TEAM_LEARNERS.get(config.learner, Learner)(
+        self.learner = GENERAL_RIVALS.get(config.learner, Learner)(
             learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config)
         )
         if config.start:
@@ -49,7 +49,7 @@ class GeneralTrainer:
         rows = sum(squad.rows for squad in self.squads)
         kept = max(config.capacity // rows, 2 * config.n_step)
         sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])
-        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner in TEAM_LEARNERS else Replay(kept, rows, 1, INPUTS)
+        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner in TEAM_ERRORS else Replay(kept, rows, 1, INPUTS)
         self.steps = 0  # mission steps made, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         single_thread()
@@ -109,7 +109,7 @@ class GeneralTrainer:
         self.replay.store(
             state=inputs,
             final=np.concatenate([outcome.final.reshape(-1, INPUTS) for outcome in outcomes]),
-            action=np.concatenate([squad.last.reshape(-1, 1) for squad in self.squads]),
+            action=np.concatenate([outcome.action.reshape(-1, 1) for outcome in outcomes]),
             reward=np.concatenate([outcome.reward.reshape(-1, 1) for outcome in outcomes]),
             leniency=leniency(np.full((rows, 1), temperature)).astype(np.float32),
             lost=np.zeros((rows, 1), dtype=bool),

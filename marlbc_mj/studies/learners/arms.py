@@ -42,6 +42,7 @@ ARMS: dict[str, Arm] = {
     "lenient": Arm("leniency in the place of hysteresis", {"learner": "lenient"}),
     "vdn": Arm("VDN: one TD error for the mean of a team's values", {"learner": "vdn"}),
     "qmix": Arm("QMIX: one TD error for a monotonic mixture of them", {"learner": "qmix"}),
+    "imitation": Arm("no rewards: in all episodes the look-ahead that guides a quarter is imitated", {"learner": "imitation"}),
     "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
     "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
     "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),

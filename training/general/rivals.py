@@ -1,4 +1,4 @@
-"""Values of whole teams of any size: the rivals of the general policy whose one error is that of a team, VDN and QMIX."""
+"""Rivals of the general policy's learner: VDN and QMIX for teams of any size, with one error for a team, and imitation."""
 
 import numpy as np
 import torch
@@ -67,8 +67,19 @@ class TeamQMIX(Mixing):
         return self.mixer(chosen, self.tensor(batch.state), team), target
 
 
-TEAM_LEARNERS: dict[str, type[Learner]] = {"vdn": TeamVDN, "qmix": TeamQMIX}
-"""Learners that learn from whole teams, by the setting ``learner``."""
+class Imitation(Learner):
+    """Imitation alone: what the network gives are logits, and the actions of a batch are those of a guide, whatever was taken."""
+
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The cross entropy of the guide's actions, and how improbable each was (1, M)."""
+        logits = self.network(self.tensor(batch.state))[0]
+        shown = torch.from_numpy(batch.action[:, 0]).to(logits.device)
+        each = nn.functional.cross_entropy(logits, shown, reduction="none")
+        return each.mean(), 1.0 - torch.exp(-each.detach())[None]
+
+
+GENERAL_RIVALS: dict[str, type[Learner]] = {"vdn": TeamVDN, "qmix": TeamQMIX, "imitation": Imitation}
+"""Learners by the setting ``learner``, where it names another than :class:`~marlbc_mj.training.learner.Learner`."""
 
 
 def _teams_of(batch: Batch, like: Tensor) -> Tensor:

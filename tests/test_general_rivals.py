@@ -1,4 +1,4 @@
-"""VDN and QMIX for teams of any size: whole teams are drawn, and each has one error."""
+"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; and imitation alone."""
 
 from dataclasses import replace
 from typing import Literal
@@ -9,7 +9,7 @@ import torch
 
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
-from marlbc_mj.training.general.team_values import TeamMixer, TeamReplay, TeamVDN
+from marlbc_mj.training.general.rivals import Imitation, TeamMixer, TeamReplay, TeamVDN
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.replay import Batch
 
@@ -66,14 +66,15 @@ def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:
     torch.testing.assert_close(alone, mixed[:, :1])
 
 
-@pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0)])
-def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix"], settle: float) -> None:
+@pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0), ("imitation", 1.0)])
+def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix", "imitation"], settle: float) -> None:
     """All errors count alike before values settle and after."""
     config = replace(SMALL, learner=learner, settle=settle)
     one, other = GeneralTrainer(config), GeneralTrainer(replace(config, seed=3))
     for _ in range(4):
         one.advance()
-    assert one.learner.treatment == "plain" and one.learner.errors.shape == (1, 4)  # 4 teams of 5 agents in the mean
+    drawn = 20 if learner == "imitation" else 4  # agents, or teams of five in the mean
+    assert one.learner.treatment == "plain" and one.learner.errors.shape == (1, drawn)
     arrays, scalars = one.snapshot()
     other.restore({name: array.copy() for name, array in arrays.items()}, scalars)
     for _ in range(3):
@@ -82,3 +83,36 @@ def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix"], sett
     assert one.error == other.error > 0.0
     after = other.snapshot()[0]
     assert all(np.array_equal(array, after[name], equal_nan=True) for name, array in one.snapshot()[0].items())
+
+
+def test_imitation_learns_what_the_guide_would_do() -> None:
+    """The cross entropy by hand; then a batch, learned again and again, is imitated whatever its rewards."""
+    config = learner_config(replace(SMALL, learner="imitation"))
+    learner = Imitation(config, 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
+    rng = np.random.default_rng(1)
+    state, shown = rng.normal(size=(30, INPUTS)).astype(np.float32), rng.integers(2, size=(30, 1))
+    zeros = np.zeros((30, 1), dtype=np.float32)
+    batch = Batch(state, shown, rng.normal(size=(30, 1)).astype(np.float32), zeros, state, zeros)
+    values = learner.values(state)[:, 0].astype(np.float64)
+    chance = np.exp(values) / np.exp(values).sum(axis=1, keepdims=True)
+    loss, error = learner.loss(batch)
+    taken = np.take_along_axis(chance, shown, axis=1)[:, 0]
+    assert float(loss.detach()) == pytest.approx(-np.log(taken).mean(), rel=1e-5)
+    np.testing.assert_allclose(error[0], 1.0 - taken, atol=1e-6)
+    for _ in range(200):
+        learner.update(batch, 0.01)
+    assert (learner.values(state)[:, 0].argmax(axis=1) == shown[:, 0]).all()
+
+
+def test_what_is_imitated_is_the_guide_and_not_what_was_taken() -> None:
+    """Exploration leaves the guide's actions in the buffer, in every episode."""
+    trainer = GeneralTrainer(replace(SMALL, learner="imitation", together=1.0))
+    taken = []
+    for _ in range(6):
+        trainer.advance()
+        taken.append(np.concatenate([squad.last.reshape(-1, 1) for squad in trainer.squads]))
+    stored = trainer.replay.arrays["action"][:6]
+    assert (np.array(taken) != stored).any()
+    assert all((squad.bins > 0).all() for squad in trainer.squads)
+    for row in stored:  # a team is told one action
+        assert len(set(row[:4, 0])) == len(set(row[4:, 0])) == 1
