@@ -89,7 +89,7 @@ class ShieldView(NamedTuple):
     stopping: np.ndarray  # (N,) L_i, filled by shield_team [m]
     grid: np.ndarray  # room for a grid of the obstacles, filled, and one of the team; empty where trying all pairs costs less
     planes: np.ndarray  # (N, N, 2, 3) half-planes in the place of agents, see marlbc_mj.core.stamps; (0, 0, 2, 3): all know all
-    looked: np.ndarray  # (N, 3) the last look at everything, see marlbc_mj.core.lookout; (0, 3): none is of use
+    looked: np.ndarray  # (N, 3) where each agent last looked from, see marlbc_mj.core.lookout; (0, 3): no look-out
     around: np.ndarray  # (N, 1 + LISTED) int64, what was around each agent when it looked; (0, 1 + LISTED)
     near: np.ndarray  # (1 + things,) int64 scratch: how many things may be too near to the agent at hand, then which
 
