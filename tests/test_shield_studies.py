@@ -74,3 +74,11 @@ def test_the_report_bounds_the_rate_of_failures(capsys):
     said = capsys.readouterr().out
     assert "| field | 2 | 2 | 0 | 0 |" in said
     assert "4 missions among obstacles at rest, none failed: rate at most 0.75 at 95 %" in said
+
+
+def test_a_team_without_room_is_passed_over(capsys):
+    """With its reason; the others are flown."""
+    report_missions(["--missions", "1", "--seconds", "0.5", "--agents", "64,2", "--families", "corridor"])
+    said = capsys.readouterr().out
+    assert "corridor, 64 agents, not flown: scenario 'corridor' cannot be flown" in said
+    assert "| corridor | 2 | 1 | 0 | 0 |" in said

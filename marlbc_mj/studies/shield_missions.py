@@ -23,6 +23,7 @@ from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import ASSUMPTIONS, Shield
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import FAMILIES, Scenario, held_out, make_scenario
+from marlbc_mj.util.errors import ConfigurationError
 
 ATTACK_SPEED = 15.0  # of references that attack [m/s]
 CHANGE = 20  # mission steps between two changes of mind
@@ -128,7 +129,11 @@ def report_missions(arguments: Sequence[str] | None = None) -> None:
     print("| family | agents | missions | violated | touched | substeps changed | " + " | ".join(ASSUMPTIONS) + " | s |")
     for family, agents in product(given.families.split(","), map(int, given.agents.split(","))):
         began = perf_counter()
-        scenario = mission_of(family, agents, given.seconds)
+        try:
+            scenario = mission_of(family, agents, given.seconds)
+        except ConfigurationError as error:  # no room for a team of this size
+            print(f"{family}, {agents} agents, not flown: {error}", flush=True)
+            continue
         cell = run_missions(scenario, given.missions, given.seed)
         changed = f"{100 * cell.interventions / cell.substeps:.2f} %"
         numbers = (family, agents, cell.missions, cell.violations, cell.touches, changed, *map(int, cell.breaches))
