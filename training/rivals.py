@@ -30,10 +30,33 @@ class VDN(Learner):
         return chosen.sum(dim=0, keepdim=True), target.sum(dim=0, keepdim=True)
 
 
-class Mixer(nn.Module):
-    """Q_tot = w2(s) . elu(W1(s) Q + b1(s)) + b2(s), with W1 and w2 >= 0, so that Q_tot never falls when a Q_i rises.
+class MixingLayers(nn.Module):
+    """w2(s) . elu(W1(s) Q + b1(s)) + b2(s), with W1 and w2 >= 0, so that the team's value never falls when a Q_i rises.
 
     W1 and w2 are absolute values of linear functions of the state; b2 has a hidden ReLU layer (Rashid et al., ICML 2018).
+
+    Args:
+        inputs: S, size of what the layers see.
+        weighted: values that one row of W1 weighs.
+        generator: random numbers of the initial weights.
+    """
+
+    def __init__(self, inputs: int, weighted: int, generator: torch.Generator) -> None:
+        super().__init__()
+        self.weight1 = _linear(inputs, weighted * EMBEDDING, generator)
+        self.bias1 = _linear(inputs, EMBEDDING, generator)
+        self.weight2 = _linear(inputs, EMBEDDING, generator)
+        self.bias2 = nn.Sequential(_linear(inputs, EMBEDDING, generator), nn.ReLU(), _linear(EMBEDDING, 1, generator))
+
+    def mix(self, weighted: Tensor, x: Tensor) -> Tensor:
+        """(1, M) values of M teams from W1(s) Q (M, E) and what the other layers see, ``x`` (M, S)."""
+        hidden = nn.functional.elu(weighted + self.bias1(x))
+        mixed: Tensor = (hidden * self.weight2(x).abs()).sum(dim=-1) + self.bias2(x)[:, 0]
+        return mixed[None]
+
+
+class Mixer(MixingLayers):
+    """The mixture of QMIX for N agents.
 
     Args:
         agents: N.
@@ -42,27 +65,19 @@ class Mixer(nn.Module):
     """
 
     def __init__(self, agents: int, scale: Tensor, generator: torch.Generator) -> None:
-        super().__init__()
+        super().__init__(len(scale), agents, generator)
         self.agents = agents
         self.scale: Tensor
         self.register_buffer("scale", scale.to(torch.float32))
-        size = len(scale)
-        self.weight1 = drawn_linear(size, agents * EMBEDDING, generator)
-        self.bias1 = drawn_linear(size, EMBEDDING, generator)
-        self.weight2 = drawn_linear(size, EMBEDDING, generator)
-        self.bias2 = nn.Sequential(drawn_linear(size, EMBEDDING, generator), nn.ReLU(), drawn_linear(EMBEDDING, 1, generator))
 
     def forward(self, values: Tensor, state: Tensor) -> Tensor:
         """(1, M) values of the team from the agents' values (N, M) in states (M, S)."""
         x = state / self.scale
         weight = self.weight1(x).abs().view(len(x), self.agents, EMBEDDING)
-        hidden = nn.functional.elu(torch.einsum("nm,mne->me", values, weight) + self.bias1(x))
-        mixed: Tensor = (hidden * self.weight2(x).abs()).sum(dim=-1) + self.bias2(x)[:, 0]
-        return mixed[None]
+        return self.mix(torch.einsum("nm,mne->me", values, weight), x)
 
 
-def drawn_linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
-    """A linear layer whose weights are drawn by ``generator``, uniform within 1 / sqrt(inputs)."""
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
     layer = nn.Linear(inputs, outputs)
     bound = 1.0 / np.sqrt(inputs)
     for parameter in layer.parameters():
@@ -70,10 +85,11 @@ def drawn_linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Li
     return layer
 
 
-class Mixing(Learner):
-    """A learner with a mixer, which makes the team's value of its agents' and is trained with the networks by one error.
+class QMIX(Learner):
+    """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
 
-    The mixer of targets is copied whenever a network joins the past ones.
+    The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
+    max_b Q_i(s', b), Q_i averaged over the past networks. The mixer of targets is copied whenever a network joins the past ones.
     """
 
     joint = True
@@ -93,8 +109,15 @@ class Mixing(Learner):
         self.optimise([*self.network.parameters(), *self.mixer.parameters()])
 
     def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
-        """The mixer, with initial weights drawn by ``generator``."""
-        raise NotImplementedError
+        """A mixer for N agents, with initial weights drawn by ``generator``."""
+        return Mixer(agents, scale, generator)
+
+    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
+        """(1, M) values of the team's actions and their targets."""
+        reward, discount = team_return(batch)
+        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
+        target = self.tensor(reward) + self.tensor(discount) * mixed
+        return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
 
     def push(self) -> None:
         """Add the present networks to those that targets are averaged over, and copy the mixer."""
@@ -111,25 +134,6 @@ class Mixing(Learner):
         super().restore(arrays)
         for k, p in enumerate(self.target_mixer.parameters()):
             p.data.copy_(torch.from_numpy(arrays[f"past_mixer{k}"]))
-
-
-class QMIX(Mixing):
-    """The team's value is a monotonic mixture of the agents' (Rashid et al., ICML 2018), see :class:`Mixer`.
-
-    The team's reward is the sum of the agents'; its return ends with the first agent's. Target: the mixture of
-    max_b Q_i(s', b), Q_i averaged over the past networks.
-    """
-
-    def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
-        """A mixer for N agents."""
-        return Mixer(agents, scale, generator)
-
-    def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, M) values of the team's actions and their targets."""
-        reward, discount = team_return(batch)
-        mixed: Tensor = self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state))
-        target = self.tensor(reward) + self.tensor(discount) * mixed
-        return self.mixer(self.chosen(batch, now), self.tensor(batch.state)), target
 
 
 class Central(Learner):

@@ -96,12 +96,6 @@ class Fleet:
         for _ in range(steps):
             self.world.advance(self._next_orders())
 
-    def advance_under(self, supervision: "InCharge", steps: int) -> None:
-        """``steps`` decisions of a supervisor for all worlds, each with its mission step."""
-        for _ in range(steps):
-            self._restart_finished()
-            supervision.advance(self.world)
-
     def _next_orders(self) -> np.ndarray:
         self._restart_finished()
         return np.asarray(self.orders[self.world.state.steps])
@@ -112,16 +106,19 @@ class Fleet:
             self.world.reset(mask=finished)
 
 
-class InCharge:
-    """A supervisor in charge of all teams of a world."""
+class SupervisedFleet(Fleet):
+    """A fleet whose supervisor observes and decides for all worlds before every mission step."""
 
-    def __init__(self, supervisor: Supervisor, world: World) -> None:
-        self.supervisor, self.memory = supervisor, supervisor.start(world.scenario, world.worlds)
+    def __init__(self, scenario: Scenario, worlds: int, threads: int, orders: np.ndarray, supervisor: Supervisor) -> None:
+        super().__init__(scenario, worlds, threads, orders)
+        self.supervisor, self.memory = supervisor, supervisor.start(scenario, worlds)
 
-    def advance(self, world: World) -> None:
-        """One decision, and the mission step after it."""
-        decision, self.memory = self.supervisor.decide(world.observe(), self.memory)
-        carry_out(world, decision)
+    def advance(self, steps: int) -> None:
+        """``steps`` decisions, each with its ``World.step``; a finished world starts again."""
+        for _ in range(steps):
+            self._restart_finished()
+            decision, self.memory = self.supervisor.decide(self.world.observe(), self.memory)
+            carry_out(self.world, decision)
 
 
 def _bare(fleet: Fleet, threads: int) -> Callable[[], None]:
@@ -252,11 +249,9 @@ def measure_supervised(threads: tuple[int, ...], rounds: int, progress: Progress
     progress("mission steps with a supervisor", 0, 1)
     scenario = paper()
     orders = scripted_orders(scenario)
-    alone = Fleet(scenario, SUPERVISED_WORLDS, 1, orders)
-    variants: dict[Any, Callable[[], None]] = {"alone": partial(alone.advance, SUPERVISED_STEPS)}
-    for name in SUPERVISED:
-        fleet = Fleet(scenario, SUPERVISED_WORLDS, 1, orders)
-        variants[name] = partial(fleet.advance_under, InCharge(make_supervisor(name), fleet.world), SUPERVISED_STEPS)
+    fleets = {"alone": Fleet(scenario, SUPERVISED_WORLDS, 1, orders)}
+    fleets |= {name: SupervisedFleet(scenario, SUPERVISED_WORLDS, 1, orders, make_supervisor(name)) for name in SUPERVISED}
+    variants: dict[Any, Callable[[], None]] = {name: partial(fleet.advance, SUPERVISED_STEPS) for name, fleet in fleets.items()}
     taken = interleaved(variants, rounds, process_time)
     done = SUPERVISED_WORLDS * SUPERVISED_STEPS
     return {

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.replay import Batch, Replay
-from marlbc_mj.training.rivals import EMBEDDING, Mixing, drawn_linear
+from marlbc_mj.training.rivals import QMIX, MixingLayers
 
 
 def team_means(rows: Tensor, team: Tensor) -> Tensor:
@@ -30,29 +30,22 @@ class TeamVDN(Learner):
         return team_means(chosen.T, team).T, team_means(target.T, team).T
 
 
-class TeamMixer(nn.Module):
+class TeamMixer(MixingLayers):
     """The mixture of QMIX for teams of any size: w2(x) . elu(mean_i |W1(x_i)| Q_i + b1(x)) + b2(x), x the mean of the inputs x_i.
 
     The layer that gives an agent's weights sees that agent's inputs, and is the same for all; the others see the team's mean.
     """
 
     def __init__(self, inputs: int, generator: torch.Generator) -> None:
-        super().__init__()
-        self.weight1 = drawn_linear(inputs, EMBEDDING, generator)
-        self.bias1 = drawn_linear(inputs, EMBEDDING, generator)
-        self.weight2 = drawn_linear(inputs, EMBEDDING, generator)
-        self.bias2 = nn.Sequential(drawn_linear(inputs, EMBEDDING, generator), nn.ReLU(), drawn_linear(EMBEDDING, 1, generator))
+        super().__init__(inputs, 1, generator)
 
     def forward(self, values: Tensor, inputs: Tensor, team: Tensor) -> Tensor:
         """(1, K) values of the teams ``team`` (M,) from their agents' values (1, M) and inputs (M, S)."""
-        x = team_means(inputs, team)
-        hidden = nn.functional.elu(team_means(self.weight1(inputs).abs() * values.T, team) + self.bias1(x))
-        mixed: Tensor = (hidden * self.weight2(x).abs()).sum(dim=-1) + self.bias2(x)[:, 0]
-        return mixed[None]
+        return self.mix(team_means(self.weight1(inputs).abs() * values.T, team), team_means(inputs, team))
 
 
-class TeamQMIX(Mixing):
-    """QMIX (Rashid et al., ICML 2018) with one network for all agents and a :class:`TeamMixer`; reward as in :class:`TeamVDN`."""
+class TeamQMIX(QMIX):
+    """QMIX with one network for all agents and a :class:`TeamMixer`; reward as in :class:`TeamVDN`."""
 
     def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
         """A mixer for any number of agents; inputs are not scaled."""

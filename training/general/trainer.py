@@ -39,10 +39,8 @@ class GeneralTrainer:
         self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
-        self.treatment = learning.learner
-        self.learner = GENERAL_RIVALS.get(config.learner, Learner)(
-            learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config)
-        )
+        kind = GENERAL_RIVALS.get(config.learner, Learner)
+        self.learner = kind(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
@@ -122,7 +120,7 @@ class GeneralTrainer:
     def _learn(self) -> None:
         config = self.config
         rate = config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * (1.0 - self.share)
-        self.learner.treatment = "plain" if self.share >= config.settle else self.treatment
+        self.learner.treatment = "plain" if self.share >= config.settle else self.learner.config.learner
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
             self.error = self.learner.update(batch, rate)
