@@ -72,7 +72,7 @@ def for_team(law: Law, signature: Any) -> Law:
     The function raises ConfigurationError where the law reads a name that it does not declare, and SimulationError where it
     raises anything else.
     """
-    team = on_rows(law, signature)
+    team = _entry(law, signature) if is_compiled(law) else on_rows(law, signature)
 
     def checked(*arguments: Any) -> Any:
         try:
