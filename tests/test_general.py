@@ -231,6 +231,8 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
         ({}, {"weight0": np.zeros((1, 7, 16), np.float32)}, "7, 16"),
         ({}, {"weight1": np.full((1, 16, 3), np.nan, np.float32)}, "not finite"),
         ({}, {"weight0": np.zeros((1, inputs.INPUTS, 16))}, "float32"),
+        ({}, {"weight0": np.zeros((2, inputs.INPUTS, 16), np.float32)}, "layer 0 has weights"),
+        ({}, {"weight0": np.float32(1.0)}, "float32"),
     ],
 )
 def test_checkpoints_of_another_kind_are_refused(tmp_path: Path, changes, arrays, said: str) -> None:
@@ -249,7 +251,7 @@ def test_a_checkpoint_of_one_team_is_no_general_policy() -> None:
 
 
 def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
-    """As one network, also of three layers; a mean of none is refused."""
+    """Also of three layers; a mean of none, or of networks of two sizes, is refused."""
     deep = [with_middle_layer(random_policy(seed), seed) for seed in range(3)]
     seen = np.random.default_rng(0).normal(size=(7, inputs.INPUTS)).astype(np.float32)
     for policies in ([random_policy(1), random_policy(2)], deep):
@@ -257,6 +259,8 @@ def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
         np.testing.assert_allclose(mean_policy(policies, 0.05).values(seen), mean, rtol=1e-4, atol=1e-4)
     with pytest.raises(ConfigurationError, match="at least one policy"):
         mean_policy([], 0.0)
+    with pytest.raises(ConfigurationError, match="of the same size"):
+        mean_policy([random_policy(), deep[0]], 0.0)
 
 
 def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
@@ -268,6 +272,22 @@ def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
     assert shipped_to.with_suffix(".md").read_text().count("marlbc train marlms-general --seed 0 --set budget=400") == 2
     with pytest.raises(ConfigurationError, match="exists"):
         ship_mean([shipped_to], "both", tmp_path)
+
+
+def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of their last networks, under one margin."""
+    run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0}, "git_revision": "abc"}
+    for k in range(3):
+        for kind in ("best", "last"):
+            (tmp_path / f"{k}" / "checkpoint").mkdir(parents=True, exist_ok=True)
+            write_general(tmp_path / f"{k}" / "checkpoint" / f"{kind}.safetensors", random_policy(k + (kind == "best")), run)
+    monkeypatch.setattr(ship_mean, "__defaults__", (tmp_path,))
+    main(["ship", str(tmp_path / "0"), "mine", "--mean-with", str(tmp_path / "1"), str(tmp_path / "2")])
+    policy, description = read_general(tmp_path / "mine.safetensors")
+    seen = np.random.default_rng(0).normal(size=(7, inputs.INPUTS)).astype(np.float32)
+    mean = np.mean([random_policy(k).values(seen) for k in range(3)], axis=0)
+    np.testing.assert_allclose(policy.values(seen), mean, rtol=1e-4, atol=1e-4)
+    assert policy.network.margin == np.float32(GeneralConfig().switching_margin) and len(description["mean_of"]) == 3
 
 
 def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
@@ -338,6 +358,9 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
     for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
         with pytest.raises(ConfigurationError, match=said):
             GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
+    write_general(path, mean_policy([policy, policy], 0.0), {})
+    with pytest.raises(ConfigurationError, match="a mean of several networks"):
+        GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path)))
 
 
 def test_a_stopped_run_goes_on_bit_for_bit(
@@ -430,7 +453,7 @@ def test_it_flies_over_any_network(changes) -> None:
 
 def test_all_errors_count_once_values_settle() -> None:
     """Before the share ``settle`` of the budget negative errors count half, from then on in full."""
-    trainer = GeneralTrainer(replace(SMALL, settle=0.5))
+    trainer = GeneralTrainer(replace(SMALL, settle=0.5, learner="hysteretic"))
     trainer.advance()
     trainer.advance()
     assert trainer.share < 0.5 and trainer.learner.treatment == "hysteretic"

@@ -111,6 +111,23 @@ def _need_packages() -> None:
             raise ConfigurationError(f"marlbc export needs the {name} package: pip install 'marlbc-mj[onnx]'") from None
 
 
+def _as_modules(policy: Policy) -> TeamNetwork:
+    """The networks of a policy in torch."""
+    size = NetworkSize(len(policy.weights[0]), len(policy.scale), policy.columns, tuple(b.shape[2] for b in policy.biases[:-1]))
+    network = TeamNetwork(size, torch.tensor(policy.scale), dueling=policy.dueling, risk=policy.risk > 0).requires_grad_(False)
+    for own, trained in ((network.weights, policy.weights), (network.biases, policy.biases)):
+        for parameter, array in zip(own, trained, strict=True):
+            parameter.copy_(torch.tensor(array))
+    return network
+
+
+def _choose(values: Tensor, kept: Tensor, fresh: Tensor, margin: float) -> Tensor:
+    """Actions (...,) for values (..., A), chosen as :func:`~marlbc_mj.policies.greedy.greedy` does; in force are ``kept``."""
+    best = values.argmax(dim=-1)
+    lead = values.gather(-1, best[..., None]) - values.gather(-1, kept[..., None])
+    return torch.where(takes_best(lead[..., 0], fresh, margin), best, kept)
+
+
 class TeamPolicy(nn.Module):
     """``Policy.values`` and ``greedy`` of N agents in torch.
 
@@ -121,16 +138,8 @@ class TeamPolicy(nn.Module):
 
     def __init__(self, policy: Policy, agents: int) -> None:
         super().__init__()
-        networks, hidden = len(policy.weights[0]), tuple(bias.shape[2] for bias in policy.biases[:-1])
-        self.network = TeamNetwork(
-            NetworkSize(networks, len(policy.scale), policy.columns, hidden),
-            torch.tensor(policy.scale),
-            dueling=policy.dueling,
-            risk=policy.risk > 0,
-        ).requires_grad_(False)
-        for own, trained in ((self.network.weights, policy.weights), (self.network.biases, policy.biases)):
-            for parameter, array in zip(own, trained, strict=True):
-                parameter.copy_(torch.tensor(array))
+        networks = len(policy.weights[0])
+        self.network = _as_modules(policy)
         self.margin, self.risk = policy.margin, policy.risk
         self.each = policy.columns if networks == agents else round(policy.columns ** (1 / agents))
         self.strides: Tensor | None  # of the agents' actions in a joint one
@@ -149,9 +158,7 @@ class TeamPolicy(nn.Module):
         kept = last.clamp(min=0)
         if self.strides is not None:
             kept = (kept * self.strides).sum(dim=-1, keepdim=True)
-        best = values.argmax(dim=-1)
-        lead = values.gather(-1, best[..., None]) - values.gather(-1, kept[..., None])
-        chosen = torch.where(takes_best(lead[..., 0], fresh, self.margin), best, kept)
+        chosen = _choose(values, kept, fresh, self.margin)
         return values, chosen if self.strides is None else chosen.div(self.strides, rounding_mode="floor") % self.each
 
 
@@ -162,14 +169,15 @@ class AgentPolicy(nn.Module):
 
     def __init__(self, policy: GeneralPolicy) -> None:
         super().__init__()
-        self.team = TeamPolicy(policy.network, 1)
+        self.network, self.margin = _as_modules(policy.network), policy.network.margin
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
         """Values (B, 2) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
         (B,), negative for none.
         """
-        values, chosen = self.team(torch.cat([features, pool(heard, age)], dim=-1), last[:, None])
-        return values[:, 0], chosen[:, 0]
+        values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
+        mean = values.mean(dim=0)
+        return mean, _choose(mean, last.clamp(min=0), last < 0, self.margin)
 
 
 def pool(heard: Tensor, age: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""``marlbc ship``: copy a training run's best checkpoint into the package."""
+"""``marlbc ship``: copy a training run's best checkpoint, or the mean of several runs, into the package."""
 
 from dataclasses import dataclass, field
 
@@ -16,6 +16,8 @@ class ShipCommand:
     """Folder of the training run."""
     name: Positional[str]
     """Name that the supervisor gets: marlms, rlms, marlms-general."""
+    mean_with: tuple[TrainedRun, ...] = ()
+    """More runs of the general policy: shipped are the mean action values of the last networks of all."""
     overwrite: bool = False
     """Replace an existing checkpoint."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
@@ -23,9 +25,12 @@ class ShipCommand:
     def run(self) -> None:
         """Copy, write the card, say where."""
         from marlbc_mj.policies.general import is_general
-        from marlbc_mj.training.general.shipping import ship_general
+        from marlbc_mj.training.general.shipping import ship_general, ship_mean
         from marlbc_mj.training.ship import ship
 
-        best = self.run_folder / "checkpoint" / "best.safetensors"
-        put = ship_general if is_general(best) else ship
+        if self.mean_with:
+            parts = [run / "checkpoint" / "last.safetensors" for run in (self.run_folder, *self.mean_with)]
+            self.output.say(ship_mean(parts, self.name, overwrite=self.overwrite))
+            return
+        put = ship_general if is_general(self.run_folder / "checkpoint" / "best.safetensors") else ship
         self.output.say(put(self.run_folder, self.name, overwrite=self.overwrite))

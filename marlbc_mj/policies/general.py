@@ -35,9 +35,9 @@ class Sensed(NamedTuple):
 
 
 class GeneralPolicy(NamedTuple):
-    """A dueling network that all agents share, with a switching margin."""
+    """Dueling networks that all agents share, with a switching margin. Its values are the mean of the networks'."""
 
-    network: Policy  # of one network, INPUTS wide, with two action values
+    network: Policy  # of one or more networks, INPUTS wide, with two action values
 
     def messages(self, features: np.ndarray) -> np.ndarray:
         """(B, N, M) what each agent sends to the others: what it sensed."""
@@ -57,7 +57,8 @@ class GeneralPolicy(NamedTuple):
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
         """(M, 2) action values for inputs (M, S), one row per agent."""
-        return self.network.values(inputs)[:, 0]
+        values: np.ndarray = self.network.values(inputs).mean(axis=1)
+        return values
 
 
 def decision_steps(scenario: Scenario, sight: Sight) -> int:
@@ -126,46 +127,32 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
 
 
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
-    """The policy of one dueling network, weights (1, in, out) and biases (1, 1, out) of its layers."""
+    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers."""
     return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
 
 
 def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
-    """One policy whose values are the mean of those of others: their networks side by side, weights between two of them zero.
+    """One policy whose values are the mean of those of others.
 
     Raises:
-        ConfigurationError: no policies, or networks of different depth.
+        ConfigurationError: no policies, or networks of different sizes.
     """
-    from scipy.linalg import block_diag  # here, as it takes longer to import than most commands take to answer
-
     networks = [policy.network for policy in policies]
-    if not networks or len({len(network.weights) for network in networks}) > 1:
-        raise ConfigurationError("a mean takes at least one policy, and networks that have the same number of layers")
-    last = len(networks[0].weights) - 1
-    share = np.float32(1.0 / len(networks))
-    weights: list[np.ndarray] = []
-    biases: list[np.ndarray] = []
-    for k in range(last + 1):
-        layers = [network.weights[k][0] for network in networks]
-        if k == 0:
-            joined = np.concatenate(layers, axis=1)
-        elif k < last:
-            joined = block_diag(*layers)
-        else:
-            joined = share * np.concatenate(layers, axis=0)
-        weights.append(joined[None])
-        offsets = [network.biases[k] for network in networks]
-        biases.append(np.concatenate(offsets, axis=-1) if k < last else np.asarray(share * np.sum(offsets, axis=0)))
+    sizes = {tuple(weight.shape[1:] for weight in network.weights) for network in networks}
+    if len(sizes) != 1:
+        raise ConfigurationError(f"a mean takes at least one policy, and networks of the same size; these have {sorted(sizes)}")
+    weights = (np.concatenate(layers) for layers in zip(*(network.weights for network in networks), strict=True))
+    biases = (np.concatenate(layers) for layers in zip(*(network.biases for network in networks), strict=True))
     return make_general(tuple(weights), tuple(biases), margin)
 
 
 def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:
     """The reason why arrays are no network for a general policy; empty if they are one."""
-    width = INPUTS
+    width, count = INPUTS, len(biases[0]) if biases and biases[0].ndim else 1
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if weight.dtype != np.float32 or bias.dtype != np.float32 or weight.ndim != 3:
             return f"layer {k} is not made of float32 matrices"
-        if weight.shape[:2] != (1, width) or bias.shape != (1, 1, weight.shape[2]):
+        if weight.shape[:2] != (count, width) or bias.shape != (count, 1, weight.shape[2]):
             return f"layer {k} has weights {weight.shape} and biases {bias.shape} for {width} inputs"
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             return f"layer {k} is not finite"

@@ -88,11 +88,12 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "imitation"] = "hysteretic"
-    """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count); vdn
-    and qmix have one error for each whole team, and all count; imitation learns to do what a look-ahead does in all episodes."""
+    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "imitation"] = "vdn"
+    """vdn and qmix have one TD error for each whole team. With lenient, hysteretic and plain every agent has its own; some
+    of the negative ones are overlooked, half of each counts, or all count. Imitation learns to do what a look-ahead does in all
+    episodes."""
     settle: Annotated[float, SHARE] = 0.5
-    """Share of the budget from which all TD errors count, whatever the learner: values settle where they were too high."""
+    """Share of the budget from which lenient and hysteretic learners count all TD errors: values that were too high settle."""
     cool_by: Annotated[float, POSITIVE] = 0.5
     """Share of the budget after which the temperature is 0.05."""
     hold: Annotated[int, AT_LEAST_ONE] = 6
@@ -109,7 +110,7 @@ class GeneralConfig:
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that is out of its slot's tolerance when the mission ends."""
-    switching_margin: float = 0.05
+    switching_margin: float = 0.3
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""

@@ -72,8 +72,10 @@ class GeneralTrainer:
         """Take over the network of a policy, also for targets and for the running mean.
 
         Raises:
-            ConfigurationError: its layers have other sizes than the configuration's.
+            ConfigurationError: its layers have other sizes than the configuration's, or it is a mean of several networks.
         """
+        if len(policy.network.weights[0]) > 1:
+            raise ConfigurationError(f"checkpoint {self.config.start} is a mean of several networks; a run begins with one")
         found = tuple(bias.shape[2] for bias in policy.network.biases[:-1])
         if found != self.config.hidden:
             raise ConfigurationError(f"checkpoint {self.config.start} has hidden layers {found}, the run {self.config.hidden}")

@@ -35,13 +35,13 @@ class Arm(NamedTuple):
 
 
 ARMS: dict[str, Arm] = {
-    "full": Arm("the defaults"),
+    "full": Arm("the defaults: VDN, one TD error for the mean of a team's values"),
     "no-pooling": Arm("an agent hears nobody", {"hide": ("pooled",)}),
     "no-lanes": Arm("no clearance along the lanes of the slots, own or heard", {"hide": ("lanes",)}),
-    "plain": Arm("negative TD errors count fully from the start", {"learner": "plain"}),
-    "lenient": Arm("leniency in the place of hysteresis", {"learner": "lenient"}),
-    "vdn": Arm("VDN: one TD error for the mean of a team's values", {"learner": "vdn"}),
-    "qmix": Arm("QMIX: one TD error for a monotonic mixture of them", {"learner": "qmix"}),
+    "hysteretic": Arm("every agent learns by itself, and half of each negative TD error counts", {"learner": "hysteretic"}),
+    "lenient": Arm("every agent learns by itself, and overlooks some negative TD errors", {"learner": "lenient"}),
+    "plain": Arm("every agent learns by itself, and all TD errors count", {"learner": "plain"}),
+    "qmix": Arm("QMIX: one TD error for a monotonic mixture of the team's values", {"learner": "qmix"}),
     "imitation": Arm("no rewards: in all episodes the look-ahead that guides a quarter is imitated", {"learner": "imitation"}),
     "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
     "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
