@@ -21,6 +21,7 @@ from marlbc_mj.studies.draws import DrawsStudy
 from marlbc_mj.studies.learners.trainings import LearnerStudy
 from marlbc_mj.studies.perf import PerfStudy
 from marlbc_mj.studies.protocol import Report, Stopped, Watch
+from marlbc_mj.studies.regret import RegretStudy
 from marlbc_mj.studies.robot_gate import GateStudy
 from marlbc_mj.studies.runner import counting, run_jobs, run_study
 from marlbc_mj.studies.scale import ScaleStudy
@@ -130,6 +131,7 @@ STUDIES = {
     "calibrate": CalibrationStudy(),
     "gate": GateStudy(("disc", "omni"), ("scripted",)),
     "perf": PerfStudy(),
+    "regret": RegretStudy(("gates",), ("fixed",), 2),
     "scale": ScaleStudy(),
     "study": LearnerStudy(Path("nowhere"), budget=5_000),
 }

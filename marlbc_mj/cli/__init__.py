@@ -17,6 +17,7 @@ from marlbc_mj.cli.measuring import (
     CommunicationCommand,
     OracleCommand,
     PerfCommand,
+    RegretCommand,
     ScaleCommand,
 )
 from marlbc_mj.cli.parsing import parse
@@ -50,6 +51,7 @@ Command = (
     | Annotated[CommunicationCommand, subcommand("communication")]
     | Annotated[CalibrateCommand, subcommand("calibrate")]
     | Annotated[OracleCommand, subcommand("oracle")]
+    | Annotated[RegretCommand, subcommand("regret")]
 )
 
 DESCRIPTION = (

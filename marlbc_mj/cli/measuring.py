@@ -1,6 +1,4 @@
-"""``marlbc perf``, ``scale``, ``ablation``, ``communication``, ``calibrate`` and ``oracle``: speed, and where numbers come
-from.
-"""
+"""Commands about speed, about where numbers come from, and about the best known return."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +14,7 @@ from marlbc_mj.cli.choices import (
     ScenarioNames,
     SomePath,
     SupervisorName,
+    SupervisorNames,
 )
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.cli.scenario_options import ScenarioOptions
@@ -206,6 +205,43 @@ class OracleCommand:
         save_schedule(found, scenario, self.controller, self.out)
         text = f"return {found.total:.0f} after {found.episodes} episodes (schedule of the scenario: {found.scripted})"
         self.output.report(text, {"return": found.total, "episodes": found.episodes, "scripted": found.scripted})
+
+
+@dataclass(frozen=True)
+class RegretCommand:
+    """Compare supervisors with the best schedule that a search finds for each of some held-out layouts; half a minute each."""
+
+    missions: Positional[ScenarioNames] = ("field", "forest", "gates", "corridor")
+    """Scenarios that draw layouts of obstacles at rest; flown under the set-based composition."""
+    supervisors: SupervisorNames = ("marlms-general", "rollout", "lookahead", "fixed")
+    """Supervisors to compare. The search begins with the best that one of them flew."""
+    layouts: int = 50
+    """Layouts of every mission."""
+    seed: int = 90_000
+    """Seed of the first layout."""
+    budget: int = 512
+    """Episodes that the search may simulate on each layout."""
+    controller: ControllerName = "sorlc"
+    """Controller that tracks the references."""
+    workers: int = 1
+    """Processes that share the layouts."""
+    out: Path = Path("out/regret")
+    """Folder for regret.csv, regret.md and config.json."""
+    overwrite: bool = False
+    """Replace the results in the output folder."""
+    output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
+
+    def run(self) -> None:
+        """Fly and search, write the numbers, and print the table."""
+        from marlbc_mj.studies.regret import RegretStudy
+        from marlbc_mj.studies.runner import counting, run_study
+
+        study = RegretStudy(self.missions, self.supervisors, self.layouts, self.seed, self.budget, self.controller)
+        with self.output.progress() as told:
+            ended = counting(study.jobs(), lambda job: job.mission, told.progress)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=ended)
+        self.output.report(done.report.text, done.report.document)
+        self.output.say(f"{self.out / 'regret.csv'} holds the numbers")
 
 
 def _check_writable(out: Path | None, *, overwrite: bool) -> None:

@@ -18,9 +18,9 @@ from marlbc_mj.util.files import check_target, staged_file
 from marlbc_mj.util.provenance import plain_data, provenance
 
 _WHAT = (
-    "One dueling Q-network that every agent of every team shares. Every 1.2 settling times each agent decides by itself between "
-    f"formation and column, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} that it pools "
-    "of what it heard. It needs the set-based composition, a formation with a column and a path that moves."
+    "Dueling Q-learning of one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
+    f"itself between formation and column, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
+    "that it pools of what it heard. It needs the set-based composition, a formation with a column and a path that moves."
 )
 
 
@@ -78,8 +78,8 @@ def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
     lines = [
         f"# {name}",
         "",
-        f"{_WHAT} Its action values are the mean of those of {len(runs)} networks that were trained apart or one from the other; "
-        "a file named in `start` is the checkpoint of another run, of this table or before it.",
+        f"{_WHAT} Its action values are the mean of those of {len(runs)} networks, each trained by a command of its own"
+        + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
         "",
         pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
     ]

@@ -1,0 +1,159 @@
+"""How much of the best known return supervisors reach: for every layout a search, without a time limit, for the best schedule.
+
+The search knows the layout and plays every candidate to its end on the simulator, see :mod:`marlbc_mj.supervisors.oracle`. It
+begins with the best that a supervisor flew, so it finds nothing worse. What it finds is a lower bound of what can be reached.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from marlbc_mj.controllers import make_controller
+from marlbc_mj.engine.world import World
+from marlbc_mj.episode import run_episode
+from marlbc_mj.report.formats import fixed
+from marlbc_mj.report.table import Column, Table, to_markdown, write_rows
+from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.seeds import seed_range
+from marlbc_mj.scenarios import Obstacle, Perturbation, Scenario, held_out, make_scenario
+from marlbc_mj.studies.protocol import Report, Watch
+from marlbc_mj.supervisors import make_supervisor
+from marlbc_mj.supervisors.oracle import POPULATION, search, windows_of
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.files import write_json
+from marlbc_mj.util.method_names import display_name
+from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.provenance import provenance
+from marlbc_mj.util.seeding import stream
+
+
+class RegretJob(NamedTuple):
+    """One layout: who flies it, and how long is searched."""
+
+    mission: str
+    seed: int
+    supervisors: tuple[str, ...]
+    controller: str
+    budget: int
+
+
+class LayoutReturns(NamedTuple):
+    """Returns on one layout."""
+
+    best: float  # of the best schedule known that violates nowhere
+    flown: tuple[float, ...]  # of each supervisor, whether it violated or not
+
+
+@dataclass(frozen=True)
+class RegretStudy:
+    """Supervisors and a search on held-out layouts of families whose obstacles are at rest, under the set-based composition.
+
+    Raises:
+        ConfigurationError: no missions or supervisors, unknown ones, obstacles that move, no layouts, or a budget below one
+            population.
+    """
+
+    missions: tuple[str, ...] = ("field", "forest", "gates", "corridor")
+    supervisors: tuple[str, ...] = ("marlms-general", "rollout", "lookahead", "fixed")
+    layouts: int = 50
+    seed: int = 90_000
+    """Seed of the first layout."""
+    budget: int = 512
+    """Episodes that the search may simulate on each."""
+    controller: str = "sorlc"
+
+    def __post_init__(self) -> None:
+        if not self.missions or not self.supervisors:
+            raise ConfigurationError("name at least one mission and one supervisor")
+        if self.budget < POPULATION:
+            raise ConfigurationError(f"budget must be at least {POPULATION}, one population, got {self.budget}")
+        make_controller(self.controller)
+        for name in self.missions:
+            scenario = frozen(_mission(name), self.seed)
+            for supervisor in self.supervisors:
+                make_supervisor(supervisor).start(scenario, 1)
+        seed_range(self.layouts, self.seed)
+
+    def jobs(self) -> list[RegretJob]:
+        """Layout by layout, so that a study that is stopped has all missions."""
+        return [
+            RegretJob(mission, seed, self.supervisors, self.controller, self.budget)
+            for seed in seed_range(self.layouts, self.seed)
+            for mission in self.missions
+        ]
+
+    def run(self, job: RegretJob, watch: Watch) -> LayoutReturns:
+        scenario = frozen(_mission(job.mission), job.seed)
+        world = World(scenario, make_controller(job.controller), record=True)
+        tables, returns, safe = [], [], []
+        for name in job.supervisors:
+            trajectory = run_episode(world, make_supervisor(name))
+            metrics = measure(trajectory)
+            tables.append(trajectory.command)
+            returns.append(metrics["team"]["return"])
+            safe.append(all(agent["violation_time"] == 0.0 for agent in metrics["agents"]))
+        first = max(range(len(returns)), key=lambda k: (safe[k], returns[k]))
+        start = windows_of(tables[first], scenario)
+        found = search(scenario, job.controller, seed=job.seed, budget=job.budget, start=start)
+        return LayoutReturns(found.total, tuple(returns))
+
+    def report(self, results: Sequence[LayoutReturns], out: Path | None, progress: Progress = silent) -> Report:
+        """Write regret.csv, regret.md and the configuration."""
+        rows = [
+            {
+                "mission": job.mission,
+                "seed": job.seed,
+                "best": result.best,
+                **dict(zip(self.supervisors, result.flown, strict=True)),
+            }
+            for job, result in zip(self.jobs(), results, strict=True)
+        ]
+        text = to_markdown(regret_table(rows, self.supervisors))
+        if out is not None:
+            write_rows(rows, out / "regret.csv")
+            (out / "regret.md").write_text(text + "\n", encoding="utf-8")
+            write_json(out / "config.json", {"study": self, **provenance()})
+        return Report(text, rows)
+
+
+def frozen(scenario: Scenario, seed: int) -> Scenario:
+    """The instance of a scenario that a seed draws, as a scenario that draws nothing.
+
+    Raises:
+        ConfigurationError: obstacles move, which the search cannot plan around.
+    """
+    draw = scenario.draw(stream(seed))
+    if len(draw.motions):
+        raise ConfigurationError(f"mission {scenario.name!r} has obstacles that move; the search plans around those at rest")
+    return replace(
+        scenario,
+        starts=tuple((x, y) for x, y in draw.starts.tolist()),
+        obstacles=tuple(Obstacle(*each) for each in draw.obstacles.tolist()),
+        layout=None,
+        perturbation=Perturbation(),
+    )
+
+
+def regret_table(rows: Sequence[dict[str, Any]], supervisors: Sequence[str]) -> Table:
+    """Per mission the median of the best known returns, and of every supervisor's share of the best of its layout."""
+    cells = []
+    for mission in dict.fromkeys(row["mission"] for row in rows):
+        lines = [row for row in rows if row["mission"] == mission]
+        shares = [np.array([100.0 * row[name] / row["best"] for row in lines]) for name in supervisors]
+        each = (f"{np.median(share):.1f} [{share.min():.1f}]" for share in shares)
+        cells.append((mission, str(len(lines)), fixed(float(np.median([row["best"] for row in lines])), 0), *each))
+    columns = (
+        *(Column("", "mission"), Column("", "layouts"), Column("best known return", "median")),
+        *(Column("share of the best", display_name(name), "%") for name in supervisors),
+    )
+    notes = (
+        "Shares are medians over layouts, in brackets the least. Schedules violate nowhere; supervisors count as they flew.",
+    )
+    return Table("regret", "Return against the best schedule that a search found for each layout", columns, tuple(cells), notes)
+
+
+def _mission(name: str) -> Scenario:
+    return held_out(make_scenario(name, composition="set-based"))
