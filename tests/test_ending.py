@@ -64,7 +64,7 @@ def test_a_command_that_is_interrupted_while_it_is_read(monkeypatch, capsys):
     assert stopped.value.code == 130 and capsys.readouterr().err == "marlbc: interrupted\n"
 
 
-LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times the second after which the signal comes
+LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times as long as until the signal comes
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +84,7 @@ def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers)
         until = time.monotonic() + 120
         while not any(tmp_path.iterdir()) and time.monotonic() < until:
             time.sleep(0.05)
-        time.sleep(1.0)
+        time.sleep(1.0 if workers else 0.3)
         os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
         try:
             _, said = process.communicate(timeout=100)

@@ -14,7 +14,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 def short(name: str):
-    return replace(held_out(make_scenario(name, composition="set-based")), duration=6.0)
+    return replace(held_out(make_scenario(name, composition="set-based")), duration=3.0)
 
 
 @pytest.mark.parametrize("name", ["gates", "field"])
