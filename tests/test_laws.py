@@ -1,6 +1,7 @@
 """Names of gains and state: one law reads the same on every path, and a wrong name is refused with the names there are."""
 
 import json
+import pickle
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -115,6 +116,20 @@ def test_names_cost_no_reference_counting_and_leave_the_loops_signature_as_it_is
     assert laws.address(named, laws.CONTROLLER) != 0
     assert named.entry.signatures == [laws.TEAM_CONTROLLER.args]
     assert named.targetoptions["_nrt"] is named.entry.targetoptions["_nrt"] is False
+
+
+def test_a_record_is_its_row_and_its_names_travel():
+    """A number and an array are written through; nothing else can be; and names in a pickle are names again."""
+    names, row = laws.Names.of({"limit": (), "memory": (2, 2)}), np.arange(7.0)
+    record = names.view(row)
+    record.limit = 8.0
+    record.memory[1, 0] += 0.5
+    assert row.tolist() == [8.0, 1.0, 2.0, 3.5, 4.0, 5.0, 6.0] and record.memory.shape == (2, 2)
+    with pytest.raises(AttributeError, match="'record' object has no attribute 'weight'"):
+        _ = record.weight
+    with pytest.raises(AttributeError, match="'record' object has no attribute 'weight'"):
+        record.weight = 1.0
+    assert pickle.loads(pickle.dumps(names)) == names and pickle.loads(pickle.dumps(names)).view(row).limit == 8.0
 
 
 def test_gains_are_packed_in_the_order_of_their_names():
