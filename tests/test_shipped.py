@@ -36,12 +36,17 @@ def test_a_message_names_a_shipped_checkpoint_without_its_place(tmp_path):
             supervisor.start(make_scenario("field"), 1)
 
 
-def test_marlms_reaches_the_goal():
-    """Safe at every substep, no more switches than the paper's, and not below the scripted supervisor."""
-    metrics = measure(run_episode(World(paper(), record=True), make_supervisor("marlms")))
+@pytest.mark.parametrize(
+    ("name", "composition", "least"), [("marlms", "null-space", 15_017), ("marlms-general", "set-based", 15_500)]
+)
+def test_the_goal_is_reached_on_the_case_study(name, composition, least):
+    """Safe at every substep, no more switches than the paper's, and a return not below the schedule's; of the general policy,
+    which has never seen the mission, at least 15 500.
+    """
+    metrics = measure(run_episode(World(paper(composition=composition), record=True), make_supervisor(name)))
     assert all(a["violation_time"] == 0.0 for a in metrics["agents"])
     assert all(a["switches"] <= most for a, most in zip(metrics["agents"], (4, 2, 2, 4), strict=True))
-    assert metrics["team"]["return"] >= 15_017
+    assert metrics["team"]["return"] >= least
 
 
 def test_a_run_becomes_a_shipped_checkpoint(tmp_path, capsys):
