@@ -6,6 +6,7 @@ begins with the best that a supervisor flew, so it finds nothing worse. What it 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,6 +18,7 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.report.formats import fixed
 from marlbc_mj.report.table import Column, Table, to_markdown, write_rows
 from marlbc_mj.results.metrics import measure
+from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.scenarios import Obstacle, Perturbation, Scenario, held_out, make_scenario
 from marlbc_mj.studies.protocol import Report, Watch
@@ -88,17 +90,15 @@ class RegretStudy:
     def run(self, job: RegretJob, watch: Watch) -> LayoutReturns:
         scenario = frozen(_mission(job.mission), job.seed)
         world = World(scenario, make_controller(job.controller), record=True)
-        tables, returns, safe = [], [], []
+        flown = []
         for name in job.supervisors:
             trajectory = run_episode(world, make_supervisor(name))
             metrics = measure(trajectory)
-            tables.append(trajectory.command)
-            returns.append(metrics["team"]["return"])
-            safe.append(all(agent["violation_time"] == 0.0 for agent in metrics["agents"]))
-        first = max(range(len(returns)), key=lambda k: (safe[k], returns[k]))
-        start = windows_of(tables[first], scenario)
+            safe = SCORES["violation_time_worst"].read(metrics) == 0.0
+            flown.append((safe, SCORES["return"].read(metrics), trajectory.command))
+        start = windows_of(max(flown, key=itemgetter(0, 1))[2], scenario)
         found = search(scenario, job.controller, seed=job.seed, budget=job.budget, start=start)
-        return LayoutReturns(found.total, tuple(returns))
+        return LayoutReturns(found.total, tuple(total for _, total, _ in flown))
 
     def report(self, results: Sequence[LayoutReturns], out: Path | None, progress: Progress = silent) -> Report:
         """Write regret.csv, regret.md and the configuration."""
