@@ -399,7 +399,7 @@ def test_lost_messages_age() -> None:
     squad.end[:] = 10**6
     before = squad.age.copy()
     own = np.eye(4, dtype=bool)
-    squad.step(np.zeros((2, 4), dtype=np.int64), 0.0)
+    squad.step(np.zeros((2, 4), dtype=np.int64))
     assert (squad.age[:, own] == 0.0).all()
     assert (squad.age[:, ~own] == before[:, ~own] + 1.0).all()
     torch.set_num_threads(1)

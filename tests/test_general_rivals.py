@@ -1,4 +1,4 @@
-"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; and imitation alone."""
+"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; MAPPO; and imitation alone."""
 
 from dataclasses import replace
 from typing import Literal
@@ -9,8 +9,12 @@ import torch
 
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
+from marlbc_mj.training.general.ppo import PPOTrainer, with_team
 from marlbc_mj.training.general.rivals import Imitation, TeamMixer, TeamReplay, TeamVDN
+from marlbc_mj.training.general.run import make_general_trainer
 from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.mappo import advantages
+from marlbc_mj.training.methods import PPO
 from marlbc_mj.training.replay import Batch
 
 SMALL = GeneralConfig(
@@ -66,14 +70,14 @@ def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:
     torch.testing.assert_close(alone, mixed[:, :1])
 
 
-@pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0), ("imitation", 1.0)])
-def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix", "imitation"], settle: float) -> None:
-    """All errors count alike before values settle and after."""
-    config = replace(SMALL, learner=learner, settle=settle)
-    one, other = GeneralTrainer(config), GeneralTrainer(replace(config, seed=3))
+@pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0), ("mappo", 1.0), ("imitation", 1.0)])
+def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix", "mappo", "imitation"], settle: float) -> None:
+    """All errors count alike before values settle and after; a rollout of three decisions is interrupted."""
+    config = replace(SMALL, learner=learner, settle=settle, ppo=PPO(rollout=3, epochs=2, minibatches=1))
+    one, other = make_general_trainer(config), make_general_trainer(replace(config, seed=3))
     for _ in range(4):
         one.advance()
-    drawn = 20 if learner == "imitation" else 4  # agents, or teams of five in the mean
+    drawn = {"imitation": 20, "mappo": 30}.get(learner, 4)  # agents, or teams of five in the mean
     assert one.learner.treatment == "plain" and one.learner.errors.shape == (1, drawn)
     arrays, scalars = one.snapshot()
     other.restore({name: array.copy() for name, array in arrays.items()}, scalars)
@@ -83,6 +87,49 @@ def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix", "imit
     assert one.error == other.error > 0.0
     after = other.snapshot()[0]
     assert all(np.array_equal(array, after[name], equal_nan=True) for name, array in one.snapshot()[0].items())
+
+
+def test_the_critic_sees_an_agent_and_the_mean_of_its_team() -> None:
+    rows = np.arange(10.0, dtype=np.float32).reshape(1, 5, 2)
+    seen = with_team(rows, np.array([2, 3]))
+    np.testing.assert_array_equal(seen[..., :2], rows)
+    np.testing.assert_array_equal(seen[0, :, 2:], [[1, 2], [1, 2], [6, 7], [6, 7], [6, 7]])
+
+
+def test_a_rollout_is_assessed_with_the_critics_values() -> None:
+    """Advantages of every agent by the estimator of Schulman et al., normalised; the critic learns value and advantage."""
+    trainer = PPOTrainer(replace(SMALL, learner="mappo", ppo=PPO(rollout=6)))
+    for _ in range(5):
+        trainer.advance()
+    learner, rows = trainer.learner, trainer.replay.arrays
+    rows["terminal"][2, 3] = rows["ended"][2, 3] = True
+    found = learner.assess(rows, trainer.sizes, 0.9)
+    now, ahead = (
+        learner.critic(torch.from_numpy(with_team(rows[name], trainer.sizes)).flatten(0, 1))[0].detach().numpy().reshape(6, 10, 1)
+        for name in ("state", "final")
+    )
+    gain = advantages(rows["reward"], now, ahead, rows["terminal"], rows["ended"], 0.9, 0.95).reshape(-1)
+    np.testing.assert_allclose(found.gain[0], (gain - gain.mean()) / gain.std(), rtol=1e-3, atol=1e-4)
+    moved = gain + now.reshape(-1)
+    np.testing.assert_allclose(found.returns[0], (moved - moved.mean()) / moved.std(), rtol=1e-3, atol=1e-3)
+    assert gain[2 * 10 + 3] == pytest.approx(rows["reward"][2, 3, 0] - now[2, 3, 0])
+    assert found.state.shape == (60, INPUTS) and found.view.shape == (60, 2 * INPUTS)
+
+
+def test_mappo_prefers_what_paid() -> None:
+    """Rollouts in which the second action was worth more than the first: actors choose it more often then."""
+    trainer = PPOTrainer(replace(SMALL, learner="mappo", learning_rate=5e-3, ppo=PPO(rollout=8, epochs=3, minibatches=2)))
+    rng, rows = np.random.default_rng(0), trainer.replay.arrays
+    for _ in range(12):
+        for name in ("state", "final"):
+            rows[name][:] = rng.normal(size=rows[name].shape)
+        rows["action"][:] = rng.integers(2, size=rows["action"].shape)
+        rows["reward"][:] = rows["action"] == 1
+        rows["terminal"][:] = True
+        trainer.learn()
+    values = trainer.learner.values(rng.normal(size=(200, INPUTS)).astype(np.float32))[:, 0]
+    assert (values.argmax(axis=-1) == 1).mean() > 0.95
+    assert trainer.learner.updates == 72
 
 
 def test_imitation_learns_what_the_guide_would_do() -> None:

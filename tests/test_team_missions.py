@@ -65,7 +65,7 @@ def test_an_episode_ends_where_an_agent_is_lost() -> None:
     squad = Squad(team_mission("gates", "line", 6, composition="set-based", substep=0.01), config, learner_config(config), 0)
     squad.end[:] = squad.scenario.mission_steps
     greedy = np.full((1, 6), FORMATION)
-    outcomes = [squad.step(greedy, 0.0) for _ in range(90)]
+    outcomes = [squad.step(greedy) for _ in range(90)]
     first = next(k for k, outcome in enumerate(outcomes) if outcome.terminal.any())
     assert first > LOST_AFTER
     assert outcomes[first].ended.all()
@@ -79,10 +79,10 @@ def test_a_mission_is_over_at_its_end_and_who_is_late_pays() -> None:
     mission = team_mission("field", "wedge", 4, composition="set-based", substep=0.01, duration=6.0)
     squad = Squad(mission, config, learner_config(config), 0)
     squad.end[:] = 3 * squad.interval
-    early = [squad.step(np.full((1, 4), FORMATION), 0.0) for _ in range(3)]
+    early = [squad.step(np.full((1, 4), FORMATION)) for _ in range(3)]
     assert early[-1].ended.all() and not any(outcome.terminal.any() for outcome in early)
     action, last = np.full((1, 4), COLUMN_ACTION), -(-mission.mission_steps // squad.interval) - 1
-    column = [squad.step(action, 0.0) for _ in range(last + 1)]
+    column = [squad.step(action) for _ in range(last + 1)]
     assert [bool(outcome.terminal.all()) for outcome in column] == [False] * last + [True]
     late = column[-1].final[0, :, WAYS] > np.tanh(mission.formation_tolerance / mission.safe_distance)
     assert late.any()

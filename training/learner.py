@@ -85,9 +85,12 @@ class Learner:
 
     def update(self, batch: Batch, learning_rate: float) -> float:
         """Make one gradient step on :meth:`loss` and return the mean absolute error."""
+        return self.descend(*self.loss(batch), learning_rate)
+
+    def descend(self, loss: Tensor, error: Tensor, learning_rate: float) -> float:
+        """Make one gradient step on ``loss`` and return the mean absolute ``error`` (K, M)."""
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate
-        loss, error = self.loss(batch)
         self.optimiser.zero_grad()
         loss.backward()
         self.network.forget_unseen()

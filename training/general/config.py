@@ -9,6 +9,7 @@ from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES
 from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
+from marlbc_mj.training.methods import PPO
 from marlbc_mj.util.errors import unknown
 from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
 
@@ -24,6 +25,10 @@ HIDEABLE = ("pooled", "lanes", "column-lane", "ways")
 """Groups of inputs that an ablation can hide from the network."""
 TEAM_ERRORS = ("vdn", "qmix")
 """Learners with one error for a whole team."""
+TREATMENTS = {"lenient": "marlms", "hysteretic": "hysteretic", "plain": "iql"}
+"""Methods for one team that have the same learner, by learners whose agents learn by themselves."""
+GENERAL_PPO = PPO(entropy=0.03)
+"""Settings of MAPPO for the general policy. With an entropy bonus of 0.01 nobody learns to form the column."""
 _NAMED = Rule("must name at least one", bool)
 _LAYERS = Rule("layers must have at least one unit", lambda widths: bool(widths) and min(widths) >= 1)
 _DISCOUNT = Rule("must be at least 0 and below 1", lambda gamma: 0 <= gamma < 1)
@@ -88,10 +93,10 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "imitation"] = "vdn"
+    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "mappo", "imitation"] = "vdn"
     """vdn and qmix have one TD error for each whole team. With lenient, hysteretic and plain every agent has its own; some
-    of the negative ones are overlooked, half of each counts, or all count. Imitation learns to do what a look-ahead does in all
-    episodes."""
+    of the negative ones are overlooked, half of each counts, or all count. mappo learns from fresh rollouts, see ppo. Imitation
+    learns to do what a look-ahead does in all episodes."""
     settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which lenient and hysteretic learners count all TD errors: values that were too high settle."""
     cool_by: Annotated[float, POSITIVE] = 0.5
@@ -114,6 +119,8 @@ class GeneralConfig:
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
+    ppo: PPO = GENERAL_PPO
+    """Settings of mappo alone, which has no replay buffer, guide, held exploration or target copies."""
 
     evaluate_every: Annotated[int, AT_LEAST_ONE] = 800_000
     """Mission steps between evaluations on held-out layouts."""
@@ -162,10 +169,10 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 def learner_config(config: GeneralConfig) -> TrainConfig:
     """The parts of a configuration that learner and exploration use, under their names."""
-    treatment: Any = "plain" if config.learner in (*TEAM_ERRORS, "imitation") else config.learner
+    treatment: Any = config.learner if config.learner in TREATMENTS else "plain"
     return make_config(
         "fast",
-        method={"lenient": "marlms", "hysteretic": "hysteretic", "plain": "iql"}[treatment],
+        method=TREATMENTS[treatment],
         learner=treatment,
         seed=config.seed,
         worlds=config.worlds,
@@ -180,6 +187,7 @@ def learner_config(config: GeneralConfig) -> TrainConfig:
         together=config.together,
         agreement=0.0,
         least_exploration=config.least_exploration,
+        ppo=config.ppo,
         device=config.device,
     )
 

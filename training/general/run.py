@@ -10,6 +10,7 @@ from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
+from marlbc_mj.training.general.ppo import PPOTrainer
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.resuming import RESUME, saved_run
 from marlbc_mj.training.run import (
@@ -31,6 +32,15 @@ _SAVED = {**{name: kind for name, kind in SAVED_KINDS.items() if name != "curve"
 """Types of the entries in the description of a saved run."""
 GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
 """Callback of a run after every decision, with its last evaluation."""
+
+
+def make_general_trainer(config: GeneralConfig) -> GeneralTrainer:
+    """The trainer of the configuration's learner.
+
+    Raises:
+        ConfigurationError: a scenario, controller or device that cannot be used.
+    """
+    return PPOTrainer(config) if config.learner == "mappo" else GeneralTrainer(config)
 
 
 def train_general(
@@ -102,7 +112,7 @@ class GeneralRun:
 
     def __init__(self, config: GeneralConfig, out: Path) -> None:
         self.config, self.out = config, out
-        self.trainer = GeneralTrainer(config)
+        self.trainer = make_general_trainer(config)
         scenarios = judging_scenarios(config)
         self.judges = {k: Judge(each, JUDGED_WITH, config.layouts, config.threads) for k, each in scenarios.items()}
         self.origin = provenance()

@@ -86,11 +86,18 @@ class Squad:
         self.age = np.where(arrives, 0.0, self.age + (1.0 if only is None else only[:, None, None]))
         return join_inputs(features, self.heard, self.age * self.interval * self.scenario.mission_step / self.sight.time)
 
-    def step(self, greedy: np.ndarray, temperature: float) -> SquadOutcome:
-        """One decision: ``greedy`` (W, N) actions, or what is explored instead; see :class:`Exploration` for the temperature."""
-        guide = np.broadcast_to(look_ahead(self.inputs, self.last, self.bins)[:, None], greedy.shape)
-        greedy = np.where(self.bins[:, None] > 0, guide, greedy)
-        actions = self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
+    def choose(self, greedy: np.ndarray, temperature: float) -> np.ndarray:
+        """(W, N) actions: ``greedy`` ones, a guide's, or what is explored at this temperature, see :class:`Exploration`."""
+        greedy = np.where(self.bins[:, None] > 0, self._guide(), greedy)
+        return self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
+
+    def _guide(self) -> np.ndarray:
+        """(W, N) what the look-ahead would do."""
+        return np.broadcast_to(look_ahead(self.inputs, self.last, self.bins)[:, None], self.last.shape)
+
+    def step(self, actions: np.ndarray) -> SquadOutcome:
+        """One decision, with ``actions`` (W, N)."""
+        learnt = self._guide() if self.config.learner == "imitation" else actions
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
         self.last = actions
         returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
@@ -106,7 +113,6 @@ class Squad:
         if ended.any():
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
-        learnt = guide if self.config.learner == "imitation" else actions
         return SquadOutcome(learnt, reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
 
     def _late(self, inputs: np.ndarray) -> np.ndarray:

@@ -39,18 +39,24 @@ class GeneralTrainer:
         self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
-        kind = GENERAL_RIVALS.get(config.learner, Learner)
-        self.learner = kind(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        self.learner = self.kind()(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
-        rows = sum(squad.rows for squad in self.squads)
-        kept = max(config.capacity // rows, 2 * config.n_step)
-        sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])
-        self.replay = TeamReplay(kept, sizes, INPUTS) if config.learner in TEAM_ERRORS else Replay(kept, rows, 1, INPUTS)
+        self.sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])  # (T,) of the teams
+        self.replay = self.make_replay(int(self.sizes.sum()))
         self.steps = 0  # mission steps made, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         single_thread()
+
+    def kind(self) -> type[Learner]:
+        """Class of the learner."""
+        return GENERAL_RIVALS.get(self.config.learner, Learner)
+
+    def make_replay(self, rows: int) -> Replay:
+        """The replay buffer for the decisions of ``rows`` agents."""
+        kept = max(self.config.capacity // rows, 2 * self.config.n_step)
+        return TeamReplay(kept, self.sizes, INPUTS) if self.config.learner in TEAM_ERRORS else Replay(kept, rows, 1, INPUTS)
 
     @property
     def finished(self) -> bool:
@@ -95,17 +101,13 @@ class GeneralTrainer:
         """
         self._act()
         if self.replay.count > self.config.n_step:
-            self._learn()
+            self.learn()
 
     def _act(self) -> None:
         inputs = np.concatenate([squad.inputs.reshape(-1, INPUTS) for squad in self.squads])
-        greedy = self.learner.values(inputs)[:, 0].argmax(axis=-1)
-        bounds = np.cumsum([squad.rows for squad in self.squads])[:-1]
-        temperature, outcomes = self.temperature, []
-        for squad, best in zip(self.squads, np.split(greedy, bounds), strict=True):
-            outcomes.append(squad.step(best.reshape(squad.last.shape), temperature))
+        outcomes = [squad.step(actions) for squad, actions in zip(self.squads, self.choose(inputs), strict=True)]
         single_thread()
-        rows = len(inputs)
+        rows, temperature = len(inputs), self.temperature
         self.replay.store(
             state=inputs,
             final=np.concatenate([outcome.final.reshape(-1, INPUTS) for outcome in outcomes]),
@@ -119,13 +121,37 @@ class GeneralTrainer:
         )
         self.steps += sum(outcome.steps for outcome in outcomes)
 
-    def _learn(self) -> None:
+    def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
+        """(W, N) actions of every squad, which has inputs among ``inputs`` (M, S); greedy, explored or a guide's."""
+        greedy, temperature = self.learner.values(inputs)[:, 0].argmax(axis=-1), self.temperature
+        return [squad.choose(best, temperature) for squad, best in zip(self.squads, self.by_squad(greedy), strict=True)]
+
+    def by_squad(self, actions: np.ndarray) -> list[np.ndarray]:
+        """(W, N) actions of every squad, of those of all agents (M,)."""
+        bounds = np.cumsum([squad.rows for squad in self.squads])[:-1]
+        return [own.reshape(squad.last.shape) for squad, own in zip(self.squads, np.split(actions, bounds), strict=True)]
+
+    @property
+    def learning_rate(self) -> float:
+        """Step size of Adam at present."""
+        first, last = self.config.learning_rate, self.config.final_learning_rate
+        return last + (first - last) * (1.0 - self.share)
+
+    def learn(self) -> None:
+        """The updates after a decision."""
         config = self.config
-        rate = config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * (1.0 - self.share)
         self.learner.treatment = "plain" if self.share >= config.settle else self.learner.config.learner
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
-            self.error = self.learner.update(batch, rate)
+            self.error = self.learner.update(batch, self.learning_rate)
+        self.refuse_nonsense()
+
+    def refuse_nonsense(self) -> None:
+        """Stop if the network has diverged.
+
+        Raises:
+            ConfigurationError: it has.
+        """
         if not np.isfinite(self.error):
             raise ConfigurationError(f"the network diverged after {self.steps} mission steps; try a lower learning_rate")
 

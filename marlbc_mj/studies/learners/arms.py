@@ -19,7 +19,7 @@ from marlbc_mj.studies.protocol import Report, Stopped, Watch
 from marlbc_mj.supervisors.general import General
 from marlbc_mj.training.general.config import DRAWN, JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.general.judging import Judge
-from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.general.run import make_general_trainer
 from marlbc_mj.util.errors import ConfigurationError, check_named_once, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.palette import METHOD_COLORS
@@ -42,9 +42,15 @@ ARMS: dict[str, Arm] = {
     "lenient": Arm("every agent learns by itself, and overlooks some negative TD errors", {"learner": "lenient"}),
     "plain": Arm("every agent learns by itself, and all TD errors count", {"learner": "plain"}),
     "qmix": Arm("QMIX: one TD error for a monotonic mixture of the team's values", {"learner": "qmix"}),
+    # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
+    "mappo": Arm(
+        "MAPPO: one actor for all agents, a critic that sees the team, and no cost of a switch",
+        {"learner": "mappo", "switch_cost": 0.0},
+    ),
     "imitation": Arm("no rewards: in all episodes the look-ahead that guides a quarter is imitated", {"learner": "imitation"}),
     "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
     "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
+    "no-switch-cost": Arm("a switch costs nothing while learning", {"switch_cost": 0.0}),
     "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),
     **{
         f"without-{left}": Arm(f"never trained on {left}", {"families": tuple(f for f in GeneralConfig().families if f != left)})
@@ -112,7 +118,7 @@ class ArmStudy:
         ]
 
     def run(self, job: ArmJob, watch: Watch) -> list[ArmScore]:
-        trainer = GeneralTrainer(job.config)
+        trainer = make_general_trainer(job.config)
         while not trainer.finished:
             trainer.advance()
             if watch.stopping():

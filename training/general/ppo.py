@@ -1,0 +1,135 @@
+"""MAPPO for teams of any size: one actor for every agent, and one critic that sees the agent's inputs and its team's mean."""
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from marlbc_mj.policies.general_inputs import INPUTS
+from marlbc_mj.training.config import TrainConfig
+from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.mappo import HUBER, LAST_LAYER, ValueScale, advantages, clipped_loss, log_probability
+from marlbc_mj.training.networks import NetworkSize, TeamNetwork
+from marlbc_mj.training.replay import Replay
+
+
+class Assessed(NamedTuple):
+    """M decisions of single agents under one policy."""
+
+    state: Tensor  # (M, S) inputs of the actor
+    view: Tensor  # (M, 2 S) inputs of the critic
+    action: Tensor  # (1, M)
+    old: Tensor  # (1, M) log-probabilities of the actions when they were taken
+    gain: Tensor  # (1, M) advantages, with mean 0 and deviation 1
+    returns: Tensor  # (1, M) normalised
+
+    def part(self, rows: Tensor) -> "Assessed":
+        """The decisions ``rows`` alone."""
+        return Assessed(self.state[rows], self.view[rows], *(each[:, rows] for each in self[2:]))
+
+
+class TeamPPO(Learner):
+    """Actor and critic of MAPPO (Yu et al., NeurIPS 2022) with parameter sharing; the network's values are the actor's logits.
+
+    An agent's return is that of its own rewards. The critic sees what the agent sees, and the mean of that over its team.
+    """
+
+    joint = True
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        agents: int,
+        actions: int,
+        scale: np.ndarray,
+        generator: torch.Generator,
+        mask: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(config, agents, actions, scale, generator, mask)
+        self.network.weights[-1].data *= LAST_LAYER
+        size = NetworkSize(agents, 2 * len(scale), 1, config.hidden)
+        twice = torch.from_numpy(np.concatenate([scale, scale]))
+        self.critic = TeamNetwork(size, twice, dueling=False, generator=generator).to(config.device)
+        self.optimise([*self.network.parameters(), *self.critic.parameters()])
+        self.scaling = ValueScale(1)
+
+    @torch.no_grad()
+    def assess(self, rows: dict[str, np.ndarray], sizes: np.ndarray, gamma: float) -> Assessed:
+        """Advantages and returns of T decisions of M agents.
+
+        Args:
+            rows: arrays of a :class:`Replay`, first axis T.
+            sizes: (K,) agents of each team, in the order of their columns.
+            gamma: discount factor per decision.
+        """
+        view, after = (self.tensor(with_team(rows[name], sizes)) for name in ("state", "final"))
+        now, ahead = (self.scaling.undo(self.critic(each.flatten(0, 1))[0].cpu().numpy()) for each in (view, after))
+        shape = rows["reward"].shape  # (T, M, 1)
+        now, ahead = now.reshape(shape), ahead.reshape(shape)
+        trace = self.config.ppo.trace
+        gain = advantages(rows["reward"], now, ahead, rows["terminal"], rows["ended"], gamma, trace).reshape(-1, 1)
+        returns = gain + now.reshape(-1, 1)
+        self.scaling.take(returns)
+        gain = (gain - gain.mean()) / (gain.std() + 1e-5)
+        state = self.tensor(rows["state"]).flatten(0, 1)
+        action = torch.from_numpy(rows["action"].reshape(1, -1)).to(state.device)
+        old, _ = log_probability(self.network(state), action)
+        return Assessed(state, view.flatten(0, 1), action, old, self.tensor(gain.T), self.tensor(self.scaling(returns).T))
+
+    def objective(self, part: Assessed) -> tuple[Tensor, Tensor]:
+        """The loss: clipped surrogate, entropy bonus and Huber loss of the values; and the errors of these (1, M)."""
+        ppo = self.config.ppo
+        new, entropy = log_probability(self.network(part.state), part.action)
+        value = self.critic(part.view)[..., 0]
+        missed = nn.functional.huber_loss(value, part.returns, reduction="none", delta=HUBER)
+        loss = clipped_loss(new, part.old, part.gain, ppo.clip) - ppo.entropy * entropy + missed
+        return loss.mean(), (part.returns - value).detach()
+
+    def snapshot(self) -> dict[str, np.ndarray]:
+        """Copies of everything that training changes, by name."""
+        return super().snapshot() | {"returns": self.scaling.sums.copy()}
+
+    def restore(self, arrays: dict[str, np.ndarray]) -> None:
+        """Go back to a :meth:`snapshot`."""
+        super().restore(arrays)
+        self.scaling.sums[:] = arrays["returns"]
+
+
+class PPOTrainer(GeneralTrainer):
+    """A run of MAPPO: actions are drawn from the policy, and every ``ppo.rollout`` decisions are learned from and forgotten."""
+
+    learner: TeamPPO
+
+    def kind(self) -> type[Learner]:
+        """Class of the learner."""
+        return TeamPPO
+
+    def make_replay(self, rows: int) -> Replay:
+        """Room for one rollout."""
+        return Replay(self.config.ppo.rollout, rows, 1, INPUTS)
+
+    def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
+        """(W, N) actions of every squad, drawn from the softmax of the logits."""
+        logits = self.learner.values(inputs)[:, 0]
+        return self.by_squad((logits + self.rng.gumbel(size=logits.shape)).argmax(axis=-1))
+
+    def learn(self) -> None:
+        """At the end of a rollout, ``ppo.epochs`` passes over it."""
+        ppo = self.config.ppo
+        if self.replay.count % ppo.rollout:
+            return
+        whole = self.learner.assess(self.replay.arrays, self.sizes, self.config.gamma)
+        for _ in range(ppo.epochs):
+            order = torch.from_numpy(self.rng.permutation(len(whole.state))).to(whole.state.device)
+            for rows in order.tensor_split(ppo.minibatches):
+                self.error = self.learner.descend(*self.learner.objective(whole.part(rows)), self.learning_rate)
+        self.refuse_nonsense()
+
+
+def with_team(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """(T, M, 2 S) rows (T, M, S) of M agents, and beside each the mean over its team; ``sizes`` (K,) agents of the teams."""
+    begins = np.cumsum(sizes) - sizes
+    means = np.add.reduceat(rows, begins, axis=1) / sizes[:, None].astype(rows.dtype)
+    return np.concatenate([rows, np.repeat(means, sizes, axis=1)], axis=-1)
