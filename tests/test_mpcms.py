@@ -128,6 +128,15 @@ def test_the_case_study_without_violation_with_the_fewest_switches():
     assert metrics["team"]["decision_ms_median"] < 20.0
 
 
+def test_under_the_set_based_composition_it_leaves_the_column_again():
+    """It looks 6 s ahead there: within 2 s the way back into the formation would not pay."""
+    scenario = paper(composition="set-based", duration=21.0)
+    for horizon, last in ((None, "FM"), (40, "FR")):
+        command = run_episode(World(scenario, record=True), MPCMS(horizon=horizon)).command
+        assert {scenario.orders.commands[k][-2:] for k in command[362]} == {"FR"}
+        assert {scenario.orders.commands[k][-2:] for k in command[-1]} == {last}
+
+
 def test_episodes_are_deterministic_and_the_memory_is_not_changed_by_a_decision():
     first, second = (run_episode(World(paper(duration=22.0), record=True), MPCMS()) for _ in range(2))
     assert (np.diff(first.command[:, 0]) != 0).sum() == 2

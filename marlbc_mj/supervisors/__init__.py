@@ -39,7 +39,10 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
         "the oracle's switch times, found for the nominal mission and played on any draw around it",
     ),
     "fms": (FMS, "fuzzy rules on each agent's clearance and its rate (reconstructed)"),
-    "mpcms": (MPCMS, "model predictive: the cheapest order sequence over a 2 s horizon of the kinematic reference"),
+    "mpcms": (
+        MPCMS,
+        "model predictive: the cheapest order sequence over the next 2 s of the kinematic reference (set-based: 6 s)",
+    ),
     "mpcms-mujoco": (
         lambda: MPCMS(prediction="mujoco", horizon=120),
         "the same over 6 s of simulated candidates, which includes the agents' lag; takes minutes per episode",

@@ -20,6 +20,8 @@ The specified margin, 0.05 m, suits a reference; the agents lag behind it when i
 
 The MuJoCo prediction sees that lag, and needs a longer horizon for it: the way back from the column takes about 3 s, so
 that within the 2 s of H = 40 leaving it never pays, and the case study ends in the column; with H = 120 it is left, with 80 not.
+Under the set-based composition the kinematic way back takes longer than 2 s, too, since avoidance bounds it: with H = 40 the case
+study ends in the column, with 60 it does not, and on drawn layouts returns rise to H = 120 (HORIZONS).
 """
 
 from dataclasses import dataclass, field
@@ -41,7 +43,9 @@ from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, follow, judge_pairs, simulate
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
-MOST_ORDERS = 1_000_000  # candidates x steps x agents in one decision of one team
+HORIZONS = {"null-space": 40, "set-based": 120}
+"""Default horizons by composition [mission steps]."""
+MOST_ORDERS = 2_000_000  # candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
 PREDICTED_FROM = ("measured", "reference")
 AVOIDANCE = "OA"
@@ -91,7 +95,7 @@ class MPCMS:
         ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
     """
 
-    horizon: int = 40  # H [mission steps]
+    horizon: int | None = None  # H [mission steps]; None: that of the composition in HORIZONS
     w_formation: float = 1.0  # w_F, per agent and step
     w_reconstruction: float = 0.3  # w_R, per agent and step
     w_switch: float = 20.0  # w_s, per change of the joint order
@@ -107,6 +111,8 @@ class MPCMS:
     def __post_init__(self) -> None:
         for name in ("horizon", "together", "threads"):
             value = getattr(self, name)
+            if value is None and name == "horizon":
+                continue
             if not isinstance(value, int) or value < 1:
                 raise ConfigurationError(f"MPCMS {name} must be a whole number, at least 1, got {value}")
         for name in ("w_formation", "w_reconstruction", "w_switch", "margin", "slack"):
@@ -115,10 +121,9 @@ class MPCMS:
                 raise ConfigurationError(f"MPCMS {name} must be non-negative and finite, got {value}")
         if not self.instants:
             raise ConfigurationError("MPCMS candidate set is empty: instants must name at least one predicted step, got ()")
-        if any(not isinstance(k, int) or not 0 <= k < self.horizon for k in self.instants):
-            raise ConfigurationError(
-                f"MPCMS instants must lie between 0 and horizon - 1 = {self.horizon - 1}, got {self.instants}"
-            )
+        least = self.horizon or min(HORIZONS.values())
+        if any(not isinstance(k, int) or not 0 <= k < least for k in self.instants):
+            raise ConfigurationError(f"MPCMS instants must lie between 0 and horizon - 1 = {least - 1}, got {self.instants}")
         if self.prediction not in PREDICTIONS:
             raise unknown("MPCMS prediction", self.prediction, PREDICTIONS)
         if self.start_from not in PREDICTED_FROM:
@@ -135,9 +140,10 @@ class MPCMS:
         """
         joint = Joint(0, (False,) * scenario.agents)
         most = 1 + len(set(self.instants)) * len(self._changes(Joint(0, (True,) * scenario.agents)))
-        if most * self.horizon * scenario.agents > MOST_ORDERS:
+        horizon = self._horizon(scenario)
+        if most * horizon * scenario.agents > MOST_ORDERS:
             raise ConfigurationError(
-                f"MPCMS would predict {most} candidates over {self.horizon} steps for {scenario.agents} agents: more than "
+                f"MPCMS would predict {most} candidates over {horizon} steps for {scenario.agents} agents: more than "
                 f"{MOST_ORDERS} orders a decision; choose fewer instants or a supervisor that decides per agent"
             )
         self._candidates(scenario, joint)
@@ -213,7 +219,10 @@ class MPCMS:
         """All sequences from the joint order in force."""
         motions = scenario.formation_names
         orders = tuple((scenario.orders.index(m), scenario.orders.index(f"{AVOIDANCE}>{m}")) for m in motions)
-        return _sequences(joint, tuple(self._changes(joint)), orders, self.horizon, self.instants)
+        return _sequences(joint, tuple(self._changes(joint)), orders, self._horizon(scenario), self.instants)
+
+    def _horizon(self, scenario: Scenario) -> int:
+        return self.horizon or HORIZONS[scenario.composition]
 
 
 def _cheapest(costs: np.ndarray, team: np.ndarray, time: np.ndarray) -> np.ndarray:
