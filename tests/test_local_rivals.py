@@ -13,9 +13,18 @@ from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.results.outcomes import outcome
 from marlbc_mj.scenarios import Scenario, held_out, make_scenario
-from marlbc_mj.supervisors import LOCAL_RIVALS, FixedPriority, LookAhead, Rollout, SetBasedRule, carry_out, make_supervisor
+from marlbc_mj.supervisors import (
+    LOCAL_RIVALS,
+    FixedPriority,
+    LookAhead,
+    Rollout,
+    SetBasedRule,
+    carry_out,
+    make_supervisor,
+    rollout,
+)
 from marlbc_mj.supervisors.lookahead import blocked_lanes
-from marlbc_mj.supervisors.rollout import Lag, follow_reference
+from marlbc_mj.supervisors.rollout import Lag, One, Present, follow_plan, follow_reference
 from marlbc_mj.supervisors.set_based_rule import IN_COLUMN, IN_FORMATION
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
@@ -215,6 +224,28 @@ def test_there_are_33_plans():
     assert sorted({int(row.sum()) for row in plans.changed[1:] if row[-1] == 0}) == [60, 120, 200]
     edges = np.abs(np.diff(plans.changed, axis=1, prepend=0)).sum(axis=1)
     np.testing.assert_array_equal(edges, plans.switches)
+
+
+@pytest.mark.parametrize("family", ["gates", "traffic"])
+def test_plans_that_are_given_up_could_not_have_been_the_cheapest(family: str) -> None:
+    """The rest costs what every plan costs that is followed to its end, to the bit; in drawn states of held-out layouts."""
+    scenario = make_scenario(family, composition="set-based", split="test")
+    supervisor, world = Rollout(), World(scenario, worlds=6)
+    for step in (0, 500, 1100):
+        observation = world.reset(51_000 + step)._replace(step=np.full(6, step), time=np.full(6, 0.05 * step))
+        memory = supervisor.start(scenario, 6)
+        now = 0.05 * step * np.array(scenario.path_velocity) + np.random.default_rng(step).normal(size=(6, 4, 2))
+        place = observation.reference + now, observation.position + now
+        present = Present(observation.step, *place, observation.velocity, observation.obstacles)
+        motion, room, found = np.array([0, 0, 0, 1, 1, 1]), memory.room, np.empty((6, 33))
+        rollout._search(np.arange(6), motion, memory.search, present, room, found)
+        costs = np.empty_like(found)
+        for b, plan in np.ndindex(costs.shape):
+            costs[b, plan] = follow_plan(One(np.array([b])), plan, np.inf, motion[b], memory.search, present, room)
+        kept, best = np.isfinite(found), np.minimum.accumulate(costs, axis=1)
+        assert np.isfinite(costs).all() and not kept.all() and kept[:, 1:].any()
+        np.testing.assert_array_equal(found[kept], costs[kept])
+        assert (costs[:, 1:] > best[:, :-1])[~kept[:, 1:]].all()
 
 
 NOW_OR_NEVER = Rollout(change_after=(0.0,), back_after=())

@@ -10,7 +10,7 @@ from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
-from marlbc_mj.scenarios import Perturbation, paper
+from marlbc_mj.scenarios import Perturbation, paper, robot_gate
 from marlbc_mj.supervisors.mpcms import MPCMS, Joint
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
 from marlbc_mj.util.errors import ConfigurationError
@@ -44,7 +44,7 @@ def judge(start, step, orders, obstacles, weights, *, threads=1, trails=None):
     """Costs (C,) and trails (C, H, N, 2) of candidate ``orders`` (C, H, N) of one team at rest at ``start`` (N, 2)."""
     now = at(start, step, obstacles)
     every = np.arange(len(orders))
-    pairs = Pairs(np.zeros_like(every), every, orders)
+    pairs = Pairs(np.zeros_like(every), every, orders, np.zeros_like(every), np.full(len(orders), -np.inf))
     laws = make_behaviors(PAPER)
     teams = Teams(now.step, now.position, now.velocity, now.obstacles)
     return judge_pairs(PAPER, laws, weights, teams, pairs, threads=threads, trails=trails)
@@ -69,6 +69,38 @@ def test_the_prediction_does_not_depend_on_the_number_of_threads():
     one, two = (judge(in_formation(1000), 1000, orders, PAPER.obstacle_array(), FREE, threads=t) for t in (1, 2))
     np.testing.assert_array_equal(one[0], two[0])
     np.testing.assert_array_equal(one[1], two[1])
+
+
+@pytest.mark.parametrize("scenario", [PAPER, paper(composition="set-based"), robot_gate("disc")], ids=["null", "set", "disc"])
+def test_candidates_that_are_given_up_could_not_have_been_the_cheapest(scenario):
+    """In drawn states, moving, some out of formation or too close: the rest costs what it costs alone, to the bit.
+
+    Teams are in formation or in column, so the first candidate is often the best, but not always. Limited accelerations make the
+    velocity part of what two candidates have in common.
+    """
+    rng, supervisor = np.random.default_rng(3), MPCMS()
+    memory = supervisor.start(scenario, 24)
+    joints = [Joint(motion, tuple((rng.random(4) < 0.2).tolist())) for motion in rng.integers(2, size=24)]
+    _, pairs = supervisor._pairs(memory._replace(joints=tuple(joints)))
+    step = rng.integers(scenario.mission_steps - 200, size=24)
+    centre = np.array(scenario.path_origin) + step[:, None] * scenario.mission_step * np.array(scenario.path_velocity)
+    slots = np.array([scenario.formations[joint.motion] for joint in joints])
+    off = scenario.formation_tolerance * rng.choice([0.0, 0.1, 3.0], size=(24, 1, 1)) * rng.normal(size=slots.shape)
+    moving, start = scenario.path_velocity + 0.1 * rng.normal(size=slots.shape), centre[:, None] + slots + off
+    teams = Teams(step, start, moving, np.repeat(scenario.obstacle_array()[None], 24, axis=0))
+    weights = CostWeights(1.0, 0.3, 1e4, scenario.safe_distance + 0.15, scenario.formation_tolerance)
+    found, trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs)
+    apart = pairs._replace(branch=np.zeros_like(pairs.branch), extra=np.full_like(pairs.extra, -np.inf))
+    costs, whole = judge_pairs(scenario, memory.behaviors, weights, teams, apart)
+    kept = np.isfinite(found)
+    np.testing.assert_array_equal(found[kept], costs[kept])
+    np.testing.assert_array_equal(trails[kept], whole[kept])
+    total, held = costs + pairs.extra[pairs.sequence], costs[np.searchsorted(pairs.team, pairs.team)]
+    assert (total[~kept] > held[~kept]).all()
+    assert 0.05 < kept.mean() < 0.9 and (total[kept] < held[kept]).any()
+    threaded_costs, threaded_trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs, threads=2)
+    np.testing.assert_array_equal(threaded_costs, found)
+    np.testing.assert_array_equal(threaded_trails[kept], whole[kept])
 
 
 def test_the_cost_of_two_steps_by_hand():

@@ -21,7 +21,7 @@ The specified margin, 0.05 m, suits a reference; the agents lag behind it when i
 The MuJoCo prediction sees that lag, and needs a longer horizon for it: the way back from the column takes about 3 s, so
 that within the 2 s of H = 40 leaving it never pays, and the case study ends in the column; with H = 120 it is left, with 80 not.
 Under the set-based composition the kinematic way back takes longer than 2 s, too, since avoidance bounds it: with H = 40 the case
-study ends in the column, with 60 it does not, and on drawn layouts returns rise to H = 120 (HORIZONS).
+study ends in the column, with 60 it does not, and on drawn layouts returns rise to H = 120 (STEPS_AHEAD).
 """
 
 from dataclasses import dataclass, field
@@ -43,7 +43,7 @@ from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, follow, judge_pairs, simulate
 from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
-HORIZONS = {"null-space": 40, "set-based": 120}
+STEPS_AHEAD = {"null-space": 40, "set-based": 120}
 """Default horizons by composition [mission steps]."""
 MOST_ORDERS = 2_000_000  # candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
@@ -64,6 +64,7 @@ class Candidates(NamedTuple):
     first: tuple[Joint, ...]  # (C,) joint order at the present mission step
     orders: np.ndarray  # (C, H, N) int64, indices into scenario.orders
     switches: np.ndarray  # (C,) changes of the joint order along the horizon
+    branch: np.ndarray  # (C,) int64, predicted step of the change; H for the first one
 
 
 class Forecast(NamedTuple):
@@ -95,7 +96,7 @@ class MPCMS:
         ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
     """
 
-    horizon: int | None = None  # H [mission steps]; None: that of the composition in HORIZONS
+    horizon: int | None = None  # H [mission steps]; None: that of the composition in STEPS_AHEAD
     w_formation: float = 1.0  # w_F, per agent and step
     w_reconstruction: float = 0.3  # w_R, per agent and step
     w_switch: float = 20.0  # w_s, per change of the joint order
@@ -121,7 +122,7 @@ class MPCMS:
                 raise ConfigurationError(f"MPCMS {name} must be non-negative and finite, got {value}")
         if not self.instants:
             raise ConfigurationError("MPCMS candidate set is empty: instants must name at least one predicted step, got ()")
-        least = self.horizon or min(HORIZONS.values())
+        least = self.horizon or min(STEPS_AHEAD.values())
         if any(not isinstance(k, int) or not 0 <= k < least for k in self.instants):
             raise ConfigurationError(f"MPCMS instants must lie between 0 and horizon - 1 = {least - 1}, got {self.instants}")
         if self.prediction not in PREDICTIONS:
@@ -165,17 +166,17 @@ class MPCMS:
         Raises:
             SimulationError: a team without any candidate of finite cost.
         """
-        candidates, pairs = self._pairs(memory)
+        firsts, pairs = self._pairs(memory)
         began = perf_counter()
         costs, reached = self._predict(observation, memory, pairs)
         solver_ms = 1e3 * (perf_counter() - began)
-        costs = np.where(np.isfinite(costs), costs, np.inf) + self.w_switch * candidates.switches[pairs.sequence]
+        costs = np.where(np.isfinite(costs), costs, np.inf) + pairs.extra[pairs.sequence]
         best = _cheapest(costs, pairs.team, observation.time)
         sequence = pairs.sequence[best]
         orders = lift(pairs.orders[sequence, 0], observation, memory.way)
         if memory.twins is not None:
             memory.twins.step(orders)
-        joints = tuple(candidates.first[s] for s in sequence.tolist())
+        joints = tuple(firsts[s] for s in sequence.tolist())
         return orders, memory._replace(joints=joints, reference=reached[best], solver_ms=solver_ms)
 
     def _predict(self, observation: Observation, memory: Forecast, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
@@ -195,16 +196,16 @@ class MPCMS:
         costs, trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs, threads=self.threads, trails=trails)
         return costs, trails[:, 0]
 
-    def _pairs(self, memory: Forecast) -> tuple[Candidates, Pairs]:
-        """The candidates of every joint order in force, one after the other, and which of them are each team's."""
+    def _pairs(self, memory: Forecast) -> tuple[tuple[Joint, ...], Pairs]:
+        """First joint orders of the candidates of every joint order in force, one after the other, and which are each team's."""
         known = {joint: self._candidates(memory.scenario, joint) for joint in dict.fromkeys(memory.joints)}
-        firsts, orders, switches = zip(*known.values(), strict=True)
+        firsts, orders, switches, branch = zip(*known.values(), strict=True)
         counts = {joint: len(candidates.orders) for joint, candidates in known.items()}
         ends = dict(zip(counts, accumulate(counts.values()), strict=True))
         sequence = np.concatenate([np.arange(ends[joint] - counts[joint], ends[joint]) for joint in memory.joints])
         team = np.repeat(np.arange(len(memory.joints)), [counts[joint] for joint in memory.joints])
-        every = Candidates(tuple(chain(*firsts)), np.concatenate(orders), np.concatenate(switches))
-        return every, Pairs(team, sequence, every.orders)
+        extra = self.w_switch * np.concatenate(switches)
+        return tuple(chain(*firsts)), Pairs(team, sequence, np.concatenate(orders), np.concatenate(branch), extra)
 
     def _changes(self, joint: Joint) -> list[Joint]:
         """Joint orders that one change leads to."""
@@ -222,7 +223,7 @@ class MPCMS:
         return _sequences(joint, tuple(self._changes(joint)), orders, self._horizon(scenario), self.instants)
 
     def _horizon(self, scenario: Scenario) -> int:
-        return self.horizon or HORIZONS[scenario.composition]
+        return self.horizon or STEPS_AHEAD[scenario.composition]
 
 
 def _cheapest(costs: np.ndarray, team: np.ndarray, time: np.ndarray) -> np.ndarray:
@@ -251,5 +252,5 @@ def _sequences(
     rows = {j: np.array([orders[j.motion][avoids] for avoids in j.avoiding], dtype=np.int64) for j in (joint, *changes)}
     later = np.arange(horizon)[:, None]
     table = np.stack([np.where(later < k, rows[joint], rows[j]) for j, k in plans])
-    switches = np.array([float(k < horizon) for _, k in plans])
-    return Candidates(tuple(j if k == 0 else joint for j, k in plans), table, switches)
+    branch = np.array([k for _, k in plans], dtype=np.int64)
+    return Candidates(tuple(j if k == 0 else joint for j, k in plans), table, (branch < horizon).astype(np.float64), branch)

@@ -21,6 +21,9 @@ from marlbc_mj.engine.plan import grid_room
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 
+CERTAIN = 1.0 - 1e-9
+"""Factor of a lower bound, far beyond what rounding makes of it."""
+
 
 class CostWeights(NamedTuple):
     """The numbers of the cost."""
@@ -42,6 +45,7 @@ class Problem(NamedTuple):
     w_slack: float
     least: float
     scale: float
+    floor: float  # least cost of a step of the team: nobody is at both of its slots
 
 
 class Teams(NamedTuple):
@@ -54,48 +58,94 @@ class Teams(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """The candidates of every team, one team after the other; many pairs may share a sequence of orders."""
+    """The candidates of every team, one team after the other; many pairs may share a sequence of orders.
+
+    The other sequences of a team begin like its first one.
+    """
 
     team: np.ndarray  # (C,) int64, below B
     sequence: np.ndarray  # (C,) int64, below S
     orders: np.ndarray  # (S, H, N) int64, indices into scenario.orders
+    branch: np.ndarray  # (S,) int64, predicted step from which a sequence differs from the first of its team
+    extra: np.ndarray  # (S,) what a sequence costs beside its trail, more than the first of its team
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays of a pair."""
+    """Scratch arrays of C pairs of B teams."""
 
+    lead: np.ndarray  # (C,) int64, the first pair of the same team
     rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.plan.workspace_rows
     velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
     obstacles: np.ndarray  # (C, K, 3 or 5)
     grid: np.ndarray  # (C, room)
+    held: np.ndarray  # (B, H + 1) cost of the first pair before every step
+    held_velocity: np.ndarray  # (B, H + 1, N, 2) its v_r there
 
 
 def problem(scenario: Scenario, weights: CostWeights) -> Problem:
     """The numbers of a scenario that a prediction needs, under the weights of a cost."""
-    return Problem(scenario.mission_step, scenario.formations, *weights)
+    apart = np.linalg.norm(scenario.formations[0] - scenario.formations[1], axis=-1)  # (N,) of an agent's two slots
+    floor = min(weights.formation, weights.reconstruction) * np.minimum(1.0, apart / weights.scale).sum()
+    return Problem(scenario.mission_step, scenario.formations, *weights, floor=float(floor))
 
 
 @allocation_free
-def predict_reference(c, behaviors, problem, teams, pairs, scratch, trail):
-    """Reference trail (H, N, 2) [m] of pair ``c``: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual``
-    reference.
+def predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs):
+    """Reference trail and cost of pair ``c``: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
+
+    A pair goes on from the step at which it leaves its team's first pair, which is predicted before it. It is given up, with an
+    infinite cost, as soon as it cannot become cheaper than that one.
     """
-    b, orders, duration = pairs.team[c], pairs.orders[pairs.sequence[c]], problem.mission_step
+    b, lead, orders = pairs.team[c], scratch.lead[c], pairs.orders[pairs.sequence[c]]
+    begin, horizon = np.int64(0), orders.shape[0]
+    trail, v_r = trails[c], scratch.velocity[c, 0]
+    held, held_v = scratch.held[b], scratch.held_velocity[b]
+    if c == lead:
+        held[0] = 0.0
+        copy_points(teams.moving[b], held_v[0])
+    else:
+        begin = pairs.branch[pairs.sequence[c]]
+        for k in range(begin):
+            copy_points(trails[lead, k], trail[k])
+    cost = held[begin]
+    copy_points(held_v[begin], v_r)
+    for k in range(begin, horizon):
+        least = cost + (horizon - k) * problem.floor + pairs.extra[pairs.sequence[c]]
+        if c != lead and least * CERTAIN > held[horizon]:
+            costs[c] = np.inf
+            return
+        before = teams.start[b] if k == 0 else trail[k - 1]
+        advance_reference((c, k), before, orders[k], behaviors, problem, teams, pairs, scratch, trail[k])
+        cost = add_step_cost(cost, k, trail[k], c, behaviors, problem, teams, pairs, scratch)
+        if c == lead:
+            held[k + 1] = cost
+            copy_points(v_r, held_v[k + 1])
+    costs[c] = cost
+
+
+@allocation_free
+def advance_reference(moment, before, orders, behaviors, problem, teams, pairs, scratch, after):
+    """Predicted step k of pair c, ``moment`` = (c, k), from p_r ``before`` to ``after`` (N, 2) [m] under ``orders`` (N,); moves
+    its v_r on.
+    """
+    c, k = moment
+    b, duration = pairs.team[c], problem.mission_step
     v_r, before_v = scratch.velocity[c, 0], scratch.velocity[c, 1]
-    before = teams.start[b]
+    keep(behaviors, v_r, before_v)
+    seen = extrapolate(k * duration, teams.obstacles[b], scratch.obstacles[c])
+    compose_team((teams.first[b] + k) * duration, orders, behaviors, before, seen, scratch.grid[c], scratch.rows[c], v_r)
+    limit(behaviors, duration, before_v, v_r)
     for i in range(before.shape[0]):
         for axis in range(2):
-            v_r[i, axis] = teams.moving[b, i, axis]
-    for k in range(orders.shape[0]):
-        keep(behaviors, v_r, before_v)
-        seen = extrapolate(k * duration, teams.obstacles[b], scratch.obstacles[c])
-        t = (teams.first[b] + k) * duration
-        compose_team(t, orders[k], behaviors, before, seen, scratch.grid[c], scratch.rows[c], v_r)
-        limit(behaviors, duration, before_v, v_r)
-        for i in range(before.shape[0]):
-            for axis in range(2):
-                trail[k, i, axis] = before[i, axis] + duration * v_r[i, axis]
-        before = trail[k]
+            after[i, axis] = before[i, axis] + duration * v_r[i, axis]
+
+
+@allocation_free
+def copy_points(points, into):
+    """``into`` = ``points``, both (N, 2)."""
+    for i in range(points.shape[0]):
+        for axis in range(2):
+            into[i, axis] = points[i, axis]
 
 
 @allocation_free
@@ -137,26 +187,29 @@ def add_step_cost(cost, k, at, c, behaviors, problem, teams, pairs, scratch):
     return cost
 
 
-@allocation_free
-def judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
-    """Cost of pair ``c``, after its reference is predicted unless its trail was filled by other means."""
-    if kinematic:
-        predict_reference(c, behaviors, problem, teams, pairs, scratch, trails[c])
-    costs[c] = trail_cost(c, behaviors, problem, teams, pairs, scratch, trails[c])
-
-
 @compiled
-def _judge_serial(kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
-    """:func:`judge_pair` of every pair, one after the other."""
+def _predict_serial(behaviors, problem, teams, pairs, scratch, trails, costs):
+    """:func:`predict_pair` of every pair, one after the other; the first of each team comes before its others."""
     for c in range(costs.shape[0]):
-        judge_pair(c, kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
+        predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs)
 
 
 @threaded
-def _judge_parallel(kinematic, behaviors, problem, teams, pairs, scratch, trails, costs):
-    """:func:`judge_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
+def _predict_parallel(behaviors, problem, teams, pairs, scratch, trails, costs):
+    """:func:`predict_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
     for c in numba.prange(costs.shape[0]):
-        judge_pair(np.int64(c), kinematic, behaviors, problem, teams, pairs, scratch, trails, costs)
+        if scratch.lead[c] == c:
+            predict_pair(np.int64(c), behaviors, problem, teams, pairs, scratch, trails, costs)
+    for c in numba.prange(costs.shape[0]):
+        if scratch.lead[c] != c:
+            predict_pair(np.int64(c), behaviors, problem, teams, pairs, scratch, trails, costs)
+
+
+@compiled
+def _judge(behaviors, problem, teams, pairs, scratch, trails, costs):
+    """:func:`trail_cost` of every pair, whose trails are filled."""
+    for c in range(costs.shape[0]):
+        costs[c] = trail_cost(c, behaviors, problem, teams, pairs, scratch, trails[c])
 
 
 def judge_pairs(
@@ -171,23 +224,29 @@ def judge_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
-    ``trails`` given are judged as they are, else the kinematic reference is predicted.
+    ``trails`` given are judged as they are, else the kinematic reference is predicted. A pair that cannot become cheaper than the
+    first one of its team is given up: its cost is infinite, and its trail is not filled.
     """
-    kinematic, count = trails is None, len(pairs.team)
+    kinematic, (count, teams_count, horizon) = trails is None, (len(pairs.team), len(teams.first), pairs.orders.shape[1])
     if trails is None:
         trails = np.empty((count, *pairs.orders.shape[1:], 2))
     costs = np.empty(count)
     scratch = Scratch(
+        np.searchsorted(pairs.team, pairs.team),
         np.zeros((count, workspace_rows(scenario), 2)),
         np.zeros((count, 2, scenario.agents, 2)),
         np.zeros((count, *teams.obstacles.shape[1:])),
         np.zeros((count, grid_room(scenario))),
+        np.zeros((teams_count, horizon + 1)),
+        np.zeros((teams_count, horizon + 1, scenario.agents, 2)),
     )
-    arguments = kinematic, behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
-    if count > 1 and threads_usable(threads):
-        _judge_parallel(*arguments)
+    arguments = behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
+    if not kinematic:
+        _judge(*arguments)
+    elif count > 1 and threads_usable(threads):
+        _predict_parallel(*arguments)
     else:
-        _judge_serial(*arguments)
+        _predict_serial(*arguments)
     return costs, trails
 
 

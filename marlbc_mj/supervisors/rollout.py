@@ -25,7 +25,7 @@ from marlbc_mj.engine.inequalities import workspace_rows
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import REACH
-from marlbc_mj.supervisors.prediction import CostWeights, Problem, add_step_cost, extrapolate, problem
+from marlbc_mj.supervisors.prediction import CERTAIN, CostWeights, Problem, add_step_cost, extrapolate, problem
 from marlbc_mj.supervisors.set_based_rule import IN_FORMATION, LocalRule, follow_rule, make_local_rule, rule_orders
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
@@ -84,6 +84,7 @@ class Room(NamedTuple):
     rows: np.ndarray  # (1, W, 2), see marlbc_mj.engine.inequalities.workspace_rows
     tracks: Tracks
     costs: np.ndarray  # (3, H + 1) of the steps before each step
+    known: np.ndarray  # (3,) int64, last k of the tracks that is predicted
     before: np.ndarray  # (N, 2) v_r of the step before [m/s]
     obstacles: np.ndarray  # (1, K, 3 or 5)
     orders: np.ndarray  # (N,) int64
@@ -109,22 +110,32 @@ class Improved(NamedTuple):
 
 
 @allocation_free
-def follow_plan(one, plan, motion, search, present, room):
-    """Cost of a plan for one team, whose motion in force is ``motion``; what is predicted goes into ``room``."""
+def follow_plan(one, plan, best, motion, search, present, room):
+    """Cost of a plan for one team, whose motion in force is ``motion``; infinite once it cannot be less than ``best``.
+
+    What is predicted goes into ``room``.
+    """
     level, first = search.plans.level[plan], search.plans.branch[plan]
     tracks, costs, changed = room.tracks, room.costs[level], search.plans.changed[plan]
+    switching, horizon = search.w_switch * search.plans.switches[plan], changed.shape[0]
     if level == 0:
         _begin(one.team[0], present, tracks)
         costs[0] = 0.0
+    elif room.known[level - 1] < first:  # where the other was given up this one would have been, too
+        return np.inf
     else:
         _copy(tracks, (level - 1, first), (level, first))
         costs[first] = room.costs[level - 1, first]
-    for k in range(first, changed.shape[0]):
+    for k in range(first, horizon):
+        room.known[level] = k
+        if (costs[k] + (horizon - k) * search.problem.floor + switching) * CERTAIN > best:
+            return np.inf
         _copy(tracks, (level, k), (level, k + 1))
         predict_step((level, k), one.team[0], motion ^ changed[k], search, present, room)
         at, behaviors = tracks.position[level, k + 1], search.rule.behaviors
         costs[k + 1] = add_step_cost(costs[k], k, at, 0, behaviors, search.problem, present, one, room)
-    return costs[changed.shape[0]] + search.w_switch * search.plans.switches[plan]
+    room.known[level] = horizon
+    return costs[horizon] + switching
 
 
 @allocation_free
@@ -203,8 +214,11 @@ def _search(due, motion, search, present, room, costs):
     one = One(np.zeros(1, dtype=np.int64))
     for d in range(due.shape[0]):
         one.team[0] = due[d]
+        best = np.inf
         for plan in range(costs.shape[1]):
-            costs[d, plan] = follow_plan(one, plan, motion[due[d]], search, present, room)
+            costs[d, plan] = follow_plan(one, plan, best, motion[due[d]], search, present, room)
+            if costs[d, plan] < best:
+                best = costs[d, plan]
 
 
 @dataclass(frozen=True)
@@ -267,6 +281,7 @@ class Rollout:
             rows=np.zeros((1, workspace_rows(scenario), 2)),
             tracks=Tracks(*(np.zeros((3, plans.changed.shape[1] + 1, scenario.agents, 2)) for _ in Tracks._fields)),
             costs=np.zeros((3, plans.changed.shape[1] + 1)),
+            known=np.zeros(3, dtype=np.int64),
             before=np.zeros((scenario.agents, 2)),
             obstacles=np.zeros((1, len(scenario.obstacles), columns)),
             orders=np.zeros(scenario.agents, dtype=np.int64),
