@@ -3,6 +3,7 @@
 import ast
 from collections import defaultdict
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,7 @@ def defined(path: Path) -> Iterator[str]:
         yield from (name for name in dict.fromkeys(names) if not name.startswith("_"))
 
 
+@cache
 def repeated(root: Path) -> dict[str, list[str]]:
     """Files by name, of names that more than one file defines."""
     homes = defaultdict(list)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from functools import cache
 from importlib.metadata import PackageNotFoundError, packages_distributions, version
 from importlib.resources import files
 from pathlib import Path
@@ -28,6 +29,7 @@ NAMED_IN_REFERENCES = re.findall(r"^### `marlbc_mj/(.+\.py)`$", (PACKAGE / "REFE
 in_repository = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reason="needs the repository's files")
 
 
+@cache
 def _imports(path: Path) -> set[str]:
     """Top-level names that a file imports, wherever in it."""
     found = set()
