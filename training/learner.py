@@ -59,13 +59,17 @@ class Learner:
         ).to(config.device)
         self.smooth = copy.deepcopy(self.network).requires_grad_(False)  # running mean of the weights
         self.targets = TargetRing(self.network, config.copies)
-        self.optimise(self.network.parameters())
+        self.optimise([*self.network.parameters(), *self.further(agents, scale, generator)])
         self.updates = 0
         self.errors = np.zeros((0, 0), dtype=np.float32)  # (K, M) absolute TD errors of the last update
 
     def shape(self, agents: int, actions: int) -> tuple[int, int]:
         """Number of networks, and number of values that each gives."""
         return agents, actions
+
+    def further(self, agents: int, scale: np.ndarray, generator: torch.Generator) -> list[nn.Parameter]:
+        """Make what learns beside the network, and return its parameters; arguments as those of the class."""
+        return []
 
     def optimise(self, parameters: Iterable[nn.Parameter]) -> None:
         """Train these parameters, with a fresh optimiser."""

@@ -94,19 +94,11 @@ class QMIX(Learner):
 
     joint = True
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        agents: int,
-        actions: int,
-        scale: np.ndarray,
-        generator: torch.Generator,
-        mask: np.ndarray | None = None,
-    ) -> None:
-        super().__init__(config, agents, actions, scale, generator, mask)
-        self.mixer = self.make_mixer(agents, torch.from_numpy(scale), generator).to(config.device)
+    def further(self, agents: int, scale: np.ndarray, generator: torch.Generator) -> list[nn.Parameter]:
+        """The mixer, and its copy for targets."""
+        self.mixer = self.make_mixer(agents, torch.from_numpy(scale), generator).to(self.config.device)
         self.target_mixer = copy.deepcopy(self.mixer).requires_grad_(False)
-        self.optimise([*self.network.parameters(), *self.mixer.parameters()])
+        return list(self.mixer.parameters())
 
     def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
         """A mixer for N agents, with initial weights drawn by ``generator``."""

@@ -7,7 +7,6 @@ import torch
 from torch import Tensor, nn
 
 from marlbc_mj.policies.general_inputs import INPUTS
-from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import HUBER, LAST_LAYER, ValueScale, advantages, clipped_loss, log_probability
@@ -38,22 +37,14 @@ class TeamPPO(Learner):
 
     joint = True
 
-    def __init__(
-        self,
-        config: TrainConfig,
-        agents: int,
-        actions: int,
-        scale: np.ndarray,
-        generator: torch.Generator,
-        mask: np.ndarray | None = None,
-    ) -> None:
-        super().__init__(config, agents, actions, scale, generator, mask)
+    def further(self, agents: int, scale: np.ndarray, generator: torch.Generator) -> list[nn.Parameter]:
+        """The critic, and the scale of its values; the actor begins with actions about equally likely."""
         self.network.weights[-1].data *= LAST_LAYER
-        size = NetworkSize(agents, 2 * len(scale), 1, config.hidden)
+        size = NetworkSize(agents, 2 * len(scale), 1, self.config.hidden)
         twice = torch.from_numpy(np.concatenate([scale, scale]))
-        self.critic = TeamNetwork(size, twice, dueling=False, generator=generator).to(config.device)
-        self.optimise([*self.network.parameters(), *self.critic.parameters()])
+        self.critic = TeamNetwork(size, twice, dueling=False, generator=generator).to(self.config.device)
         self.scaling = ValueScale(1)
+        return list(self.critic.parameters())
 
     @torch.no_grad()
     def assess(self, rows: dict[str, np.ndarray], sizes: np.ndarray, gamma: float) -> Assessed:
