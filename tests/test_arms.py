@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.studies.learners.arms import ARMS, ArmStudy, arms_table, success_of_seeds
+from marlbc_mj.studies.learners.arms import ARMS, ArmScore, ArmStudy, _standing, arms_table, success_of_seeds
 from marlbc_mj.training.general.config import DRAWN, GeneralConfig
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import MANIFEST
@@ -27,7 +27,8 @@ def test_a_study_trains_flies_and_reports(tmp_path: Path, monkeypatch: pytest.Mo
     """From the command line, with a small team: a line per training and mission, table and figure."""
     small = {"teams": ("wedge-4",), "families": ("gates",), "batch": 16, "updates": 1, "hidden": (8,), "capacity": 500}
     monkeypatch.setitem(ARMS, "no-pooling", ARMS["no-pooling"]._replace(changes={**ARMS["no-pooling"].changes, **small}))
-    monkeypatch.setattr("marlbc_mj.studies.learners.arms.MISSIONS", (("field", "wedge-4", "straight"),))
+    for name, value in (("MISSIONS", (("field", "wedge-4", "straight"),)), ("MARGINS", (0.05,)), ("TRIED", 1)):
+        monkeypatch.setattr(f"marlbc_mj.studies.learners.arms.{name}", value)
     out = tmp_path / "out"
     main(["arms", "--arms", "no-pooling", "--seeds", "2", "--budget", "100", "--layouts", "1", "--out", str(out)])
     assert "no-pooling" in capsys.readouterr().out
@@ -36,6 +37,18 @@ def test_a_study_trains_flies_and_reports(tmp_path: Path, monkeypatch: pytest.Mo
         rows = list(csv.DictReader(stream))
     assert [(row["seed"], row["mission"]) for row in rows] == [("1", "field, wedge-4"), ("2", "field, wedge-4")]
     assert all((row["arm"], row["mission_steps"], row["layouts"]) == ("no-pooling", "100", "1") for row in rows)
+    assert {row["margin"] for row in rows} == {"0.05"}
+
+
+def test_the_margin_is_that_with_the_most_successes_and_of_those_with_the_greatest_return():
+    """Scores of two missions, by hand."""
+    tried = {
+        margin: [
+            ArmScore(mission, 8, count, 0, total, 1.0, margin) for mission, count, total in (("a", 8, 50.0), ("b", least, more))
+        ]
+        for margin, least, more in ((0.0, 7, 90.0), (0.05, 8, 20.0), (0.3, 8, 30.0))
+    }
+    assert max(tried, key=lambda margin: _standing(tried[margin])) == 0.3
 
 
 def test_shares_are_of_all_layouts_of_a_training():
