@@ -17,7 +17,16 @@ from marlbc_mj.cli import main
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general import GeneralPolicy, Sensed, make_general, mean_policy, read_general, write_general
+from marlbc_mj.policies.general import (
+    COLUMN_ACTION,
+    FORMATION,
+    GeneralPolicy,
+    Sensed,
+    make_general,
+    mean_policy,
+    read_general,
+    write_general,
+)
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.supervisors import General, make_supervisor
@@ -389,6 +398,16 @@ def test_a_stopped_run_goes_on_bit_for_bit(
     for name, array in whole[0].items():
         np.testing.assert_array_equal(array, stopped[0][name], err_msg=name)
     assert whole[1]["scalars"]["updates"] > 20
+
+
+def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
+    """The next episode begins in formation, which changes neither the outcome nor the caller's actions."""
+    trainer = GeneralTrainer(SMALL)
+    squad, taken = trainer.squads[0], np.full((2, 4), COLUMN_ACTION)
+    squad.end[:] = 0
+    outcome = squad.step(taken)
+    assert outcome.ended.all() and (squad.last == FORMATION).all()
+    assert (outcome.action == COLUMN_ACTION).all() and (taken == COLUMN_ACTION).all()
 
 
 def test_lost_messages_age() -> None:

@@ -45,7 +45,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
 STEPS_AHEAD = {"null-space": 40, "set-based": 120}
 """Default horizons by composition [mission steps]."""
-MOST_ORDERS = 2_000_000  # candidates x steps x agents in one decision of one team
+MOST_ORDERS = 3_000_000  # candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
 PREDICTED_FROM = ("measured", "reference")
 AVOIDANCE = "OA"

@@ -101,6 +101,11 @@ class PPOTrainer(GeneralTrainer):
         """Room for one rollout."""
         return Replay(self.config.ppo.rollout, rows, 1, INPUTS)
 
+    @property
+    def flown(self) -> TeamNetwork:
+        """The present actor: of so few updates a mean would still hold those that knew nothing."""
+        return self.learner.network
+
     def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
         """(W, N) actions of every squad, drawn from the softmax of the logits."""
         logits = self.learner.values(inputs)[:, 0]

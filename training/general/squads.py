@@ -99,7 +99,7 @@ class Squad:
         """One decision, with ``actions`` (W, N)."""
         learnt = self._guide() if self.config.learner == "imitation" else actions
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
-        self.last = actions
+        self.last = actions.copy()  # a restart changes it; what was taken is learned from
         returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()

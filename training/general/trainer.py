@@ -15,6 +15,7 @@ from marlbc_mj.training.general.rivals import GENERAL_RIVALS, TeamReplay
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
+from marlbc_mj.training.networks import TeamNetwork
 from marlbc_mj.training.replay import Replay
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -100,8 +101,7 @@ class GeneralTrainer:
             ConfigurationError: the network diverged.
         """
         self._act()
-        if self.replay.count > self.config.n_step:
-            self.learn()
+        self.learn()
 
     def _act(self) -> None:
         inputs = np.concatenate([squad.inputs.reshape(-1, INPUTS) for squad in self.squads])
@@ -140,6 +140,8 @@ class GeneralTrainer:
     def learn(self) -> None:
         """The updates after a decision."""
         config = self.config
+        if self.replay.count <= config.n_step:
+            return
         self.learner.treatment = "plain" if self.share >= config.settle else self.learner.config.learner
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
@@ -172,9 +174,14 @@ class GeneralTrainer:
         self.rng.bit_generator.state = scalars["rng"]
         self.steps, self.error = scalars["steps"], scalars["error"]
 
+    @property
+    def flown(self) -> TeamNetwork:
+        """The network that the policy is made of: the running mean of the weights."""
+        return self.learner.smooth
+
     def policy(self) -> GeneralPolicy:
-        """The greedy policy of the running mean of the weights."""
-        network = self.learner.smooth
+        """The greedy policy of :attr:`flown`."""
+        network = self.flown
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
         return make_general(weights, biases, self.config.switching_margin)
