@@ -424,6 +424,16 @@ def test_lost_messages_age() -> None:
     torch.set_num_threads(1)
 
 
+def test_a_silent_agent_is_heard_by_itself_alone() -> None:
+    """One agent in every episode, not always the same, from the first decision on."""
+    trainer = GeneralTrainer(replace(SMALL, silent=1.0, lossy=0.0, worlds=12))
+    squad = trainer.squads[0]
+    squad.step(np.zeros((12, 4), dtype=np.int64))
+    never = np.isinf(squad.age)
+    assert (squad.mute.sum(axis=1) == 1).all() and len(set(squad.mute.argmax(axis=1))) > 1
+    assert (never == (squad.mute[:, None] & ~np.eye(4, dtype=bool))).all()
+
+
 def test_the_command_refuses_what_it_cannot_train(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for options, said in (
         (["--preset", "paper"], "has no presets"),

@@ -70,6 +70,8 @@ class GeneralConfig:
     """Share of episodes in which agents miss messages of others."""
     most_loss: Annotated[float, SHARE] = 0.6
     """In those, the share of messages that are missed is a draw from 0 to this."""
+    silent: Annotated[float, SHARE] = 0.0
+    """Share of episodes in which one agent, drawn, is never heard by the others."""
 
     hidden: Annotated[tuple[int, ...], _LAYERS] = (64, 64)
     """Widths of the hidden layers."""

@@ -58,6 +58,7 @@ class Squad:
         self.heard = np.zeros((config.worlds, scenario.agents, scenario.agents, SENT), dtype=np.float32)
         self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
         self.loss = np.zeros(config.worlds)  # share of messages missed
+        self.mute = np.zeros((config.worlds, scenario.agents), dtype=bool)  # whom the others never hear
         self.bins = np.zeros(config.worlds, dtype=np.int64)  # of lanes, that a guided episode looks at; 0: not guided
         self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
         self.finish = scenario.mission_steps - self.interval + 1  # mission step from which no decision is left
@@ -79,6 +80,7 @@ class Squad:
         """(W, N, S) inputs after everybody sent once; of the teams ``only`` (W,) alone others' memories stay as they are."""
         features = self._sense()
         arrives = self.rng.random(self.age.shape) >= self.loss[:, None, None]
+        arrives &= ~self.mute[:, None]
         arrives |= np.eye(features.shape[1], dtype=bool)
         if only is not None:
             arrives &= only[:, None, None]
@@ -140,7 +142,7 @@ class Squad:
 
     def _plain_arrays(self) -> list[tuple[Any, str]]:
         """Arrays that are attributes, as pairs of owner and name."""
-        own = ("last", "heard", "age", "loss", "bins", "astray", "end", "inputs")
+        own = ("last", "heard", "age", "loss", "mute", "bins", "astray", "end", "inputs")
         return [*((self, name) for name in own), *((self.explore, name) for name in ("left", "held"))]
 
     def _restart(self, ended: np.ndarray) -> None:
@@ -154,6 +156,9 @@ class Squad:
         self.astray[ended] = 0
         lossy = self.rng.random(count) < config.lossy
         self.loss[ended] = np.where(lossy, self.rng.uniform(0.0, config.most_loss, count), 0.0)
+        if config.silent:
+            drawn = self.rng.integers(self.mute.shape[1], size=count), self.rng.random(count) < config.silent
+            self.mute[ended] = (np.arange(self.mute.shape[1]) == drawn[0][:, None]) & drawn[1][:, None]
         guided = self.rng.random(count) < (1.0 if config.learner == "imitation" else config.guided)
         self.bins[ended] = np.where(guided, self.rng.integers(NEAREST_SIGHT, LANE_BINS, count, endpoint=True), 0)
 
