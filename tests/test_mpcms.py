@@ -1,5 +1,7 @@
 """MPCMS: its prediction is the mission's own reference, its cost is hand arithmetic, and it flies the case study."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,8 @@ from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
-from marlbc_mj.scenarios import Perturbation, paper, robot_gate
-from marlbc_mj.supervisors.mpcms import MPCMS, Joint
+from marlbc_mj.scenarios import Perturbation, make_scenario, paper, robot_gate
+from marlbc_mj.supervisors.mpcms import MPCMS, Joint, avoids_anyway
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -101,6 +103,32 @@ def test_candidates_that_are_given_up_could_not_have_been_the_cheapest(scenario)
     threaded_costs, threaded_trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs, threads=2)
     np.testing.assert_array_equal(threaded_costs, found)
     np.testing.assert_array_equal(threaded_trails[kept], whole[kept])
+
+
+@pytest.mark.parametrize("family", ["gates", "exchange"])
+def test_avoidance_on_top_changes_no_motion_under_the_set_based_composition(family):
+    """So no candidate differs in it alone: same trails to the bit in crowded states.
+
+    Where agent avoidance stands before obstacle avoidance, order matters, and candidates have both.
+    """
+    scenario = make_scenario(family, composition="set-based")
+    world, rng = World(scenario, worlds=8), np.random.default_rng(5)
+    seen = world.reset(2)
+    teams = Teams(seen.step, seen.position + rng.normal(size=seen.position.shape), seen.velocity, seen.obstacles)
+    plain, on_top = (
+        np.full((1, 40, 4), [scenario.orders.index(f"{first}{name}") for name in ("FM", "FR") * 2]) for first in ("", "OA>")
+    )
+    pairs = Pairs(
+        np.repeat(np.arange(8), 2), np.tile([0, 1], 8), np.concatenate([plain, on_top]), np.zeros(2, int), np.full(2, -np.inf)
+    )
+    costs, trails = judge_pairs(scenario, make_behaviors(scenario), FREE, teams, pairs)
+    np.testing.assert_array_equal(trails[::2], trails[1::2])
+    np.testing.assert_array_equal(costs[::2], costs[1::2])
+    free = Joint(0, (False,) * 4)
+    assert len(MPCMS()._candidates(scenario, free).orders) == 1 + 8
+    moved = replace(scenario, behaviors=scenario.behaviors[::-1])
+    assert avoids_anyway(scenario) and not avoids_anyway(moved)
+    assert not avoids_anyway(replace(scenario, composition="null-space"))
 
 
 def test_the_cost_of_two_steps_by_hand():
