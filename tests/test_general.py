@@ -1,25 +1,18 @@
-"""The general policy: inputs without scale, pooling that takes what it gets, one network for all teams, and its training."""
+"""The general policy: inputs without scale, pooling that takes what it gets, and one network for all teams."""
 
-import csv
-import itertools
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from marlbc_mj import World, make_scenario, paper
-from marlbc_mj.cli import main
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import (
-    COLUMN_ACTION,
-    FORMATION,
     GeneralPolicy,
     Sensed,
     make_general,
@@ -28,19 +21,9 @@ from marlbc_mj.policies.general import (
     write_general,
 )
 from marlbc_mj.policies.shipped import shipped
-from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.supervisors import General, make_supervisor
-from marlbc_mj.training.general.config import GeneralConfig, input_mask
 from marlbc_mj.training.general.judging import Judge
-from marlbc_mj.training.general.run import train_general
-from marlbc_mj.training.general.shipping import ship_mean
-from marlbc_mj.training.general.trainer import GeneralTrainer
-from marlbc_mj.training.resuming import RESUME
-from marlbc_mj.training.run import Interrupted
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.provenance import plain_data
-
-SMALL = GeneralConfig(budget=400, families=("field",), teams=("wedge-4",), worlds=2, hidden=(8,), updates=2, batch=16, layouts=1)
 
 
 def random_policy(seed: int = 0, margin: float = 0.0) -> GeneralPolicy:
@@ -48,6 +31,13 @@ def random_policy(seed: int = 0, margin: float = 0.0) -> GeneralPolicy:
     sizes = [(inputs.INPUTS, 16), (16, 3)]
     weights = tuple(rng.normal(size=(1, *size)).astype(np.float32) for size in sizes)
     return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin)
+
+
+def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
+    """The policy with another layer between its two."""
+    weight = np.random.default_rng(seed).normal(size=(1, 16, 16)).astype(np.float32)
+    weights, biases = policy.network.weights, policy.network.biases
+    return make_general((weights[0], weight, weights[1]), (biases[0], biases[0], biases[1]), 0.0)
 
 
 def field(**changes):
@@ -272,179 +262,6 @@ def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
         mean_policy([random_policy(), deep[0]], 0.0)
 
 
-def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
-    run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0, "cpu_s": 1.0}, "git_revision": "abc"}
-    for k in range(2):
-        write_general(tmp_path / f"{k}.safetensors", random_policy(k), run)
-    shipped_to = ship_mean([tmp_path / "0.safetensors", tmp_path / "1.safetensors"], "both", tmp_path)
-    assert read_general(shipped_to)[1]["mean_of"] == [run, run]
-    assert shipped_to.with_suffix(".md").read_text().count("marlbc train marlms-general --seed 0 --set budget=400") == 2
-    with pytest.raises(ConfigurationError, match="exists"):
-        ship_mean([shipped_to], "both", tmp_path)
-
-
-def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of their last networks, under one margin."""
-    run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0}, "git_revision": "abc"}
-    for k in range(3):
-        for kind in ("best", "last"):
-            (tmp_path / f"{k}" / "checkpoint").mkdir(parents=True, exist_ok=True)
-            write_general(tmp_path / f"{k}" / "checkpoint" / f"{kind}.safetensors", random_policy(k + (kind == "best")), run)
-    monkeypatch.setattr(ship_mean, "__defaults__", (tmp_path,))
-    main(["ship", str(tmp_path / "0"), "mine", "--mean-with", str(tmp_path / "1"), str(tmp_path / "2")])
-    policy, description = read_general(tmp_path / "mine.safetensors")
-    seen = np.random.default_rng(0).normal(size=(7, inputs.INPUTS)).astype(np.float32)
-    mean = np.mean([random_policy(k).values(seen) for k in range(3)], axis=0)
-    np.testing.assert_allclose(policy.values(seen), mean, rtol=1e-4, atol=1e-4)
-    assert policy.network.margin == np.float32(GeneralConfig().switching_margin) and len(description["mean_of"]) == 3
-
-
-def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
-    """The policy with another layer between its two."""
-    weight = np.random.default_rng(seed).normal(size=(1, 16, 16)).astype(np.float32)
-    weights, biases = policy.network.weights, policy.network.biases
-    return make_general((weights[0], weight, weights[1]), (biases[0], biases[0], biases[1]), 0.0)
-
-
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"teams": ("wedge-1",)}, "at least 2 agents"),
-        ({"teams": ("wedge",)}, "FORMATION-AGENTS"),
-        ({"teams": ("star-4",)}, "unknown formation"),
-        ({"teams": ()}, "must name at least one"),
-        ({"families": ("paper",)}, "unknown family"),
-        ({"hide": ("noses",)}, "unknown group of inputs"),
-        ({"gamma": 1.0}, "below 1"),
-    ],
-)
-def test_settings_that_cannot_be_are_refused(changes, said: str) -> None:
-    with pytest.raises(ConfigurationError, match=said):
-        replace(SMALL, **changes)
-
-
-def test_a_team_reads_from_its_text() -> None:
-    assert read_team("grid-16") == ("grid", 16)
-
-
-def test_an_ablation_hides_inputs_from_the_network() -> None:
-    """Hidden inputs have no weight, before learning and after."""
-    config = replace(SMALL, hide=("pooled", "column-lane"))
-    trainer = GeneralTrainer(config)
-    for _ in range(4):
-        trainer.advance()
-    mask = input_mask(config)
-    assert mask is not None
-    weight = trainer.policy().network.weights[0][0]
-    assert (weight[mask[0] == 0.0] == 0.0).all()
-    assert (weight[mask[0] == 1.0] != 0.0).any(axis=1).all()
-
-
-@pytest.mark.slow
-def test_training_is_its_seed(tmp_path: Path) -> None:
-    """Two runs under one seed leave the same network, another seed another one; what they leave flies."""
-    runs = {name: replace(SMALL, seed=seed, evaluate_every=200) for name, seed in (("a", 1), ("b", 1), ("c", 2))}
-    for name, config in runs.items():
-        train_general(config, tmp_path / name)
-    networks = [read_general(tmp_path / name / "checkpoint" / "last.safetensors")[0].network for name in runs]
-    assert all((x == y).all() for x, y in zip(networks[0].weights, networks[1].weights, strict=True))
-    assert any((x != y).any() for x, y in zip(networks[0].weights, networks[2].weights, strict=True))
-    with (tmp_path / "a" / "eval.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert {"success_field_wedge-4", "return_corridor_wedge-4", "mission_steps", "wall_s"} <= set(rows[0])
-    with pytest.raises(ConfigurationError, match="not empty"):
-        train_general(SMALL, tmp_path / "a")
-
-
-def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
-    """The first policy is the old one; other layers, or another kind of checkpoint, are refused."""
-    policy, path = random_policy(), tmp_path / "general.safetensors"
-    write_general(path, policy, {})
-    trainer = GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path), first_temperature=0.2))
-    assert trainer.temperature == pytest.approx(0.2)
-    for one, other in zip(policy.network.weights, trainer.policy().network.weights, strict=True):
-        np.testing.assert_array_equal(one, other)
-    for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
-        with pytest.raises(ConfigurationError, match=said):
-            GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
-    write_general(path, mean_policy([policy, policy], 0.0), {})
-    with pytest.raises(ConfigurationError, match="a mean of several networks"):
-        GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path)))
-
-
-def test_a_stopped_run_goes_on_bit_for_bit(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A signal saves the run; resumed by the command, it ends with the networks of a run that nobody stopped."""
-    short = {"field_wedge-4": make_scenario("field", composition="set-based", split="test", duration=2.0)}
-    monkeypatch.setattr("marlbc_mj.training.general.run.judging_scenarios", lambda _: short)
-    config = replace(SMALL, budget=800, evaluate_every=10_000, lossy=1.0, start_spread=0.1, capacity=2_000)
-    train_general(config, tmp_path / "whole")
-    calls, advance = itertools.count(1), GeneralTrainer.advance
-
-    def interrupted(trainer: GeneralTrainer) -> None:
-        advance(trainer)
-        if next(calls) == 9:
-            signal.raise_signal(signal.SIGTERM)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(GeneralTrainer, "advance", interrupted)
-        assert train_general(config, tmp_path / "stopped") == Interrupted(signal.SIGTERM)
-    assert next(calls) == 10 and not (tmp_path / "stopped" / "eval.csv").exists()
-    main(["train", "--resume", str(tmp_path / "stopped")])
-    assert "success" in capsys.readouterr().out
-    whole, stopped = (read_arrays(tmp_path / name / RESUME) for name in ("whole", "stopped"))
-    assert whole[0].keys() == stopped[0].keys() and whole[1]["scalars"] == stopped[1]["scalars"]
-    for name, array in whole[0].items():
-        np.testing.assert_array_equal(array, stopped[0][name], err_msg=name)
-    assert whole[1]["scalars"]["updates"] > 20
-
-
-def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
-    """The next episode begins in formation, which changes neither the outcome nor the caller's actions."""
-    trainer = GeneralTrainer(SMALL)
-    squad, taken = trainer.squads[0], np.full((2, 4), COLUMN_ACTION)
-    squad.end[:] = 0
-    outcome = squad.step(taken)
-    assert outcome.ended.all() and (squad.last == FORMATION).all()
-    assert (outcome.action == COLUMN_ACTION).all() and (taken == COLUMN_ACTION).all()
-
-
-def test_lost_messages_age() -> None:
-    """An agent always hears itself; where all is lost, others' entries stay as they were."""
-    trainer = GeneralTrainer(SMALL)
-    squad = trainer.squads[0]
-    squad.loss[:] = 1.0
-    squad.end[:] = 10**6
-    before = squad.age.copy()
-    own = np.eye(4, dtype=bool)
-    squad.step(np.zeros((2, 4), dtype=np.int64))
-    assert (squad.age[:, own] == 0.0).all()
-    assert (squad.age[:, ~own] == before[:, ~own] + 1.0).all()
-    torch.set_num_threads(1)
-
-
-def test_a_silent_agent_is_heard_by_itself_alone() -> None:
-    """One agent in every episode, not always the same, from the first decision on."""
-    trainer = GeneralTrainer(replace(SMALL, silent=1.0, lossy=0.0, worlds=12))
-    squad = trainer.squads[0]
-    squad.step(np.zeros((12, 4), dtype=np.int64))
-    never = np.isinf(squad.age)
-    assert (squad.mute.sum(axis=1) == 1).all() and len(set(squad.mute.argmax(axis=1))) > 1
-    assert (never == (squad.mute[:, None] & ~np.eye(4, dtype=bool))).all()
-
-
-def test_the_command_refuses_what_it_cannot_train(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    for options, said in (
-        (["--preset", "paper"], "has no presets"),
-        (["--set", "teams=wedge-1"], "at least 2 agents"),
-        (["--set", "nonsense=1"], "unknown setting"),
-    ):
-        with pytest.raises(SystemExit):
-            main(["train", "marlms-general", "--out", str(tmp_path / "run"), *options])
-        assert said in capsys.readouterr().err
-
-
 def test_the_shipped_policy_flies_what_it_never_saw() -> None:
     """A held-out layout of a family with walls, in whose middle only the column fits."""
     scenario = make_scenario("gates", composition="set-based", split="test")
@@ -478,15 +295,3 @@ def test_it_flies_over_any_network(changes) -> None:
     taken = decisions(scenario)
     assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
     np.testing.assert_array_equal(decisions(scenario, worlds=1)[:, 0], taken[:, 0])
-
-
-def test_all_errors_count_once_values_settle() -> None:
-    """Before the share ``settle`` of the budget negative errors count half, from then on in full."""
-    trainer = GeneralTrainer(replace(SMALL, settle=0.5, learner="hysteretic"))
-    trainer.advance()
-    trainer.advance()
-    assert trainer.share < 0.5 and trainer.learner.treatment == "hysteretic"
-    while trainer.share < 0.5:
-        trainer.advance()
-    trainer.advance()
-    assert trainer.learner.treatment == "plain"
