@@ -110,8 +110,7 @@ def predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs):
     cost = held[begin]
     copy_points(held_v[begin], v_r)
     for k in range(begin, horizon):
-        least = cost + (horizon - k) * problem.floor + pairs.extra[pairs.sequence[c]]
-        if c != lead and least * CERTAIN > held[horizon]:
+        if c != lead and cannot_win(cost, horizon - k, problem, pairs.extra[pairs.sequence[c]], held[horizon]):
             costs[c] = np.inf
             return
         before = teams.start[b] if k == 0 else trail[k - 1]
@@ -138,6 +137,12 @@ def advance_reference(moment, before, orders, behaviors, problem, teams, pairs, 
     for i in range(before.shape[0]):
         for axis in range(2):
             after[i, axis] = before[i, axis] + duration * v_r[i, axis]
+
+
+@allocation_free
+def cannot_win(cost, steps, problem, extra, best):
+    """Whether a candidate that cost ``cost`` so far and costs ``extra`` anyway ends above ``best``, with ``steps`` to go."""
+    return (cost + steps * problem.floor + extra) * CERTAIN > best
 
 
 @allocation_free

@@ -25,7 +25,7 @@ from marlbc_mj.engine.inequalities import workspace_rows
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import REACH
-from marlbc_mj.supervisors.prediction import CERTAIN, CostWeights, Problem, add_step_cost, extrapolate, problem
+from marlbc_mj.supervisors.prediction import CostWeights, Problem, add_step_cost, cannot_win, copy_points, extrapolate, problem
 from marlbc_mj.supervisors.set_based_rule import IN_FORMATION, LocalRule, follow_rule, make_local_rule, rule_orders
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
@@ -128,7 +128,7 @@ def follow_plan(one, plan, best, motion, search, present, room):
         costs[first] = room.costs[level - 1, first]
     for k in range(first, horizon):
         room.known[level] = k
-        if (costs[k] + (horizon - k) * search.problem.floor + switching) * CERTAIN > best:
+        if cannot_win(costs[k], horizon - k, search.problem, switching, best):
             return np.inf
         _copy(tracks, (level, k), (level, k + 1))
         predict_step((level, k), one.team[0], motion ^ changed[k], search, present, room)
@@ -158,22 +158,19 @@ def predict_step(moment, b, motion, search, present, room):
 @allocation_free
 def _begin(b, present, tracks):
     """Team ``b`` as it is now, before the first step of the first level."""
-    for i in range(present.position.shape[1]):
-        for axis in range(2):
-            tracks.reference[0, 0, i, axis] = present.reference[b, i, axis]
-            tracks.position[0, 0, i, axis] = present.position[b, i, axis]
-            tracks.velocity[0, 0, i, axis] = tracks.reference_velocity[0, 0, i, axis] = present.moving[b, i, axis]
+    copy_points(present.reference[b], tracks.reference[0, 0])
+    copy_points(present.position[b], tracks.position[0, 0])
+    copy_points(present.moving[b], tracks.velocity[0, 0])
+    copy_points(present.moving[b], tracks.reference_velocity[0, 0])
 
 
 @allocation_free
 def _copy(tracks, source, target):
     """Copy what is predicted at one moment (level, k) to another."""
-    for i in range(tracks.position.shape[2]):
-        for axis in range(2):
-            tracks.reference[target][i, axis] = tracks.reference[source][i, axis]
-            tracks.position[target][i, axis] = tracks.position[source][i, axis]
-            tracks.velocity[target][i, axis] = tracks.velocity[source][i, axis]
-            tracks.reference_velocity[target][i, axis] = tracks.reference_velocity[source][i, axis]
+    copy_points(tracks.reference[source], tracks.reference[target])
+    copy_points(tracks.position[source], tracks.position[target])
+    copy_points(tracks.velocity[source], tracks.velocity[target])
+    copy_points(tracks.reference_velocity[source], tracks.reference_velocity[target])
 
 
 @allocation_free

@@ -135,9 +135,10 @@ class ArmStudy:
             if watch.stopping():
                 raise Stopped
         policy = trainer.policy()
-        tried = {margin: _fly(policy, margin, VALIDATION_SEED, TRIED) for margin in MARGINS}
+        judges = _judges(TRIED)
+        tried = {margin: _fly(policy, margin, judges, VALIDATION_SEED) for margin in MARGINS}
         best = max(tried, key=lambda margin: _standing(tried[margin]))
-        return _fly(policy, best, job.first, job.layouts)
+        return _fly(policy, best, _judges(job.layouts), job.first)
 
     def report(self, results: Sequence[list[ArmScore]], out: Path | None, progress: Progress = silent) -> Report:
         """Write arms.csv, arms.md, arms.pdf and arms.png, and the configuration."""
@@ -155,15 +156,26 @@ class ArmStudy:
         return Report(text, rows)
 
 
-def _fly(policy: GeneralPolicy, margin: float, first: int, layouts: int) -> list[ArmScore]:
-    """All missions, with a switching margin in the place of the policy's own."""
+def _judges(layouts: int) -> dict[str, Judge]:
+    """A judge of every mission, by family and team."""
+    return {
+        f"{family}, {team}": Judge(
+            team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach),
+            JUDGED_WITH,
+            layouts,
+        )
+        for family, team, approach in MISSIONS
+    }
+
+
+def _fly(policy: GeneralPolicy, margin: float, judges: Mapping[str, Judge], first: int) -> list[ArmScore]:
+    """All missions from the layout ``first`` on, with a switching margin in the place of the policy's own."""
     supervisor, scores = General(mean_policy([policy], margin)), []
-    for family, team, approach in MISSIONS:
-        scenario = team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach)
-        verdict = Judge(scenario, JUDGED_WITH, layouts)(supervisor, first)
+    for mission, judge in judges.items():
+        verdict = judge(supervisor, first)
         counts = int(verdict.success.sum()), int(verdict.violated.sum())
-        medians = float(np.median(verdict.total)), float(np.median(verdict.switches)) / scenario.agents
-        scores.append(ArmScore(f"{family}, {team}", layouts, *counts, *medians, margin))
+        medians = float(np.median(verdict.total)), float(np.median(verdict.switches)) / judge.scenario.agents
+        scores.append(ArmScore(mission, len(verdict.total), *counts, *medians, margin))
     return scores
 
 
