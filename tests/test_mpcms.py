@@ -103,6 +103,8 @@ def test_candidates_that_are_given_up_could_not_have_been_the_cheapest(scenario)
     threaded_costs, threaded_trails = judge_pairs(scenario, memory.behaviors, weights, teams, pairs, threads=2)
     np.testing.assert_array_equal(threaded_costs, found)
     np.testing.assert_array_equal(threaded_trails[kept], whole[kept])
+    np.testing.assert_array_equal(threaded_trails, trails)
+    assert np.isnan(trails[~kept][:, -1]).all()  # not what happened to be in memory
 
 
 @pytest.mark.parametrize("family", ["gates", "exchange"])

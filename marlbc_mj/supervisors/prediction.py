@@ -230,11 +230,11 @@ def judge_pairs(
     """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
     ``trails`` given are judged as they are, else the kinematic reference is predicted. A pair that cannot become cheaper than the
-    first one of its team is given up: its cost is infinite, and its trail is not filled.
+    first one of its team is given up: its cost is infinite, and the rest of its trail NaN.
     """
     kinematic, (count, teams_count, horizon) = trails is None, (len(pairs.team), len(teams.first), pairs.orders.shape[1])
     if trails is None:
-        trails = np.empty((count, *pairs.orders.shape[1:], 2))
+        trails = np.full((count, *pairs.orders.shape[1:], 2), np.nan)
     costs = np.empty(count)
     scratch = Scratch(
         np.searchsorted(pairs.team, pairs.team),
