@@ -17,6 +17,7 @@ from marlbc_mj.policies.general import (
     Sensed,
     make_general,
     mean_policy,
+    orders_for,
     read_general,
     write_general,
 )
@@ -26,9 +27,9 @@ from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import ConfigurationError
 
 
-def random_policy(seed: int = 0, margin: float = 0.0) -> GeneralPolicy:
+def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2) -> GeneralPolicy:
     rng = np.random.default_rng(seed)
-    sizes = [(inputs.INPUTS, 16), (16, 3)]
+    sizes = [(inputs.INPUTS, 16), (16, 1 + actions)]
     weights = tuple(rng.normal(size=(1, *size)).astype(np.float32) for size in sizes)
     return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin)
 
@@ -189,6 +190,27 @@ def test_the_end_of_the_mission_is_known_and_not_sent() -> None:
     assert random_policy().messages(features).shape == (1, 4, inputs.SENT)
 
 
+def test_a_policy_with_four_actions_decides_about_avoidance() -> None:
+    """Under the null-space composition alone; its orders are those of its best actions, and close neighbors give way."""
+    scenario, policy = make_scenario("field"), random_policy(actions=4)
+    names = [scenario.orders.names[k] for k in orders_for(policy, scenario)]
+    assert names == ["FM>OA>FR>AA", "FR>OA>FM>AA", "OA>FM>FR>AA", "OA>FR>FM>AA"]
+    with pytest.raises(ConfigurationError, match="--composition null-space"):
+        orders_for(policy, field())
+    seen, chosen = World(scenario).reset(0), set()
+    features = inputs.sense_features(seen, inputs.make_sight(scenario))
+    known = inputs.join_inputs(features, features[:, None, :, : inputs.SENT], np.zeros((1, 1, 4)))[0]
+    for seed in range(20):
+        supervisor = General(random_policy(seed, actions=4))
+        orders, memory = supervisor.decide(seen, supervisor.start(scenario, 1))
+        np.testing.assert_array_equal(orders[0], memory.orders[supervisor.policy.values(known).argmax(axis=1)])
+        chosen |= set(orders.ravel().tolist())
+    assert len(chosen) == 4
+    together = seen._replace(position=np.zeros_like(seen.position))
+    orders, _ = supervisor.decide(together, supervisor.start(scenario, 1))
+    assert all(scenario.orders.names[k].startswith("AA>") for k in orders.ravel())
+
+
 @pytest.mark.parametrize(
     ("scenario", "said"),
     [
@@ -229,6 +251,7 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
         ({"margin": None}, {}, "does not hold the network"),
         ({}, {"weight0": np.zeros((1, 7, 16), np.float32)}, "7, 16"),
         ({}, {"weight1": np.full((1, 16, 3), np.nan, np.float32)}, "not finite"),
+        ({}, {"weight1": np.zeros((1, 16, 4), np.float32), "bias1": np.zeros((1, 1, 4), np.float32)}, "2 or 4 advantages"),
         ({}, {"weight0": np.zeros((1, inputs.INPUTS, 16))}, "float32"),
         ({}, {"weight0": np.zeros((2, inputs.INPUTS, 16), np.float32)}, "layer 0 has weights"),
         ({}, {"weight0": np.float32(1.0)}, "float32"),

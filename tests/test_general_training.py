@@ -18,6 +18,7 @@ from marlbc_mj.policies.checkpoint import read_arrays
 from marlbc_mj.policies.general import (
     COLUMN_ACTION,
     FORMATION,
+    MOTIONS,
     mean_policy,
     read_general,
     write_general,
@@ -27,6 +28,7 @@ from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.training.general.config import GeneralConfig, input_mask
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.general.shipping import ship_mean
+from marlbc_mj.training.general.squads import TOO_CLOSE
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.resuming import RESUME
 from marlbc_mj.training.run import Interrupted
@@ -124,6 +126,8 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
     for start, said in ((str(path), "hidden layers"), (str(shipped("marlms")), "of a single team")):
         with pytest.raises(ConfigurationError, match=said):
             GeneralTrainer(replace(SMALL, hidden=(8,), start=start))
+    with pytest.raises(ConfigurationError, match="--composition set-based"):
+        GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path), composition="null-space"))
     write_general(path, mean_policy([policy, policy], 0.0), {})
     with pytest.raises(ConfigurationError, match="a mean of several networks"):
         GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path)))
@@ -165,6 +169,33 @@ def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
     outcome = squad.step(taken)
     assert outcome.ended.all() and (squad.last == FORMATION).all()
     assert (outcome.action == COLUMN_ACTION).all() and (taken == COLUMN_ACTION).all()
+
+
+def test_where_agents_decide_about_avoidance_who_comes_too_close_pays() -> None:
+    """The same decisions, with the cost and without it."""
+    rewards, outcome = [], None
+    for cost in (0.0, 7.0):
+        squad = GeneralTrainer(replace(SMALL, composition="null-space", violation_cost=cost, lossy=0.0)).squads[0]
+        squad.end[:] = 10**6
+        avoid = np.full((2, 4), len(MOTIONS) + FORMATION)
+        outcomes = [squad.step(avoid if k % 2 else avoid - len(MOTIONS)) for k in range(40)]
+        outcome = np.array([each.final[..., inputs.CLEARANCE_ENTRY] for each in outcomes])
+        rewards.append(np.array([each.reward for each in outcomes]))
+    close = outcome < TOO_CLOSE
+    assert close.any() and not close.all()
+    np.testing.assert_allclose(rewards[0] - rewards[1], 7.0 * close, atol=1e-5)
+    assert squad.world.scenario.orders.names[squad.orders[len(MOTIONS)]] == "OA>FM>FR>AA"
+
+
+def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:
+    """Close to an obstacle and with a blocked way to the slot it heads for; under the set-based composition never."""
+    seen = np.ones((1, 4, inputs.INPUTS))
+    seen[0, :3, inputs.CLEARANCE_ENTRY] = 0.1
+    seen[0, 1:, inputs.LANES + FORMATION] = -0.5
+    for composition, wanted in (("null-space", [0, 2, 2, 0]), ("set-based", [0, 0, 0, 0])):
+        squad = GeneralTrainer(replace(SMALL, worlds=1, composition=composition)).squads[0]
+        squad.inputs, squad.bins[:] = seen, 0
+        assert squad._guide().tolist() == [wanted]
 
 
 def test_lost_messages_age() -> None:

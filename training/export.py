@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
-from marlbc_mj.policies.general import ACTIONS_OF_AGENT, INTERVAL, GeneralPolicy, is_general, read_general
+from marlbc_mj.policies.general import INTERVAL, GeneralPolicy, is_general, read_general
 from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
@@ -45,9 +45,9 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent has of its own; ``heard``
     (batch, agents, M) float32, the last vector heard of each agent, its own included: the first M of its F; ``age`` (batch,
     agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
-    in force, negative for none. Outputs are ``values`` (batch, 2) and ``action`` (batch,): 0 formation, 1 column. The metadata
-    are ``layout`` (JSON, what the entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and
-    ``margin``.
+    in force, negative for none. Outputs are ``values`` (batch, A) and ``action`` (batch,): 0 formation, 1 column; of a policy
+    that decides about avoidance, too, 2 and 3 are the same with avoidance on top. The metadata are ``layout`` (JSON, what the
+    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions`` and ``margin``.
 
     Args:
         checkpoint: the checkpoint's file.
@@ -93,12 +93,12 @@ def _general_model(checkpoint: Path) -> tuple[Any, str]:
     metadata = {
         "layout": json.dumps(INPUT_LAYOUT),
         "interval": repr(INTERVAL),
-        "actions": json.dumps(["formation", "column"]),
+        "actions": json.dumps(["formation", "column", "avoid, formation", "avoid, column"][: policy.actions]),
         "margin": repr(policy.network.margin),
     }
     return build_general(policy, metadata), (
         f"features (batch, {FEATURES}), heard (batch, agents, {SENT}), age (batch, agents) and last (batch,) give "
-        f"values (batch, {ACTIONS_OF_AGENT}) and action (batch,)"
+        f"values (batch, {policy.actions}) and action (batch,)"
     )
 
 
@@ -172,7 +172,7 @@ class AgentPolicy(nn.Module):
         self.network, self.margin = _as_modules(policy.network), policy.network.margin
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, 2) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
+        """Values (B, A) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
         (B,), negative for none.
         """
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))

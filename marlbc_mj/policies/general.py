@@ -1,4 +1,5 @@
-"""The general policy: one network for every agent of every team, which decides between formation and column, agent by agent.
+"""The general policy: one network for every agent of every team, which decides between formation and column, agent by agent; and
+under the null-space composition, where no order avoids by itself, also whether avoidance is on top.
 
 Its inputs are in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one vector per decision and decides on what it sensed
 and what it has heard, however old, from however many; who has heard nothing decides by itself.
@@ -19,9 +20,10 @@ from marlbc_mj.util.files import write_json
 
 KIND = "general"
 """Name of this kind of policy in a checkpoint's header."""
-FORMATION, COLUMN_ACTION = 0, 1
-"""The actions: form the formation, form the column."""
-ACTIONS_OF_AGENT = 2
+MOTIONS = FORMATION, COLUMN_ACTION = 0, 1
+"""The actions: form the formation, form the column. Action ``len(MOTIONS) + k`` is k with avoidance on top."""
+ACTIONS_UNDER = {"set-based": len(MOTIONS), "null-space": 2 * len(MOTIONS)}
+"""A, how many actions an agent has, by the scenario's composition."""
 INTERVAL = 1.2
 """Time for which a decision holds, in settling times."""
 
@@ -37,7 +39,12 @@ class Sensed(NamedTuple):
 class GeneralPolicy(NamedTuple):
     """Dueling networks that all agents share, with a switching margin. Its values are the mean of the networks'."""
 
-    network: Policy  # of one or more networks, INPUTS wide, with two action values
+    network: Policy  # of one or more networks, INPUTS wide, with A action values
+
+    @property
+    def actions(self) -> int:
+        """A, how many actions an agent chooses from."""
+        return self.network.columns
 
     def messages(self, features: np.ndarray) -> np.ndarray:
         """(B, N, M) what each agent sends to the others: what it sensed."""
@@ -52,11 +59,11 @@ class GeneralPolicy(NamedTuple):
             age: (B, N, N) or (B, 1, N) of these [T]; infinite where nothing was heard.
         """
         inputs = join_inputs(sensed.features, heard, age)
-        values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], ACTIONS_OF_AGENT)
+        values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
         return greedy(values, sensed.last, sensed.fresh, self.network.margin)
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
-        """(M, 2) action values for inputs (M, S), one row per agent."""
+        """(M, A) action values for inputs (M, S), one row per agent."""
         values: np.ndarray = self.network.values(inputs).mean(axis=1)
         return values
 
@@ -66,18 +73,37 @@ def decision_steps(scenario: Scenario, sight: Sight) -> int:
     return max(1, round(INTERVAL * sight.time / scenario.mission_step))
 
 
-def motion_orders(scenario: Scenario) -> np.ndarray:
-    """(2,) index into ``scenario.orders`` of each action.
+def action_orders(scenario: Scenario) -> np.ndarray:
+    """(A,) index into ``scenario.orders`` of each action under the scenario's composition.
 
     Raises:
-        ConfigurationError: an order is missing, or the composition does not avoid obstacles by itself.
+        ConfigurationError: an order is missing.
     """
-    if scenario.composition != "set-based":
+    motions = scenario.formation_names
+    names = (*motions, *(f"OA>{motion}" for motion in motions))[: ACTIONS_UNDER[scenario.composition]]
+    return np.array([scenario.orders.index(name) for name in names])
+
+
+def orders_for(policy: GeneralPolicy, scenario: Scenario) -> np.ndarray:
+    """:func:`action_orders` of a scenario that a policy is to fly.
+
+    Raises:
+        ConfigurationError: an order is missing, or the policy was trained for another composition.
+    """
+    orders = action_orders(scenario)
+    if len(orders) != policy.actions:
+        needed = {
+            ACTIONS_UNDER[
+                "set-based"
+            ]: "decides between formation and column alone and needs the composition that avoids by itself: "
+            "--composition set-based",
+            ACTIONS_UNDER["null-space"]: "decides about avoidance, too, and needs the composition that leaves that to it: "
+            "--composition null-space",
+        }[policy.actions]
         raise ConfigurationError(
-            f"scenario {scenario.name!r} has composition {scenario.composition!r}; the general policy decides between formation "
-            "and column alone and needs the composition that avoids by itself: --composition set-based"
+            f"scenario {scenario.name!r} has composition {scenario.composition!r}; the general policy {needed}"
         )
-    return np.array([scenario.orders.index(name) for name in scenario.formation_names])
+    return orders
 
 
 def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]) -> None:
@@ -127,7 +153,7 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
 
 
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
-    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers."""
+    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers; the last gives 1 + A."""
     return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
 
 
@@ -157,6 +183,6 @@ def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ..
         if not (np.isfinite(weight).all() and np.isfinite(bias).all()):
             return f"layer {k} is not finite"
         width = weight.shape[2]
-    if not weights or width != 1 + ACTIONS_OF_AGENT:
-        return f"its {width} outputs are not a value and {ACTIONS_OF_AGENT} advantages"
+    if not weights or width - 1 not in ACTIONS_UNDER.values():
+        return f"its {width} outputs are not a value and {' or '.join(map(str, ACTIONS_UNDER.values()))} advantages"
     return "" if np.isfinite(margin) else f"its margin is {margin}"

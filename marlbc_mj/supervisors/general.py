@@ -1,8 +1,9 @@
 """``marlms-general``: one learned policy for every agent of every team, distributed (project).
 
 Every agent senses its own lanes, sends what it sensed and decides by itself between formation and column, from what it sensed
-and what it heard of the others; see :mod:`marlbc_mj.policies.general`. Avoidance is left to the composition, which must be the
-set-based one.
+and what it heard of the others; see :mod:`marlbc_mj.policies.general`. The shipped policy leaves avoidance to the composition,
+which must be the set-based one; a policy that was trained under the null-space composition decides about avoidance, too, and
+its agents give way to each other as under other supervisors.
 
 The communication layer of the scenario carries what is sent, at every mission step. With ideal communication everybody hears
 everybody at once, and nothing is exchanged between decisions. An agent that is cut off goes on by what it senses and by what it
@@ -18,19 +19,22 @@ import numpy as np
 
 from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.policies.general import FORMATION, GeneralPolicy, Sensed, decision_steps, motion_orders, read_general
+from marlbc_mj.policies.general import FORMATION, GeneralPolicy, Sensed, decision_steps, orders_for, read_general
 from marlbc_mj.policies.general_inputs import SENT, Sight, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
+from marlbc_mj.supervisors.set_based_rule import avoids_by_itself
 
 
 class GeneralMemory(NamedTuple):
     """B teams between two mission steps."""
 
     sight: Sight
-    orders: np.ndarray  # (2,) index into scenario.orders of every action
+    orders: np.ndarray  # (A,) index into scenario.orders of every action
     interval: int  # mission steps that a decision holds for
     actions: np.ndarray  # (B, N) in force
+    way: GiveWay | None = None  # to other agents; None: the composition keeps them apart
     layer: Layer | None = None  # None: communication is ideal
     network: Any = None  # the layer's memory
     solver_ms: float = 0.0  # what inputs and network took in the last mission step [ms]
@@ -58,24 +62,28 @@ class General:
         """All teams in formation; nothing has been heard.
 
         Raises:
-            ConfigurationError: another composition than the set-based one, no column, or a path at rest.
+            ConfigurationError: another composition than the one it was trained under, no column, or a path at rest.
         """
-        orders, sight = motion_orders(scenario), make_sight(scenario)
+        orders, sight = orders_for(self.policy, scenario), make_sight(scenario)
         actions = np.full((teams, scenario.agents), FORMATION, dtype=np.int64)
-        memory = GeneralMemory(sight, orders, decision_steps(scenario, sight), actions)
+        way = None if avoids_by_itself(scenario) else give_way(scenario)
+        memory = GeneralMemory(sight, orders, decision_steps(scenario, sight), actions, way)
         if scenario.communication == IDEAL:
             return memory
         layer = make_layer(scenario)
         return memory._replace(layer=layer, network=layer.start(teams, SENT))
 
     def decide(self, observation: Observation, memory: GeneralMemory) -> tuple[np.ndarray, GeneralMemory]:
-        """Formation or column for every agent; the one in force unless the other is better by more than the margin."""
+        """An action for every agent: the one in force unless another is better by more than the margin."""
         began, due = perf_counter(), observation.step % memory.interval == 0
         if memory.layer is None:
             memory = self._decide_due(observation, memory, due) if due.any() else memory
         else:
             memory = self._exchange_and_decide(observation, memory, due)
-        return memory.orders[memory.actions], memory._replace(solver_ms=1e3 * (perf_counter() - began))
+        orders = memory.orders[memory.actions]
+        if memory.way is not None:
+            orders = lift(orders, observation, memory.way)
+        return orders, memory._replace(solver_ms=1e3 * (perf_counter() - began))
 
     def _decide_due(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
         """The memory with new actions of the teams ``due`` (B,), everybody heard at once."""

@@ -58,6 +58,8 @@ class GeneralConfig:
     """Way of teams whose column has several files [m]; evaluations have 120 m."""
     worlds: Annotated[int, AT_LEAST_ONE] = 1
     """Worlds of every family and team, all stepped together."""
+    composition: Literal["set-based", "null-space"] = "set-based"
+    """Composition of all missions. Under null-space agents decide about avoidance, too, and are punished for violations."""
     controller: str = "pd"
     """Controller that tracks the references while learning; evaluations have sorlc."""
     substep: Annotated[float, POSITIVE] = 0.01
@@ -70,7 +72,7 @@ class GeneralConfig:
     """Share of episodes in which agents miss messages of others."""
     most_loss: Annotated[float, SHARE] = 0.6
     """In those, the share of messages that are missed is a draw from 0 to this."""
-    silent: Annotated[float, SHARE] = 0.0
+    silent: Annotated[float, SHARE] = 0.15
     """Share of episodes in which one agent, drawn, is never heard by the others."""
 
     hidden: Annotated[tuple[int, ...], _LAYERS] = (64, 64)
@@ -117,6 +119,8 @@ class GeneralConfig:
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that is out of its slot's tolerance when the mission ends."""
+    violation_cost: Annotated[float, NOT_NEGATIVE] = 3.0
+    """Cost of an agent that is within the safe distance of an obstacle after a decision, under the null-space composition."""
     switching_margin: float = 0.3
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
@@ -148,9 +152,9 @@ class GeneralConfig:
 
 
 def training_scenarios(config: GeneralConfig) -> list[Scenario]:
-    """Every family with every team, under the set-based composition, with spread starts and drag."""
+    """Every family with every team, under the configuration's composition, with spread starts and drag."""
     spread = Perturbation(start_spread=config.start_spread, drag_scale=(0.0, config.most_drag))
-    changes: dict[str, Any] = {"substep": config.substep, "composition": "set-based", "perturbation": spread}
+    changes: dict[str, Any] = {"substep": config.substep, "composition": config.composition, "perturbation": spread}
     return [
         team_mission(family, *team, long_way=config.long_way, column_approach=approach, **changes)
         for k, family in enumerate(config.families)
@@ -163,7 +167,7 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
     """Held-out layouts of every family, whether it is trained on or not, for the first and the last team; by family and team."""
     names = dict.fromkeys((config.teams[0], config.teams[-1]))
     return {
-        f"{family}_{team}": team_mission(family, *read_team(team), composition="set-based", split="test")
+        f"{family}_{team}": team_mission(family, *read_team(team), composition=config.composition, split="test")
         for team in names
         for family in DRAWN
     }

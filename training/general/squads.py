@@ -8,8 +8,18 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
-from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, decision_steps, motion_orders
-from marlbc_mj.policies.general_inputs import COARSE, LANE_BINS, LANES, SENT, WAYS, join_inputs, make_sight, sense_features
+from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, MOTIONS, action_orders, decision_steps
+from marlbc_mj.policies.general_inputs import (
+    CLEARANCE_ENTRY,
+    COARSE,
+    LANE_BINS,
+    LANES,
+    SENT,
+    WAYS,
+    join_inputs,
+    make_sight,
+    sense_features,
+)
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
@@ -23,6 +33,10 @@ LOST_AFTER = 6
 """Decisions for which an agent is shut out until it is lost."""
 LOST_BEYOND = 8.0
 """Distance from both slots beyond which an agent is far [d_OA]."""
+TOO_CLOSE = 0.2
+"""Clearance beyond d_OA below which an agent is punished, where it decides about avoidance: it moves between decisions [d_OA]."""
+AVOIDS_WITHIN = 0.5
+"""Clearance beyond d_OA within which a guide avoids [d_OA]."""
 
 
 class SquadOutcome(NamedTuple):
@@ -49,7 +63,8 @@ class Squad:
     def __init__(self, scenario: Scenario, config: GeneralConfig, learning: TrainConfig, number: int) -> None:
         self.scenario, self.config = scenario, config
         self.sight = make_sight(scenario)
-        self.orders = motion_orders(scenario)
+        self.orders = action_orders(scenario)
+        self.avoids = len(self.orders) > len(MOTIONS)  # whether agents decide about avoidance
         self.interval = decision_steps(scenario, self.sight)
         self.world = World(scenario, make_controller(config.controller), worlds=config.worlds, threads=config.threads)
         self.explore = Exploration(learning, scenario.agents, len(self.orders))
@@ -94,22 +109,26 @@ class Squad:
         return self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
 
     def _guide(self) -> np.ndarray:
-        """(W, N) what the look-ahead would do."""
-        return np.broadcast_to(look_ahead(self.inputs, self.last, self.bins)[:, None], self.last.shape)
+        """(W, N) what the look-ahead would do; where agents decide about avoidance, it is on top while :func:`obstructed`."""
+        motion = look_ahead(self.inputs, self.last % len(MOTIONS), self.bins)[:, None]
+        return np.asarray(motion + len(MOTIONS) * (obstructed(self.inputs, motion) & self.avoids))
 
     def step(self, actions: np.ndarray) -> SquadOutcome:
         """One decision, with ``actions`` (W, N)."""
-        learnt = self._guide() if self.config.learner == "imitation" else actions
+        config = self.config
+        learnt = self._guide() if config.learner == "imitation" else actions
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
         self.last = actions.copy()  # a restart changes it; what was taken is learned from
         returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()
-        reward = team[:, None] - self.config.switch_cost * switched - self.config.stray_cost * final[..., WAYS + 1]
+        reward = team[:, None] - config.switch_cost * switched - config.stray_cost * final[..., WAYS + 1]
         over = self.world.state.steps >= self.finish
-        reward -= self.config.late_cost * (over[:, None] & self._late(final))
+        reward -= config.late_cost * (over[:, None] & self._late(final))
+        if self.avoids:
+            reward -= config.violation_cost * (final[..., CLEARANCE_ENTRY] < TOO_CLOSE)
         lost = self._lost(final)
-        reward[lost] = -(1.0 + self.config.stray_cost) / (1.0 - self.config.gamma)
+        reward[lost] = -(1.0 + config.stray_cost) / (1.0 - config.gamma)
         ended = lost | (self.world.state.steps >= self.end)
         self.inputs = final
         if ended.any():
@@ -170,12 +189,20 @@ def shut_out(inputs: np.ndarray) -> np.ndarray:
     return np.asarray((inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & away)
 
 
+def obstructed(inputs: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """(W, N) bool: agents close to an obstacle, whose straight way to the slot of ``motion`` (W, N or 1) comes closer than d_OA
+    to one; ``inputs`` (W, N, S).
+    """
+    way = np.where(motion == COLUMN_ACTION, inputs[..., LANES + COLUMN_ACTION], inputs[..., LANES + FORMATION])
+    return np.asarray((inputs[..., CLEARANCE_ENTRY] < AVOIDS_WITHIN) & (way < 0.0))
+
+
 def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.ndarray:
     """(W,) one action per team: the column while two lanes of the formation are blocked, or the way back is for anybody.
 
     Args:
         inputs: (W, N, S) of all agents.
-        last: (W, N) actions in force.
+        last: (W, N) motions in force, FORMATION or COLUMN_ACTION.
         bins: (W,) first bins of the lanes that are looked at.
     """
     seen = np.arange(LANE_BINS) < bins[:, None, None]

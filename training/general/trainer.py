@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from marlbc_mj.policies.general import ACTIONS_OF_AGENT, GeneralPolicy, make_general, read_general
+from marlbc_mj.policies.general import ACTIONS_UNDER, GeneralPolicy, make_general, orders_for, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import TEAM_ERRORS, GeneralConfig, input_mask, learner_config, training_scenarios
@@ -40,7 +40,7 @@ class GeneralTrainer:
         self.squads = [Squad(each, config, learning, k) for k, each in enumerate(training_scenarios(config))]
         generator = torch.Generator().manual_seed(config.seed)
         scale = np.ones(INPUTS, dtype=np.float32)
-        self.learner = self.kind()(learning, 1, ACTIONS_OF_AGENT, scale, generator, input_mask(config))
+        self.learner = self.kind()(learning, 1, ACTIONS_UNDER[config.composition], scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
         self.rng = np.random.default_rng(config.seed)
@@ -79,13 +79,15 @@ class GeneralTrainer:
         """Take over the network of a policy, also for targets and for the running mean.
 
         Raises:
-            ConfigurationError: its layers have other sizes than the configuration's, or it is a mean of several networks.
+            ConfigurationError: its layers have other sizes than the configuration's, it is a mean of several networks, or it was
+                trained under another composition.
         """
         if len(policy.network.weights[0]) > 1:
             raise ConfigurationError(f"checkpoint {self.config.start} is a mean of several networks; a run begins with one")
         found = tuple(bias.shape[2] for bias in policy.network.biases[:-1])
         if found != self.config.hidden:
             raise ConfigurationError(f"checkpoint {self.config.start} has hidden layers {found}, the run {self.config.hidden}")
+        orders_for(policy, self.squads[0].scenario)
         learner = self.learner
         arrays = (*policy.network.weights, *policy.network.biases)
         for network in (learner.network, learner.smooth):

@@ -56,6 +56,11 @@ ARMS: dict[str, Arm] = {
     "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
     "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
     "no-switch-cost": Arm("a switch costs nothing while learning", {"switch_cost": 0.0}),
+    "all-heard": Arm("no episodes with a silent agent", {"silent": 0.0}),
+    "null-space": Arm(
+        "learns and flies under the composition of the paper: an agent also decides whether avoidance is on top",
+        {"composition": "null-space"},
+    ),
     "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),
     **{
         f"without-{left}": Arm(f"never trained on {left}", {"families": tuple(f for f in GeneralConfig().families if f != left)})
@@ -135,10 +140,11 @@ class ArmStudy:
             if watch.stopping():
                 raise Stopped
         policy = trainer.policy()
-        judges = _judges(TRIED)
+        composition = job.config.composition
+        judges = _judges(TRIED, composition)
         tried = {margin: _fly(policy, margin, judges, VALIDATION_SEED) for margin in MARGINS}
         best = max(tried, key=lambda margin: _standing(tried[margin]))
-        return _fly(policy, best, _judges(job.layouts), job.first)
+        return _fly(policy, best, _judges(job.layouts, composition), job.first)
 
     def report(self, results: Sequence[list[ArmScore]], out: Path | None, progress: Progress = silent) -> Report:
         """Write arms.csv, arms.md, arms.pdf and arms.png, and the configuration."""
@@ -156,11 +162,11 @@ class ArmStudy:
         return Report(text, rows)
 
 
-def _judges(layouts: int) -> dict[str, Judge]:
-    """A judge of every mission, by family and team."""
+def _judges(layouts: int, composition: str) -> dict[str, Judge]:
+    """A judge of every mission under a composition, by family and team."""
     return {
         f"{family}, {team}": Judge(
-            team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach),
+            team_mission(family, *read_team(team), composition=composition, split="test", column_approach=approach),
             JUDGED_WITH,
             layouts,
         )
