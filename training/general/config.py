@@ -121,7 +121,7 @@ class GeneralConfig:
     """Cost of an agent that is out of its slot's tolerance when the mission ends."""
     violation_cost: Annotated[float, NOT_NEGATIVE] = 3.0
     """Cost of an agent that is within the safe distance of an obstacle after a decision, under the null-space composition."""
-    switching_margin: float = 0.1
+    switching_margin: float = 0.15
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
