@@ -11,7 +11,7 @@ import pytest
 import torch
 from test_general import random_policy
 
-from marlbc_mj import make_scenario
+from marlbc_mj import World, make_controller, make_scenario
 from marlbc_mj.cli import main
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays
@@ -28,7 +28,6 @@ from marlbc_mj.scenarios.teams import read_team
 from marlbc_mj.training.general.config import GeneralConfig, input_mask
 from marlbc_mj.training.general.run import train_general
 from marlbc_mj.training.general.shipping import ship_mean
-from marlbc_mj.training.general.squads import TOO_CLOSE
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.resuming import RESUME
 from marlbc_mj.training.run import Interrupted
@@ -172,19 +171,24 @@ def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
 
 
 def test_where_agents_decide_about_avoidance_who_comes_too_close_pays() -> None:
-    """The same decisions, with the cost and without it."""
-    rewards, outcome = [], None
-    for cost in (0.0, 7.0):
-        squad = GeneralTrainer(replace(SMALL, composition="null-space", violation_cost=cost, lossy=0.0)).squads[0]
-        squad.end[:] = 10**6
-        avoid = np.full((2, 4), len(MOTIONS) + FORMATION)
-        outcomes = [squad.step(avoid if k % 2 else avoid - len(MOTIONS)) for k in range(40)]
-        outcome = np.array([each.final[..., inputs.CLEARANCE_ENTRY] for each in outcomes])
-        rewards.append(np.array([each.reward for each in outcomes]))
-    close = outcome < TOO_CLOSE
-    assert close.any() and not close.all()
-    np.testing.assert_allclose(rewards[0] - rewards[1], 7.0 * close, atol=1e-5)
-    assert squad.world.scenario.orders.names[squad.orders[len(MOTIONS)]] == "OA>FM>FR>AA"
+    """At any mission step of a decision; with the cost and without it, the rest of the reward is the same."""
+    config = replace(SMALL, composition="null-space", lossy=0.0, violation_cost=7.0)
+    squads = [GeneralTrainer(replace(config, violation_cost=cost)).squads[0] for cost in (0.0, 7.0)]
+    scenario, paid = squads[0].scenario, []
+    for k in range(40):
+        action = np.full((2, 4), FORMATION if k % 2 else len(MOTIONS) + FORMATION)
+        for squad in squads:
+            squad.end[:] = 10**6
+        twin = World(scenario, make_controller("pd"), worlds=2)
+        twin.restore(squads[0].world.snapshot())
+        least = np.full((2, 4), np.inf)
+        for _ in range(squads[0].interval):
+            least = np.minimum(least, twin.step(squads[0].orders[action]).observation.clearance)
+        free, costly = (squad.step(action).reward for squad in squads)
+        np.testing.assert_allclose(free - costly, 7.0 * (least <= scenario.safe_distance), atol=1e-5)
+        paid.append(least <= scenario.safe_distance)
+    assert 0 < np.sum(paid) < np.size(paid)
+    assert scenario.orders.names[squads[0].orders[len(MOTIONS)]] == "OA>FM>FR>AA"
 
 
 def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:

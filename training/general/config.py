@@ -119,8 +119,8 @@ class GeneralConfig:
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that is out of its slot's tolerance when the mission ends."""
-    violation_cost: Annotated[float, NOT_NEGATIVE] = 3.0
-    """Cost of an agent that is within the safe distance of an obstacle after a decision, under the null-space composition."""
+    violation_cost: Annotated[float, NOT_NEGATIVE] = 20.0
+    """Cost of an agent that comes within the safe distance of an obstacle during a decision, under the null-space composition."""
     switching_margin: float = 0.15
     """The policy leaves an order only for one whose value is higher by more than this."""
     hide: tuple[str, ...] = ()

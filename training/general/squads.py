@@ -6,6 +6,7 @@ import numpy as np
 
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.behaviors import LineFormation
+from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, MOTIONS, action_orders, decision_steps
@@ -33,8 +34,6 @@ LOST_AFTER = 6
 """Decisions for which an agent is shut out until it is lost."""
 LOST_BEYOND = 8.0
 """Distance from both slots beyond which an agent is far [d_OA]."""
-TOO_CLOSE = 0.2
-"""Clearance beyond d_OA below which an agent is punished, where it decides about avoidance: it moves between decisions [d_OA]."""
 AVOIDS_WITHIN = 0.5
 """Clearance beyond d_OA within which a guide avoids [d_OA]."""
 
@@ -119,14 +118,13 @@ class Squad:
         learnt = self._guide() if config.learner == "imitation" else actions
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
         self.last = actions.copy()  # a restart changes it; what was taken is learned from
-        returns = self.world.rollout(np.broadcast_to(self.orders[actions], (self.interval, *actions.shape)))
+        returns, violated = self._fly(self.orders[actions])
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()
         reward = team[:, None] - config.switch_cost * switched - config.stray_cost * final[..., WAYS + 1]
         over = self.world.state.steps >= self.finish
         reward -= config.late_cost * (over[:, None] & self._late(final))
-        if self.avoids:
-            reward -= config.violation_cost * (final[..., CLEARANCE_ENTRY] < TOO_CLOSE)
+        reward -= config.violation_cost * violated
         lost = self._lost(final)
         reward[lost] = -(1.0 + config.stray_cost) / (1.0 - config.gamma)
         ended = lost | (self.world.state.steps >= self.end)
@@ -135,6 +133,19 @@ class Squad:
             self._restart(ended)
             self.inputs = np.where(ended[:, None, None], self._exchange(ended), final)
         return SquadOutcome(learnt, reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
+
+    def _fly(self, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(W,) returns of a decision's mission steps under ``orders`` (W, N); and (W, N) bool, who violated the safe distance
+        after one of them, nobody where the composition avoids.
+        """
+        violated = np.zeros(orders.shape, dtype=bool)
+        if not self.avoids:
+            return self.world.rollout(np.broadcast_to(orders, (self.interval, *orders.shape))), violated
+        returns = np.zeros(len(orders))
+        for _ in range(self.interval):
+            returns += self.world.rollout(orders[None])
+            violated |= violates(self.world.state.clearance, self.scenario.safe_distance)
+        return returns, violated
 
     def _late(self, inputs: np.ndarray) -> np.ndarray:
         """(W, N) bool: agents beyond the tolerance of their slots in the formation; ``inputs`` (W, N, S)."""
