@@ -17,11 +17,11 @@ from marlbc_mj.training.ship import put_in_package
 from marlbc_mj.util.files import check_target, staged_file
 from marlbc_mj.util.provenance import plain_data, provenance
 
-_WHAT = (
-    "Dueling Q-learning of one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
-    f"itself between formation and column, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
-    "that it pools of what it heard. It needs the set-based composition, a formation with a column and a path that moves."
-)
+_DECIDES = {
+    "set-based": "between formation and column",
+    "null-space": "between formation and column and whether avoidance is on top",
+}
+"""What an agent decides, by the composition that the policy needs."""
 
 
 def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
@@ -64,6 +64,17 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
     return target
 
 
+def _what(train: dict[str, Any]) -> str:
+    """What the policies of a training are."""
+    composition = train.get("composition", "set-based")
+    return (
+        "Dueling Q-learning of one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
+        f"itself {_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
+        f"that it pools of what it heard. It needs the {composition} composition, a formation with a column and a path that "
+        "moves."
+    )
+
+
 def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
     """The model card of a mean, in Markdown: a line per network."""
     rows = [
@@ -78,7 +89,8 @@ def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
     lines = [
         f"# {name}",
         "",
-        f"{_WHAT} Its action values are the mean of those of {len(runs)} networks, each trained by a command of its own"
+        f"{_what(runs[0]['train'])} Its action values are the mean of those of {len(runs)} networks, each trained by a command "
+        "of its own"
         + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
         "",
         pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
@@ -99,7 +111,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
     lines = [
         f"# {name}",
         "",
-        _WHAT,
+        _what(train),
         "",
         f"- Trained on {_counted(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
         f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
