@@ -24,6 +24,11 @@ MOTIONS = FORMATION, COLUMN_ACTION = 0, 1
 """The actions: form the formation, form the column. Action ``len(MOTIONS) + k`` is k with avoidance on top."""
 ACTIONS_UNDER = {"set-based": len(MOTIONS), "null-space": 2 * len(MOTIONS)}
 """A, how many actions an agent has, by the scenario's composition."""
+_NEEDS = {
+    "set-based": "decides between formation and column alone and needs the composition that avoids by itself",
+    "null-space": "decides about avoidance, too, and needs the composition that leaves that to it",
+}
+"""Why a policy needs a composition."""
 INTERVAL = 1.2
 """Time for which a decision holds, in settling times."""
 
@@ -45,6 +50,11 @@ class GeneralPolicy(NamedTuple):
     def actions(self) -> int:
         """A, how many actions an agent chooses from."""
         return self.network.columns
+
+    @property
+    def composition(self) -> str:
+        """The composition that it was trained under, told by its actions."""
+        return next(name for name, actions in ACTIONS_UNDER.items() if actions == self.actions)
 
     def messages(self, features: np.ndarray) -> np.ndarray:
         """(B, N, M) what each agent sends to the others: what it sensed."""
@@ -90,20 +100,12 @@ def orders_for(policy: GeneralPolicy, scenario: Scenario) -> np.ndarray:
     Raises:
         ConfigurationError: an order is missing, or the policy was trained for another composition.
     """
-    orders = action_orders(scenario)
-    if len(orders) != policy.actions:
-        needed = {
-            ACTIONS_UNDER[
-                "set-based"
-            ]: "decides between formation and column alone and needs the composition that avoids by itself: "
-            "--composition set-based",
-            ACTIONS_UNDER["null-space"]: "decides about avoidance, too, and needs the composition that leaves that to it: "
-            "--composition null-space",
-        }[policy.actions]
+    if scenario.composition != policy.composition:
         raise ConfigurationError(
-            f"scenario {scenario.name!r} has composition {scenario.composition!r}; the general policy {needed}"
+            f"scenario {scenario.name!r} has composition {scenario.composition!r}; the general policy "
+            f"{_NEEDS[policy.composition]}: --composition {policy.composition}"
         )
-    return orders
+    return action_orders(scenario)
 
 
 def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]) -> None:

@@ -23,7 +23,7 @@ from marlbc_mj.policies.general import FORMATION, GeneralPolicy, Sensed, decisio
 from marlbc_mj.policies.general_inputs import SENT, Sight, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
-from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift, no_way
 from marlbc_mj.supervisors.set_based_rule import avoids_by_itself
 
 
@@ -34,7 +34,7 @@ class GeneralMemory(NamedTuple):
     orders: np.ndarray  # (A,) index into scenario.orders of every action
     interval: int  # mission steps that a decision holds for
     actions: np.ndarray  # (B, N) in force
-    way: GiveWay | None = None  # to other agents; None: the composition keeps them apart
+    way: GiveWay  # to other agents; none where the composition keeps them apart
     layer: Layer | None = None  # None: communication is ideal
     network: Any = None  # the layer's memory
     solver_ms: float = 0.0  # what inputs and network took in the last mission step [ms]
@@ -66,7 +66,7 @@ class General:
         """
         orders, sight = orders_for(self.policy, scenario), make_sight(scenario)
         actions = np.full((teams, scenario.agents), FORMATION, dtype=np.int64)
-        way = None if avoids_by_itself(scenario) else give_way(scenario)
+        way = no_way(scenario) if avoids_by_itself(scenario) else give_way(scenario)
         memory = GeneralMemory(sight, orders, decision_steps(scenario, sight), actions, way)
         if scenario.communication == IDEAL:
             return memory
@@ -80,9 +80,7 @@ class General:
             memory = self._decide_due(observation, memory, due) if due.any() else memory
         else:
             memory = self._exchange_and_decide(observation, memory, due)
-        orders = memory.orders[memory.actions]
-        if memory.way is not None:
-            orders = lift(orders, observation, memory.way)
+        orders = lift(memory.orders[memory.actions], observation, memory.way)
         return orders, memory._replace(solver_ms=1e3 * (perf_counter() - began))
 
     def _decide_due(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:

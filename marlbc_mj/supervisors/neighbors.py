@@ -24,6 +24,11 @@ class GiveWay(NamedTuple):
     lifted: np.ndarray  # (orders,) index of the same order with AA on top
 
 
+def no_way(scenario: Scenario) -> GiveWay:
+    """Nobody gives way: every order stays as it is."""
+    return GiveWay(0.0, np.arange(len(scenario.orders)))
+
+
 def give_way(scenario: Scenario) -> GiveWay:
     """From a scenario's behaviors."""
     orders = scenario.orders
@@ -32,7 +37,7 @@ def give_way(scenario: Scenario) -> GiveWay:
             index = {tuple(row): k for k, row in enumerate(orders.table.tolist())}
             lifted = [index[(j, *(other for other in row if other != j))] for row in orders.table.tolist()]
             return GiveWay(float(behavior.distance), np.array(lifted))  # type: ignore[attr-defined]
-    return GiveWay(0.0, np.arange(len(orders)))
+    return no_way(scenario)
 
 
 def crowded(observation: Observation, way: GiveWay, reach: float = REACH) -> np.ndarray:

@@ -26,7 +26,7 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import grid_room, make_behaviors
 from marlbc_mj.engine.references import refer
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift
+from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift, no_way
 from marlbc_mj.util.errors import ConfigurationError
 
 IN_FORMATION, IN_COLUMN = 0, 1
@@ -56,7 +56,7 @@ def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
     free = np.array([scenario.orders.index(name) for name in scenario.formation_names])
     behaviors, step, grid = make_behaviors(scenario), float(scenario.mission_step), np.zeros(grid_room(scenario))
     if avoids_by_itself(scenario):
-        avoiding, least, way = free, -np.inf, GiveWay(0.0, np.arange(len(scenario.orders)))
+        avoiding, least, way = free, -np.inf, no_way(scenario)
     else:
         avoiding = np.array([scenario.orders.index(f"OA>{name}") for name in scenario.formation_names])
         least, way = float(scenario.safe_distance + margin), give_way(scenario)
