@@ -27,11 +27,11 @@ from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import ConfigurationError
 
 
-def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2) -> GeneralPolicy:
+def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2, dwell: int = 1) -> GeneralPolicy:
     rng = np.random.default_rng(seed)
     sizes = [(inputs.INPUTS, 16), (16, 1 + actions)]
     weights = tuple(rng.normal(size=(1, *size)).astype(np.float32) for size in sizes)
-    return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin)
+    return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin, dwell)
 
 
 def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
@@ -137,6 +137,27 @@ def test_who_hears_nothing_decides_by_itself() -> None:
     np.testing.assert_array_equal(policy.decide(now, heard, age), alone)
 
 
+@pytest.mark.parametrize("dwell", [1, 2, 4])
+def test_a_new_order_is_kept_for_the_dwell(dwell: int) -> None:
+    """At least so many decisions; the first change of an episode may come at once, and without a dwell orders last a decision."""
+    scenario = field(split="test", duration=20.0)
+    lasted, first = [], []
+    for seed in range(4):
+        supervisor, world = General(random_policy(seed, dwell=dwell)), World(scenario, worlds=8)
+        observation, memory = world.reset(5), supervisor.start(scenario, 8)
+        taken = []
+        for _ in range(scenario.mission_steps):
+            orders, memory = supervisor.decide(observation, memory)
+            observation = world.step(orders).observation
+            taken.append(orders.reshape(-1))
+        for line in np.array(taken).T:
+            changes = np.flatnonzero(np.diff(line)) + 1
+            lasted += np.diff(changes).tolist()
+            first += changes[:1].tolist()
+    assert min(lasted) == dwell * memory.interval
+    assert min(first) == memory.interval
+
+
 @pytest.mark.parametrize(("formation", "agents"), [("line", 2), ("grid", 9), ("circle", 32)])
 def test_one_policy_flies_teams_of_any_size(formation: str, agents: int) -> None:
     scenario = make_scenario("open", composition="set-based", formation=formation, agents=agents, duration=1.0)
@@ -232,12 +253,12 @@ def test_a_formation_that_is_its_own_column_is_refused() -> None:
 
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
-    policy, path = random_policy(margin=0.25), tmp_path / "general.safetensors"
+    policy, path = random_policy(margin=0.25, dwell=4), tmp_path / "general.safetensors"
     write_general(path, policy, {"note": "x"})
     read, description = read_general(path)
     for one, other in zip(policy.network.weights, read.network.weights, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert (read.network.margin, description["note"]) == (0.25, "x")
+    assert (read.network.margin, read.dwell, description["note"]) == (0.25, 4, "x")
     assert isinstance(make_supervisor(str(path)), General)
     assert path.stat().st_size < 1_000_000
 
@@ -249,6 +270,7 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
         ({"interval": 3.0}, {}, "trained on other inputs: its interval"),
         ({"kind": "team"}, {}, "not hold a general policy"),
         ({"margin": None}, {}, "does not hold the network"),
+        ({"dwell": 0}, {}, "its dwell is 0 decisions"),
         ({}, {"weight0": np.zeros((1, 7, 16), np.float32)}, "7, 16"),
         ({}, {"weight1": np.full((1, 16, 3), np.nan, np.float32)}, "not finite"),
         ({}, {"weight1": np.zeros((1, 16, 4), np.float32), "bias1": np.zeros((1, 1, 4), np.float32)}, "2 or 4 advantages"),

@@ -62,6 +62,7 @@ def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.
     mean = np.mean([random_policy(k).values(seen) for k in range(3)], axis=0)
     np.testing.assert_allclose(policy.values(seen), mean, rtol=1e-4, atol=1e-4)
     assert policy.network.margin == np.float32(GeneralConfig().switching_margin) and len(description["mean_of"]) == 3
+    assert policy.dwell == GeneralConfig().dwell and "at least 3 decisions" in (tmp_path / "mine.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -130,6 +131,13 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
     write_general(path, mean_policy([policy, policy], 0.0), {})
     with pytest.raises(ConfigurationError, match="a mean of several networks"):
         GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path)))
+
+
+def test_only_where_the_composition_avoids_there_is_a_dwell_time() -> None:
+    """Where agents decide about avoidance, it must come at once."""
+    config = replace(SMALL, dwell=5)
+    assert GeneralTrainer(config).policy().dwell == 5
+    assert GeneralTrainer(replace(config, composition="null-space")).policy().dwell == 1
 
 
 def test_a_stopped_run_goes_on_bit_for_bit(

@@ -5,6 +5,7 @@ Its inputs are in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one v
 and what it has heard, however old, from however many; who has heard nothing decides by itself.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,8 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general_inputs import INPUT_LAYOUT, INPUTS, SENT, Sight, join_inputs
-from marlbc_mj.policies.greedy import Policy, greedy
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, INPUT_LAYOUT, INPUTS, SENT, Sight, join_inputs
+from marlbc_mj.policies.greedy import Array, Policy, greedy
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
@@ -42,9 +43,10 @@ class Sensed(NamedTuple):
 
 
 class GeneralPolicy(NamedTuple):
-    """Dueling networks that all agents share, with a switching margin. Its values are the mean of the networks'."""
+    """Dueling networks that all agents share, with a switching margin and a dwell time. Its values are the mean of the networks'."""
 
     network: Policy  # of one or more networks, INPUTS wide, with A action values
+    dwell: int = 1  # decisions that an agent keeps a new order for, at least
 
     @property
     def actions(self) -> int:
@@ -61,7 +63,8 @@ class GeneralPolicy(NamedTuple):
         return features[..., :SENT]
 
     def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, N) actions: the better one if its value leads by more than the margin, else the one in force.
+        """(B, N) actions: the better one if its value leads by more than the margin and the agent :func:`may_change`, else the
+        one in force.
 
         Args:
             sensed: by each agent.
@@ -70,12 +73,35 @@ class GeneralPolicy(NamedTuple):
         """
         inputs = join_inputs(sensed.features, heard, age)
         values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
-        return greedy(values, sensed.last, sensed.fresh, self.network.margin)
+        chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
+        free = may_change(sensed.features[..., AGE_ENTRIES], sensed.fresh[:, None], least_age(self.dwell))
+        return np.where(free, chosen, sensed.last)
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
         """(M, A) action values for inputs (M, S), one row per agent."""
         values: np.ndarray = self.network.values(inputs).mean(axis=1)
         return values
+
+
+def least_age(dwell: int) -> float:
+    """Entry AGE_ENTRIES of the features from which an order is ``dwell`` decisions old; 0 for one, which every order is.
+
+    It stands for an age half a decision less, as the time of a decision is rounded to mission steps.
+    """
+    return -math.expm1(-(dwell - 0.5) * INTERVAL / COARSE) if dwell > 1 else 0.0
+
+
+def may_change(age: Array, fresh: Array, least: float) -> Array:
+    """Bool: whether an agent may leave its order. Who may do so at once can dither between two orders close to an obstacle, where
+    the references jump and the tracking error ends in a violation; a dwell time bounds that (Hespanha and Morse 1999).
+
+    Args:
+        age: entry AGE_ENTRIES of the agent's features.
+        fresh: whether no order is in force yet.
+        least: see :func:`least_age`.
+    """
+    result: Array = (age >= least) | fresh
+    return result
 
 
 def decision_steps(scenario: Scenario, sight: Sight) -> int:
@@ -112,7 +138,14 @@ def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]
     """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
     network = policy.network
     arrays = {f"weight{k}": w for k, w in enumerate(network.weights)} | {f"bias{k}": b for k, b in enumerate(network.biases)}
-    said = {**description, "kind": KIND, "layout": INPUT_LAYOUT, "interval": INTERVAL, "margin": network.margin}
+    said = {
+        **description,
+        "kind": KIND,
+        "layout": INPUT_LAYOUT,
+        "interval": INTERVAL,
+        "margin": network.margin,
+        "dwell": policy.dwell,
+    }
     write_arrays(path, arrays, said)
     write_json(path.with_suffix(".json"), said)
 
@@ -145,21 +178,21 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
     try:
         weights = tuple(arrays[f"weight{k}"] for k in range(layers))
         biases = tuple(arrays[f"bias{k}"] for k in range(layers))
-        margin = float(description["margin"])
+        margin, dwell = float(description["margin"]), int(description.get("dwell", 1))
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy") from None
-    fault = _network_fault(weights, biases, margin)
+    fault = _network_fault(weights, biases, margin) or ("" if dwell >= 1 else f"its dwell is {dwell} decisions")
     if fault:
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy: {fault}")
-    return make_general(weights, biases, margin), description
+    return make_general(weights, biases, margin, dwell), description
 
 
-def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
+def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float, dwell: int = 1) -> GeneralPolicy:
     """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers; the last gives 1 + A."""
-    return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
+    return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin), dwell)
 
 
-def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
+def mean_policy(policies: Sequence[GeneralPolicy], margin: float, dwell: int = 1) -> GeneralPolicy:
     """One policy whose values are the mean of those of others.
 
     Raises:
@@ -171,7 +204,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
         raise ConfigurationError(f"a mean takes at least one policy, and networks of the same size; these have {sorted(sizes)}")
     weights = (np.concatenate(layers) for layers in zip(*(network.weights for network in networks), strict=True))
     biases = (np.concatenate(layers) for layers in zip(*(network.biases for network in networks), strict=True))
-    return make_general(tuple(weights), tuple(biases), margin)
+    return make_general(tuple(weights), tuple(biases), margin, dwell)
 
 
 def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:

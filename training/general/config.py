@@ -123,6 +123,9 @@ class GeneralConfig:
     """Cost of an agent that comes within the safe distance of an obstacle during a decision, under the null-space composition."""
     switching_margin: float = 0.15
     """The policy leaves an order only for one whose value is higher by more than this."""
+    dwell: Annotated[int, AT_LEAST_ONE] = 3
+    """Decisions that an agent keeps a new order for, at least, in flight; not while it learns, nor under the null-space
+    composition, where avoidance must come at once."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
     ppo: PPO = GENERAL_PPO
@@ -171,6 +174,11 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
         for team in names
         for family in DRAWN
     }
+
+
+def flown_dwell(composition: str, dwell: int = GeneralConfig.dwell) -> int:
+    """The dwell time of a policy in flight [decisions], of the setting ``dwell``."""
+    return dwell if composition == "set-based" else 1
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from marlbc_mj.policies.general import mean_policy, read_general, write_general
+from marlbc_mj.policies.general import GeneralPolicy, mean_policy, read_general, write_general
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, SENT
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.training.config import flat_settings
-from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig
+from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig, flown_dwell
 from marlbc_mj.training.ship import put_in_package
 from marlbc_mj.util.files import check_target, staged_file
 from marlbc_mj.util.provenance import plain_data, provenance
@@ -52,7 +52,9 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
         ConfigurationError: a damaged checkpoint, networks that have no mean, or a file that may not be replaced.
     """
     parts = [read_general(path) for path in checkpoints]
-    policy = mean_policy([part for part, _ in parts], GeneralConfig().switching_margin)
+    policies = [part for part, _ in parts]
+    policy = mean_policy(policies, GeneralConfig.switching_margin)
+    policy = policy._replace(dwell=flown_dwell(policy.composition))
     target = folder / f"{name}.safetensors"
     check_target(target, overwrite=overwrite)
     runs = [{key: part[key] for key in ("train", "evaluation", "git_revision")} for _, part in parts]
@@ -60,7 +62,7 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
         run["train"] = {**run["train"], "start": "/".join(Path(run["train"].get("start", "")).parts[-3:])}
     write_general(target, policy, {**provenance(), "mean_of": runs})
     with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
-        staging.write_text(_mean_card(name, runs))
+        staging.write_text(_mean_card(name, policy, runs))
     return target
 
 
@@ -75,7 +77,7 @@ def _what(train: dict[str, Any]) -> str:
     )
 
 
-def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
+def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> str:
     """The model card of a mean, in Markdown: a line per network."""
     rows = [
         (
@@ -92,6 +94,9 @@ def _mean_card(name: str, runs: list[dict[str, Any]]) -> str:
         f"{_what(runs[0]['train'])} Its action values are the mean of those of {len(runs)} networks, each trained by a command "
         "of its own"
         + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
+        "",
+        f"An agent leaves its order only for one whose value is higher by more than {policy.network.margin:g}"
+        + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else "."),
         "",
         pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
     ]

@@ -10,7 +10,14 @@ import torch
 from marlbc_mj.policies.general import ACTIONS_UNDER, GeneralPolicy, make_general, orders_for, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
-from marlbc_mj.training.general.config import TEAM_ERRORS, GeneralConfig, input_mask, learner_config, training_scenarios
+from marlbc_mj.training.general.config import (
+    TEAM_ERRORS,
+    GeneralConfig,
+    flown_dwell,
+    input_mask,
+    learner_config,
+    training_scenarios,
+)
 from marlbc_mj.training.general.rivals import GENERAL_RIVALS, TeamReplay
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
@@ -186,4 +193,5 @@ class GeneralTrainer:
         network = self.flown
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
-        return make_general(weights, biases, self.config.switching_margin)
+        dwell = flown_dwell(self.config.composition, self.config.dwell)
+        return make_general(weights, biases, self.config.switching_margin, dwell)

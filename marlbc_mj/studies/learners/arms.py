@@ -1,7 +1,8 @@
 """Ablations of the general policy: one setting changed at a time, each trained on several seeds and flown on held-out layouts.
 
 Values of different learners have different scales, so that one switching margin for all would favor some. Every training's policy
-flies with that of MARGINS with which it succeeds most on a few validation layouts, which no result is taken from.
+flies with that of MARGINS with which it succeeds most on a few validation layouts, which no result is taken from. There is no
+dwell time, so that dithering shows.
 """
 
 from collections.abc import Mapping, Sequence
@@ -175,7 +176,7 @@ def _judges(layouts: int, composition: str) -> dict[str, Judge]:
 
 
 def _fly(policy: GeneralPolicy, margin: float, judges: Mapping[str, Judge], first: int) -> list[ArmScore]:
-    """All missions from the layout ``first`` on, with a switching margin in the place of the policy's own."""
+    """All missions from the layout ``first`` on, with a switching margin in the place of the policy's own, and no dwell time."""
     supervisor, scores = General(mean_policy([policy], margin)), []
     for mission, judge in judges.items():
         verdict = judge(supervisor, first)
