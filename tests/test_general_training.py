@@ -178,6 +178,21 @@ def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
     assert (outcome.action == COLUMN_ACTION).all() and (taken == COLUMN_ACTION).all()
 
 
+def test_the_whole_team_pays_for_an_agent_that_is_late() -> None:
+    """Who is out of its slot's tolerance at the end of the mission; before the end nobody pays."""
+    squads = [GeneralTrainer(replace(SMALL, late_cost=cost)).squads[0] for cost in (0.0, 7.0)]
+    actions = np.full((2, 4), FORMATION)
+    actions[0, 2] = COLUMN_ACTION
+    for squad in squads:
+        squad.end[:] = 10**6
+    for finish, paid in (*((10**6, 0.0),) * 6, (0, 7.0)):
+        rewards = []
+        for squad in squads:
+            squad.finish = finish
+            rewards.append(squad.step(actions).reward)
+        np.testing.assert_allclose(rewards[0] - rewards[1], [[paid] * 4, [0.0] * 4], atol=1e-5)
+
+
 def test_where_agents_decide_about_avoidance_who_comes_too_close_pays() -> None:
     """At any mission step of a decision; with the cost and without it, the rest of the reward is the same."""
     config = replace(SMALL, composition="null-space", lossy=0.0, violation_cost=7.0)

@@ -47,8 +47,8 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
     in force, negative for none. Outputs are ``values`` (batch, A) and ``action`` (batch,): 0 formation, 1 column; of a policy
     that decides about avoidance, too, 2 and 3 are the same with avoidance on top. The metadata are ``layout`` (JSON, what the
-    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions``, ``margin`` and ``dwell`` (decisions that
-    an agent keeps a new order for, told by the order's age among its features).
+    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions``, ``margin`` and ``dwell`` (decisions
+    that an agent keeps a new order for, told by the order's age among its features).
 
     Args:
         checkpoint: the checkpoint's file.

@@ -43,7 +43,10 @@ class Sensed(NamedTuple):
 
 
 class GeneralPolicy(NamedTuple):
-    """Dueling networks that all agents share, with a switching margin and a dwell time. Its values are the mean of the networks'."""
+    """Dueling networks that all agents share, with a switching margin and a dwell time.
+
+    The policy's values are the mean of the networks'.
+    """
 
     network: Policy  # of one or more networks, INPUTS wide, with A action values
     dwell: int = 1  # decisions that an agent keeps a new order for, at least

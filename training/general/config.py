@@ -1,5 +1,6 @@
 """Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -93,6 +94,9 @@ class GeneralConfig:
     """Transitions of single agents per update."""
     updates: Annotated[int, AT_LEAST_ONE] = 8
     """Updates after each decision of all worlds."""
+    huber: Annotated[float, POSITIVE] = math.inf
+    """TD errors count squared up to this and linearly beyond. What is paid at the end of a mission is rare and large, and all
+    values before rest on it: at 1 it counts too little to hold them."""
     capacity: Annotated[int, AT_LEAST_ONE] = 400_000
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
@@ -118,7 +122,7 @@ class GeneralConfig:
     stray_cost: Annotated[float, NOT_NEGATIVE] = 0.3
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
     late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
-    """Cost of an agent that is out of its slot's tolerance when the mission ends."""
+    """Cost, for every agent, of a mission at whose end one is out of its slot's tolerance."""
     violation_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that comes within the safe distance of an obstacle during a decision, under the null-space composition."""
     switching_margin: float = 0.15
@@ -192,6 +196,7 @@ def learner_config(config: GeneralConfig) -> TrainConfig:
         worlds=config.worlds,
         hidden=config.hidden,
         copies=config.copies,
+        huber=config.huber,
         push_every=config.push_every,
         learning_rate=config.learning_rate,
         final_learning_rate=config.final_learning_rate,

@@ -124,7 +124,7 @@ class Squad:
         final = self._exchange()
         reward = team[:, None] - config.switch_cost * switched - config.stray_cost * final[..., WAYS + 1]
         over = self.world.state.steps >= self.finish
-        reward -= config.late_cost * (over[:, None] & self._late(final))
+        reward -= config.late_cost * (over & self._late(final).any(axis=1))[:, None]
         reward -= config.violation_cost * violated
         lost = self._lost(final)
         reward[lost] = -(1.0 + config.stray_cost) / (1.0 - config.gamma)
