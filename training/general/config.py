@@ -1,6 +1,5 @@
 """Configuration of a training run of the general policy: one frozen dataclass, and the parts that learner and exploration use."""
 
-import math
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -94,7 +93,7 @@ class GeneralConfig:
     """Transitions of single agents per update."""
     updates: Annotated[int, AT_LEAST_ONE] = 8
     """Updates after each decision of all worlds."""
-    huber: Annotated[float, POSITIVE] = math.inf
+    huber: Annotated[float, POSITIVE] = 5.0
     """TD errors count squared up to this and linearly beyond. What is paid at the end of a mission is rare and large, and all
     values before rest on it: at 1 it counts too little to hold them."""
     capacity: Annotated[int, AT_LEAST_ONE] = 400_000
@@ -121,7 +120,7 @@ class GeneralConfig:
     """Cost of an agent's own switch; a decision in formation costs nothing, in column 0.5, in neither 1."""
     stray_cost: Annotated[float, NOT_NEGATIVE] = 0.3
     """Cost of an agent's own distance e from its slot in the formation, times tanh(e / 5 d_OA)."""
-    late_cost: Annotated[float, NOT_NEGATIVE] = 20.0
+    late_cost: Annotated[float, NOT_NEGATIVE] = 5.0
     """Cost, for every agent, of a mission at whose end one is out of its slot's tolerance."""
     violation_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that comes within the safe distance of an obstacle during a decision, under the null-space composition."""
