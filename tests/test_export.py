@@ -10,8 +10,8 @@ import pytest
 
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
-from marlbc_mj.policies.general import Sensed, read_general
-from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, join_inputs
+from marlbc_mj.policies.general import Sensed, read_general, write_general
+from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, WAYS, join_inputs
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.policies.states import make_state
@@ -98,15 +98,18 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     assert (orders == greedy(expected, last, fresh, policy.margin)).mean() > 0.999
 
 
-def test_the_general_policy_is_exported_as_it_decides(tmp_path):
+@pytest.mark.parametrize("flown", [{"dwell": 1, "deadline": 0.0}, {"dwell": 3, "deadline": 1.0}])
+def test_the_general_policy_is_exported_as_it_decides(flown, tmp_path):
     """One graph for every size of team; agents that have heard nothing of some others, and agents alone."""
-    policy, _ = read_general(shipped("marlms-general"))
-    out, rng = tmp_path / "agent.onnx", np.random.default_rng(3)
-    main(["export", str(shipped("marlms-general")), str(out)])
+    policy = read_general(shipped("marlms-general"))[0]._replace(**flown)
+    checkpoint, out, rng = tmp_path / "agent.safetensors", tmp_path / "agent.onnx", np.random.default_rng(3)
+    write_general(checkpoint, policy, {})
+    main(["export", str(checkpoint), str(out)])
     session = session_of(out)
     assert json.loads(session.get_modelmeta().custom_metadata_map["layout"]) == INPUT_LAYOUT
     for teams, agents in ((1, 4), (7, 9), (2, 1)):
         features = rng.normal(size=(teams, agents, FEATURES)).astype(np.float32)
+        features[..., WAYS:] = rng.uniform(0.0, 1.0, size=features[..., WAYS:].shape)
         heard = rng.normal(size=(teams, agents, agents, SENT)).astype(np.float32)
         age = np.where(rng.random((teams, agents, agents)) < 0.3, np.inf, rng.uniform(0.0, 5.0, (teams, agents, agents)))
         last, fresh = rng.integers(2, size=(teams, agents)), np.arange(teams) % 2 == 1

@@ -17,6 +17,7 @@ from marlbc_mj.policies.general import (
     Sensed,
     make_general,
     mean_policy,
+    must_return,
     orders_for,
     read_general,
     write_general,
@@ -27,11 +28,11 @@ from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import ConfigurationError
 
 
-def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2, dwell: int = 1) -> GeneralPolicy:
+def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2, **flown) -> GeneralPolicy:
     rng = np.random.default_rng(seed)
     sizes = [(inputs.INPUTS, 16), (16, 1 + actions)]
     weights = tuple(rng.normal(size=(1, *size)).astype(np.float32) for size in sizes)
-    return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin, dwell)
+    return make_general(weights, tuple(np.zeros((1, 1, b), dtype=np.float32) for _, b in sizes), margin)._replace(**flown)
 
 
 def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
@@ -158,6 +159,30 @@ def test_a_new_order_is_kept_for_the_dwell(dwell: int) -> None:
     assert min(first) == memory.interval
 
 
+@given(st.floats(0.0, 30.0), st.floats(0.05, 60.0), st.floats(0.2, 3.0))
+def test_an_agent_returns_when_its_way_takes_the_time_left(distance: float, left: float, deadline: float) -> None:
+    """In the units of the features, whose entries saturate; farther than 36 d_OA counts as 36."""
+    if abs(left / (deadline * distance + 1e-9) - 1.0) > 1e-2:
+        e, t = np.float32(np.tanh(distance / inputs.COARSE)), np.float32(np.exp(-left / inputs.COARSEST))
+        assert must_return(e, t, deadline) == (left < deadline * distance)
+    assert not must_return(np.float32(1.0), np.float32(np.exp(-40.0 / inputs.COARSEST)), 1.0)
+    assert must_return(np.float32(1.0), np.float32(np.exp(-30.0 / inputs.COARSEST)), 1.0)
+
+
+@pytest.mark.parametrize("actions", [2, 4])
+def test_the_deadline_brings_everybody_into_formation(actions: int) -> None:
+    """In the last decision, whatever the networks say; avoidance stays as it is, and without a deadline nothing is forced."""
+    rng = np.random.default_rng(0)
+    features = rng.uniform(0.1, 0.9, size=(20, 4, inputs.FEATURES)).astype(np.float32)
+    features[10:, :, inputs.ENDING + 1], features[:10, :, inputs.ENDING + 1] = 1.0, 1e-3
+    now = Sensed(features, np.zeros((20, 4), np.int64), np.ones(20, dtype=bool))
+    heard, age = features[:, None, :, : inputs.SENT], np.zeros((20, 1, 4))
+    free, bound = (random_policy(1, actions=actions, deadline=d).decide(now, heard, age) for d in (0.0, 1.0))
+    np.testing.assert_array_equal(bound[:10], free[:10])
+    np.testing.assert_array_equal(bound[10:], free[10:] - free[10:] % 2)
+    assert (free[10:] % 2 == 1).any()
+
+
 @pytest.mark.parametrize(("formation", "agents"), [("line", 2), ("grid", 9), ("circle", 32)])
 def test_one_policy_flies_teams_of_any_size(formation: str, agents: int) -> None:
     scenario = make_scenario("open", composition="set-based", formation=formation, agents=agents, duration=1.0)
@@ -253,12 +278,12 @@ def test_a_formation_that_is_its_own_column_is_refused() -> None:
 
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
-    policy, path = random_policy(margin=0.25, dwell=4), tmp_path / "general.safetensors"
+    policy, path = random_policy(margin=0.25, dwell=4, deadline=0.5), tmp_path / "general.safetensors"
     write_general(path, policy, {"note": "x"})
     read, description = read_general(path)
     for one, other in zip(policy.network.weights, read.network.weights, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert (read.network.margin, read.dwell, description["note"]) == (0.25, 4, "x")
+    assert (read.network.margin, read.dwell, read.deadline, description["note"]) == (0.25, 4, 0.5, "x")
     assert isinstance(make_supervisor(str(path)), General)
     assert path.stat().st_size < 1_000_000
 
@@ -271,6 +296,7 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
         ({"kind": "team"}, {}, "not hold a general policy"),
         ({"margin": None}, {}, "does not hold the network"),
         ({"dwell": 0}, {}, "its dwell is 0 decisions"),
+        ({"deadline": -1.0}, {}, "its deadline -1.0"),
         ({}, {"weight0": np.zeros((1, 7, 16), np.float32)}, "7, 16"),
         ({}, {"weight1": np.full((1, 16, 3), np.nan, np.float32)}, "not finite"),
         ({}, {"weight1": np.zeros((1, 16, 4), np.float32), "bias1": np.zeros((1, 1, 4), np.float32)}, "2 or 4 advantages"),

@@ -62,7 +62,8 @@ def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.
     mean = np.mean([random_policy(k).values(seen) for k in range(3)], axis=0)
     np.testing.assert_allclose(policy.values(seen), mean, rtol=1e-4, atol=1e-4)
     assert policy.network.margin == np.float32(GeneralConfig().switching_margin) and len(description["mean_of"]) == 3
-    assert policy.dwell == GeneralConfig().dwell and "at least 3 decisions" in (tmp_path / "mine.md").read_text()
+    assert (policy.dwell, policy.deadline) == (GeneralConfig().dwell, GeneralConfig().deadline)
+    assert "at least 3 decisions" in (tmp_path / "mine.md").read_text()
 
 
 @pytest.mark.parametrize(
@@ -135,9 +136,10 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
 
 def test_only_where_the_composition_avoids_there_is_a_dwell_time() -> None:
     """Where agents decide about avoidance, it must come at once."""
-    config = replace(SMALL, dwell=5)
-    assert GeneralTrainer(config).policy().dwell == 5
-    assert GeneralTrainer(replace(config, composition="null-space")).policy().dwell == 1
+    config = replace(SMALL, dwell=5, deadline=0.75)
+    for composition, dwell in (("set-based", 5), ("null-space", 1)):
+        policy = GeneralTrainer(replace(config, composition=composition)).policy()
+        assert (policy.dwell, policy.deadline) == (dwell, 0.75)
 
 
 def test_a_stopped_run_goes_on_bit_for_bit(

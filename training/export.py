@@ -18,8 +18,17 @@ from torch import Tensor, nn
 
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
-from marlbc_mj.policies.general import INTERVAL, GeneralPolicy, is_general, least_age, may_change, read_general
-from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
+from marlbc_mj.policies.general import (
+    INTERVAL,
+    MOTIONS,
+    GeneralPolicy,
+    is_general,
+    least_age,
+    may_change,
+    must_return,
+    read_general,
+)
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, ENDING, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
@@ -47,8 +56,9 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
     agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
     in force, negative for none. Outputs are ``values`` (batch, A) and ``action`` (batch,): 0 formation, 1 column; of a policy
     that decides about avoidance, too, 2 and 3 are the same with avoidance on top. The metadata are ``layout`` (JSON, what the
-    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions``, ``margin`` and ``dwell`` (decisions
-    that an agent keeps a new order for, told by the order's age among its features).
+    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions``, ``margin``, ``dwell`` (decisions that
+    an agent keeps a new order for, told by the order's age among its features) and ``deadline``, see
+    :class:`~marlbc_mj.policies.general.GeneralPolicy`.
 
     Args:
         checkpoint: the checkpoint's file.
@@ -97,6 +107,7 @@ def _general_model(checkpoint: Path) -> tuple[Any, str]:
         "actions": json.dumps(["formation", "column", "avoid, formation", "avoid, column"][: policy.actions]),
         "margin": repr(policy.network.margin),
         "dwell": repr(policy.dwell),
+        "deadline": repr(policy.deadline),
     }
     return build_general(policy, metadata), (
         f"features (batch, {FEATURES}), heard (batch, agents, {SENT}), age (batch, agents) and last (batch,) give "
@@ -172,7 +183,7 @@ class AgentPolicy(nn.Module):
     def __init__(self, policy: GeneralPolicy) -> None:
         super().__init__()
         self.network, self.margin = _as_modules(policy.network), policy.network.margin
-        self.least_age = least_age(policy.dwell)
+        self.least_age, self.deadline = least_age(policy.dwell), policy.deadline
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
         """Values (B, A) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
@@ -182,7 +193,11 @@ class AgentPolicy(nn.Module):
         mean = values.mean(dim=0)
         kept, fresh = last.clamp(min=0), last < 0
         free = may_change(features[:, AGE_ENTRIES], fresh, self.least_age)
-        return mean, torch.where(free, _choose(mean, kept, fresh, self.margin), kept)
+        chosen = torch.where(free, _choose(mean, kept, fresh, self.margin), kept)
+        if self.deadline:
+            late = must_return(features[:, WAYS + 1], features[:, ENDING + 1], self.deadline)
+            chosen = torch.where(late, chosen - chosen % len(MOTIONS), chosen)
+        return mean, chosen
 
 
 def pool(heard: Tensor, age: Tensor) -> Tensor:

@@ -13,7 +13,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, INPUT_LAYOUT, INPUTS, SENT, Sight, join_inputs
+from marlbc_mj.policies.general_inputs import (
+    AGE_ENTRIES,
+    COARSE,
+    COARSEST,
+    ENDING,
+    INPUT_LAYOUT,
+    INPUTS,
+    SENT,
+    WAYS,
+    Sight,
+    join_inputs,
+)
 from marlbc_mj.policies.greedy import Array, Policy, greedy
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
@@ -43,13 +54,14 @@ class Sensed(NamedTuple):
 
 
 class GeneralPolicy(NamedTuple):
-    """Dueling networks that all agents share, with a switching margin and a dwell time.
+    """Dueling networks that all agents share, with a switching margin, a dwell time and a deadline.
 
     The policy's values are the mean of the networks'.
     """
 
     network: Policy  # of one or more networks, INPUTS wide, with A action values
     dwell: int = 1  # decisions that an agent keeps a new order for, at least
+    deadline: float = 0.0  # time that an agent keeps for its way back to the formation [T per d_OA]; 0: none
 
     @property
     def actions(self) -> int:
@@ -67,7 +79,7 @@ class GeneralPolicy(NamedTuple):
 
     def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
         """(B, N) actions: the better one if its value leads by more than the margin and the agent :func:`may_change`, else the
-        one in force.
+        one in force; in formation where an agent :func:`must_return`.
 
         Args:
             sensed: by each agent.
@@ -78,7 +90,11 @@ class GeneralPolicy(NamedTuple):
         values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
         chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
         free = may_change(sensed.features[..., AGE_ENTRIES], sensed.fresh[:, None], least_age(self.dwell))
-        return np.where(free, chosen, sensed.last)
+        chosen = np.where(free, chosen, sensed.last)
+        if not self.deadline:
+            return chosen
+        late = must_return(sensed.features[..., WAYS + 1], sensed.features[..., ENDING + 1], self.deadline)
+        return np.where(late, chosen - chosen % len(MOTIONS), chosen)
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
         """(M, A) action values for inputs (M, S), one row per agent."""
@@ -104,6 +120,20 @@ def may_change(age: Array, fresh: Array, least: float) -> Array:
         least: see :func:`least_age`.
     """
     result: Array = (age >= least) | fresh
+    return result
+
+
+def must_return(distance: Array, ending: Array, deadline: float) -> Array:
+    """Bool: whether the time that is left of the mission is at most ``deadline`` times an agent's distance from its slot in the
+    formation, in settling times per d_OA. At full speed a settling time is more than a d_OA takes. A distance of 36 d_OA and more
+    counts as 36.
+
+    Args:
+        distance: tanh(e / COARSE), e the distance [d_OA]: entry WAYS + 1 of the agent's features.
+        ending: exp(-t / COARSEST), t the time left [T]: entry ENDING + 1.
+        deadline: see :class:`GeneralPolicy`; positive.
+    """
+    result: Array = (1.0 - distance).clip(1e-6) <= (1.0 + distance) * ending ** (2.0 * COARSEST / (COARSE * deadline))
     return result
 
 
@@ -141,14 +171,8 @@ def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]
     """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
     network = policy.network
     arrays = {f"weight{k}": w for k, w in enumerate(network.weights)} | {f"bias{k}": b for k, b in enumerate(network.biases)}
-    said = {
-        **description,
-        "kind": KIND,
-        "layout": INPUT_LAYOUT,
-        "interval": INTERVAL,
-        "margin": network.margin,
-        "dwell": policy.dwell,
-    }
+    flown = {"margin": network.margin, "dwell": policy.dwell, "deadline": policy.deadline}
+    said = {**description, "kind": KIND, "layout": INPUT_LAYOUT, "interval": INTERVAL, **flown}
     write_arrays(path, arrays, said)
     write_json(path.with_suffix(".json"), said)
 
@@ -182,21 +206,27 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
         weights = tuple(arrays[f"weight{k}"] for k in range(layers))
         biases = tuple(arrays[f"bias{k}"] for k in range(layers))
         margin, dwell = float(description["margin"]), int(description.get("dwell", 1))
+        deadline = float(description.get("deadline", 0.0))
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy") from None
-    fault = _network_fault(weights, biases, margin) or ("" if dwell >= 1 else f"its dwell is {dwell} decisions")
+    fault = _network_fault(weights, biases, margin)
+    if dwell < 1 or not 0.0 <= deadline < math.inf:
+        fault = fault or f"its dwell is {dwell} decisions, its deadline {deadline}"
     if fault:
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy: {fault}")
-    return make_general(weights, biases, margin, dwell), description
+    return make_general(weights, biases, margin)._replace(dwell=dwell, deadline=deadline), description
 
 
-def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float, dwell: int = 1) -> GeneralPolicy:
-    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers; the last gives 1 + A."""
-    return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin), dwell)
+def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
+    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers; the last gives 1 + A.
+
+    It has no dwell time and no deadline.
+    """
+    return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
 
 
-def mean_policy(policies: Sequence[GeneralPolicy], margin: float, dwell: int = 1) -> GeneralPolicy:
-    """One policy whose values are the mean of those of others.
+def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
+    """One policy whose values are the mean of those of others; it has no dwell time and no deadline.
 
     Raises:
         ConfigurationError: no policies, or networks of different sizes.
@@ -207,7 +237,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float, dwell: int = 1
         raise ConfigurationError(f"a mean takes at least one policy, and networks of the same size; these have {sorted(sizes)}")
     weights = (np.concatenate(layers) for layers in zip(*(network.weights for network in networks), strict=True))
     biases = (np.concatenate(layers) for layers in zip(*(network.biases for network in networks), strict=True))
-    return make_general(tuple(weights), tuple(biases), margin, dwell)
+    return make_general(tuple(weights), tuple(biases), margin)
 
 
 def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
+from marlbc_mj.policies.general import GeneralPolicy
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES, SENT
 from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
@@ -129,6 +130,8 @@ class GeneralConfig:
     dwell: Annotated[int, AT_LEAST_ONE] = 3
     """Decisions that an agent keeps a new order for, at least, in flight; not while it learns, nor under the null-space
     composition, where avoidance must come at once."""
+    deadline: Annotated[float, NOT_NEGATIVE] = 1.0
+    """In flight an agent goes back to the formation when so many settling times are left for every d_OA of its way; 0: never."""
     hide: tuple[str, ...] = ()
     """Inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
     ppo: PPO = GENERAL_PPO
@@ -179,9 +182,9 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
     }
 
 
-def flown_dwell(composition: str, dwell: int = GeneralConfig.dwell) -> int:
-    """The dwell time of a policy in flight [decisions], of the setting ``dwell``."""
-    return dwell if composition == "set-based" else 1
+def as_flown(policy: GeneralPolicy, config: GeneralConfig) -> GeneralPolicy:
+    """A policy with the dwell time and the deadline of a configuration."""
+    return policy._replace(dwell=config.dwell if policy.composition == "set-based" else 1, deadline=config.deadline)
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:

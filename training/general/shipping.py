@@ -12,7 +12,7 @@ from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, SENT
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
 from marlbc_mj.training.config import flat_settings
-from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig, flown_dwell
+from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig, as_flown
 from marlbc_mj.training.ship import put_in_package
 from marlbc_mj.util.files import check_target, staged_file
 from marlbc_mj.util.provenance import plain_data, provenance
@@ -52,9 +52,8 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
         ConfigurationError: a damaged checkpoint, networks that have no mean, or a file that may not be replaced.
     """
     parts = [read_general(path) for path in checkpoints]
-    policies = [part for part, _ in parts]
-    policy = mean_policy(policies, GeneralConfig.switching_margin)
-    policy = policy._replace(dwell=flown_dwell(policy.composition))
+    config = GeneralConfig()
+    policy = as_flown(mean_policy([part for part, _ in parts], config.switching_margin), config)
     target = folder / f"{name}.safetensors"
     check_target(target, overwrite=overwrite)
     runs = [{key: part[key] for key in ("train", "evaluation", "git_revision")} for _, part in parts]
@@ -96,7 +95,12 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
         + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
         "",
         f"An agent leaves its order only for one whose value is higher by more than {policy.network.margin:g}"
-        + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else "."),
+        + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else ".")
+        + (
+            f" It goes back to the formation when {policy.deadline:g} settling times are left for each safe distance of its way."
+            if policy.deadline
+            else ""
+        ),
         "",
         pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
     ]

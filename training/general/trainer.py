@@ -13,7 +13,7 @@ from marlbc_mj.training.base import check_device, prefixed, single_thread, unpre
 from marlbc_mj.training.general.config import (
     TEAM_ERRORS,
     GeneralConfig,
-    flown_dwell,
+    as_flown,
     input_mask,
     learner_config,
     training_scenarios,
@@ -193,5 +193,4 @@ class GeneralTrainer:
         network = self.flown
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
-        dwell = flown_dwell(self.config.composition, self.config.dwell)
-        return make_general(weights, biases, self.config.switching_margin, dwell)
+        return as_flown(make_general(weights, biases, self.config.switching_margin), self.config)
