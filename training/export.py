@@ -23,12 +23,11 @@ from marlbc_mj.policies.general import (
     MOTIONS,
     GeneralPolicy,
     is_general,
-    least_age,
     may_change,
     must_return,
     read_general,
 )
-from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, ENDING, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
@@ -183,7 +182,7 @@ class AgentPolicy(nn.Module):
     def __init__(self, policy: GeneralPolicy) -> None:
         super().__init__()
         self.network, self.margin = _as_modules(policy.network), policy.network.margin
-        self.least_age, self.deadline = least_age(policy.dwell), policy.deadline
+        self.dwell, self.deadline = policy.dwell, policy.deadline
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
         """Values (B, A) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
@@ -192,11 +191,9 @@ class AgentPolicy(nn.Module):
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
         mean = values.mean(dim=0)
         kept, fresh = last.clamp(min=0), last < 0
-        free = may_change(features[:, AGE_ENTRIES], fresh, self.least_age)
-        chosen = torch.where(free, _choose(mean, kept, fresh, self.margin), kept)
+        chosen = torch.where(may_change(features, fresh, self.dwell), _choose(mean, kept, fresh, self.margin), kept)
         if self.deadline:
-            late = must_return(features[:, WAYS + 1], features[:, ENDING + 1], self.deadline)
-            chosen = torch.where(late, chosen - chosen % len(MOTIONS), chosen)
+            chosen = torch.where(must_return(features, self.deadline), chosen - chosen % len(MOTIONS), chosen)
         return mean, chosen
 
 

@@ -89,12 +89,10 @@ class GeneralPolicy(NamedTuple):
         inputs = join_inputs(sensed.features, heard, age)
         values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
         chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
-        free = may_change(sensed.features[..., AGE_ENTRIES], sensed.fresh[:, None], least_age(self.dwell))
-        chosen = np.where(free, chosen, sensed.last)
+        chosen = np.where(may_change(sensed.features, sensed.fresh[:, None], self.dwell), chosen, sensed.last)
         if not self.deadline:
             return chosen
-        late = must_return(sensed.features[..., WAYS + 1], sensed.features[..., ENDING + 1], self.deadline)
-        return np.where(late, chosen - chosen % len(MOTIONS), chosen)
+        return np.where(must_return(sensed.features, self.deadline), chosen - chosen % len(MOTIONS), chosen)
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
         """(M, A) action values for inputs (M, S), one row per agent."""
@@ -102,37 +100,33 @@ class GeneralPolicy(NamedTuple):
         return values
 
 
-def least_age(dwell: int) -> float:
-    """Entry AGE_ENTRIES of the features from which an order is ``dwell`` decisions old; 0 for one, which every order is.
+def may_change(features: Array, fresh: Array, dwell: int) -> Array:
+    """Bool (...,): whether an agent may leave its order.
 
-    It stands for an age half a decision less, as the time of a decision is rounded to mission steps.
-    """
-    return -math.expm1(-(dwell - 0.5) * INTERVAL / COARSE) if dwell > 1 else 0.0
-
-
-def may_change(age: Array, fresh: Array, least: float) -> Array:
-    """Bool: whether an agent may leave its order. Who may do so at once can dither between two orders close to an obstacle, where
-    the references jump and the tracking error ends in a violation; a dwell time bounds that (Hespanha and Morse 1999).
+    Who may do so at once can dither between two orders close to an obstacle, where the references jump and the tracking error
+    ends in a violation; a dwell time bounds that (Hespanha and Morse 1999).
 
     Args:
-        age: entry AGE_ENTRIES of the agent's features.
-        fresh: whether no order is in force yet.
-        least: see :func:`least_age`.
+        features: (..., F) of the agents.
+        fresh: (...,) bool, whether no order is in force yet.
+        dwell: decisions that an order must be old, less a half, as the time of a decision is rounded to mission steps.
     """
-    result: Array = (age >= least) | fresh
+    least = -math.expm1(-(dwell - 0.5) * INTERVAL / COARSE) if dwell > 1 else 0.0
+    result: Array = (features[..., AGE_ENTRIES] >= least) | fresh
     return result
 
 
-def must_return(distance: Array, ending: Array, deadline: float) -> Array:
-    """Bool: whether the time that is left of the mission is at most ``deadline`` times an agent's distance from its slot in the
-    formation, in settling times per d_OA. At full speed a settling time is more than a d_OA takes. A distance of 36 d_OA and more
-    counts as 36.
+def must_return(features: Array, deadline: float) -> Array:
+    """Bool (...,): whether the time left is at most ``deadline`` times an agent's distance from its slot in the formation.
+
+    The time counts in settling times, of which one is more than a d_OA takes at full speed, the distance in d_OA; 36 and more
+    count as 36.
 
     Args:
-        distance: tanh(e / COARSE), e the distance [d_OA]: entry WAYS + 1 of the agent's features.
-        ending: exp(-t / COARSEST), t the time left [T]: entry ENDING + 1.
+        features: (..., F) of the agents.
         deadline: see :class:`GeneralPolicy`; positive.
     """
+    distance, ending = features[..., WAYS + 1], features[..., ENDING + 1]  # tanh(e / COARSE), exp(-t / COARSEST)
     result: Array = (1.0 - distance).clip(1e-6) <= (1.0 + distance) * ending ** (2.0 * COARSEST / (COARSE * deadline))
     return result
 
@@ -209,12 +203,11 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
         deadline = float(description.get("deadline", 0.0))
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy") from None
-    fault = _network_fault(weights, biases, margin)
-    if dwell < 1 or not 0.0 <= deadline < math.inf:
-        fault = fault or f"its dwell is {dwell} decisions, its deadline {deadline}"
+    policy = make_general(weights, biases, margin)._replace(dwell=dwell, deadline=deadline)
+    fault = _fault(policy)
     if fault:
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy: {fault}")
-    return make_general(weights, biases, margin)._replace(dwell=dwell, deadline=deadline), description
+    return policy, description
 
 
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
@@ -240,8 +233,9 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
     return make_general(tuple(weights), tuple(biases), margin)
 
 
-def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> str:
-    """The reason why arrays are no network for a general policy; empty if they are one."""
+def _fault(policy: GeneralPolicy) -> str:
+    """The reason why what was read is no general policy; empty if it is one."""
+    weights, biases, margin = policy.network.weights, policy.network.biases, policy.network.margin
     width, count = INPUTS, len(biases[0]) if biases and biases[0].ndim else 1
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if weight.dtype != np.float32 or bias.dtype != np.float32 or weight.ndim != 3:
@@ -253,4 +247,6 @@ def _network_fault(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ..
         width = weight.shape[2]
     if not weights or width - 1 not in ACTIONS_UNDER.values():
         return f"its {width} outputs are not a value and {' or '.join(map(str, ACTIONS_UNDER.values()))} advantages"
+    if policy.dwell < 1 or not 0.0 <= policy.deadline < math.inf:
+        return f"its dwell is {policy.dwell} decisions, its deadline {policy.deadline}"
     return "" if np.isfinite(margin) else f"its margin is {margin}"

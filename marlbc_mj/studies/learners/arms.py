@@ -2,7 +2,7 @@
 
 Values of different learners have different scales, so that one switching margin for all would favor some. Every training's policy
 flies with that of MARGINS with which it succeeds most on a few validation layouts, which no result is taken from. There is no
-dwell time, so that dithering shows.
+dwell time and no deadline, so that what was learned shows.
 """
 
 from collections.abc import Mapping, Sequence
