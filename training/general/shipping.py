@@ -91,13 +91,14 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
         f"# {name}",
         "",
         f"{_what(runs[0]['train'])} Its action values are the mean of those of {len(runs)} networks, each trained by a command "
-        "of its own"
+        "of its own, at the revision beside it"
         + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
         "",
         f"An agent leaves its order only for one whose value is higher by more than {policy.network.margin:g}"
         + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else ".")
         + (
-            f" It goes back to the formation when {policy.deadline:g} settling times are left for each safe distance of its way."
+            " It goes back to the formation when the time left, in settling times, is at most "
+            f"{policy.deadline:g} times its way, in safe distances."
             if policy.deadline
             else ""
         ),
