@@ -175,19 +175,37 @@ def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
         heard: (B, R, N, M) last vectors heard of each sender.
         age: (B, R, N) how old they are [T]; infinite where nothing was heard.
     """
-    known = np.isfinite(age)[..., None]
-    count = np.maximum(known.sum(axis=2), 1)
-    counted = heard.copy()
-    np.less(heard[..., :WAYS], 0.0, out=counted[..., :WAYS])
-    changing = slice(WAYS, AGE_ENTRIES + 2)
-    parts = (
-        np.where(known, heard, np.float32(MOST_BEYOND)).min(axis=2),
-        np.where(known, counted, np.float32(0.0)).sum(axis=2) / count,
-        np.where(known, heard[..., changing], np.float32(0.0)).max(axis=2),
-        count / heard.shape[2],
-        1.0 - np.exp(-np.where(known, age[..., None], 0.0).max(axis=2) / COARSE),
-    )
-    return np.concatenate(parts, axis=-1, dtype=np.float32)
+    pooled = np.empty((*heard.shape[:2], POOLED), dtype=np.float32)
+    _fill_pooled(np.ascontiguousarray(heard, dtype=np.float32), np.ascontiguousarray(age), pooled)
+    return pooled
+
+
+@compiled
+def _fill_pooled(heard, age, pooled):
+    """:func:`pool_heard` into ``pooled`` (B, R, POOLED)."""
+    changing = AGE_ENTRIES + 2 - WAYS
+    senders = heard.shape[2]
+    for b in range(heard.shape[0]):
+        for r in range(heard.shape[1]):
+            row = pooled[b, r]
+            least, total, most = row[:SENT], row[SENT : 2 * SENT], row[2 * SENT : 2 * SENT + changing]
+            least[:], total[:], most[:] = np.inf, 0.0, -np.inf
+            count, oldest = 0, 0.0
+            for s in range(senders):
+                known = np.isfinite(age[b, r, s])
+                if known:
+                    count, oldest = count + 1, max(oldest, age[b, r, s])
+                for j in range(SENT):
+                    entry = heard[b, r, s, j]
+                    least[j] = min(least[j], entry if known else np.float32(MOST_BEYOND))
+                    if known:
+                        total[j] += entry if j >= WAYS else np.float32(entry < 0.0)
+                for j in range(changing):
+                    most[j] = max(most[j], heard[b, r, s, WAYS + j] if known else np.float32(0.0))
+            for j in range(SENT):
+                total[j] /= max(count, 1)
+            row[2 * SENT + changing] = max(count, 1) / senders
+            row[2 * SENT + changing + 1] = 1.0 - np.exp(-oldest / COARSE)
 
 
 def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:

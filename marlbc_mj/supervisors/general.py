@@ -85,7 +85,7 @@ class General:
 
     def _decide_due(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
         """The memory with new actions of the teams ``due`` (B,), everybody heard at once."""
-        seen = Observation(*(field[due] for field in observation))
+        seen = observation if due.all() else Observation(*(field[due] for field in observation))
         features = sense_features(seen, memory.sight)
         sent = self.policy.messages(features)
         heard, age = sent[:, None], np.zeros((len(sent), 1, sent.shape[1]))

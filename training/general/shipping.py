@@ -91,8 +91,9 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
         f"# {name}",
         "",
         f"{_what(runs[0]['train'])} Its action values are the mean of those of {len(runs)} networks, each trained by a command "
-        "of its own, at the revision beside it"
-        + ("; a file named in `start` is the checkpoint of another run." if any(run["train"]["start"] for run in runs) else "."),
+        "of its own at the revision beside it"
+        + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
+        + ". Commands name the settings that differ from the defaults of today; the header of the checkpoint has all of them.",
         "",
         f"An agent leaves its order only for one whose value is higher by more than {policy.network.margin:g}"
         + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else ".")
