@@ -43,9 +43,12 @@ def test_features_have_no_scale(length: float, time: float, moving: bool) -> Non
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000))
 def test_a_lane_is_the_least_clearance_in_every_bin(seed: int) -> None:
-    """Against a thousand samples per bin."""
+    """Against a thousand samples per bin, obstacles near and far."""
     rng, sight = np.random.default_rng(seed), sight_of(1.5, 0.7)
-    obstacles = np.concatenate([rng.uniform(-15.0, 15.0, (5, 2)), rng.uniform(0.0, 2.0, (5, 1)), rng.normal(size=(5, 2))], axis=1)
+    reach = rng.choice((15.0, 50.0))
+    obstacles = np.concatenate(
+        [rng.uniform(-reach, reach, (9, 2)), rng.uniform(0.0, 2.0, (9, 1)), rng.normal(size=(9, 2))], axis=1
+    )
     slot, lane = rng.normal(scale=3.0, size=2), np.empty(inputs.LANE_BINS)
     inputs.fill_lane(slot, sight, obstacles, lane)
     for k in range(inputs.LANE_BINS):
@@ -53,6 +56,19 @@ def test_a_lane_is_the_least_clearance_in_every_bin(seed: int) -> None:
         gap = np.linalg.norm(slot + t * sight.path[1] - obstacles[:, :2] - t * obstacles[:, 3:], axis=-1) - obstacles[:, 2]
         wanted = np.clip(gap.min() / sight.length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
         assert wanted - 1e-3 <= lane[k] + 1e-12 <= wanted + 2e-12
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000))
+def test_a_way_is_the_least_clearance_on_it(seed: int) -> None:
+    """Against a thousand samples, obstacles near and far."""
+    rng, length = np.random.default_rng(seed), 1.5
+    at, slot, reach = rng.normal(scale=5.0, size=2), rng.normal(scale=5.0, size=2), rng.choice((10.0, 30.0))
+    obstacles = np.concatenate([rng.uniform(-reach, reach, (6, 2)), rng.uniform(0.0, 2.0, (6, 1))], axis=1)
+    on_it = at + np.linspace(0.0, 1.0, 1001)[:, None, None] * (slot - at)
+    gap = np.linalg.norm(on_it - obstacles[:, :2], axis=-1) - obstacles[:, 2]
+    wanted = np.clip(gap.min() / length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
+    assert wanted - 1e-3 <= inputs.way_clearance(at, slot, length, obstacles) + 1e-12 <= wanted + 2e-12
 
 
 def test_the_way_to_a_slot_sees_what_is_between() -> None:

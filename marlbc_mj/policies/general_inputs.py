@@ -137,20 +137,23 @@ def fill_lane(slot, sight, obstacles, lane):
     """Profile of the lane of a slot that is at ``slot`` (2,) [m] now, into ``lane`` (LANE_BINS,) [d_OA]."""
     for k in range(LANE_BINS):
         lane[k] = MOST_BEYOND
-    reach = (1.0 + MOST_BEYOND) * sight.length
+    first, last = sight.edges[0], sight.edges[LANE_BINS]
+    middle, half = 0.5 * (first + last), 0.5 * (last - first)
+    way = half * np.sqrt(sight.path[1, 0] ** 2 + sight.path[1, 1] ** 2)
     for o in range(obstacles.shape[0]):
         x, y = slot[0] - obstacles[o, 0], slot[1] - obstacles[o, 1]
-        u, w = sight.path[1, 0], sight.path[1, 1]
+        u, w, length = sight.path[1, 0], sight.path[1, 1], way
         if obstacles.shape[1] > 3:
             u, w = u - obstacles[o, 3], w - obstacles[o, 4]
+            length = half * np.sqrt(u * u + w * w)
+        if _cannot_reach(x + middle * u, y + middle * w, length, obstacles[o, 2], sight.length):
+            continue
         square = u * u + w * w
         when = -(x * u + y * w) / square if square > 0.0 else 0.0
-        aside = np.sqrt((x + when * u) ** 2 + (y + when * w) ** 2)
-        if aside - obstacles[o, 2] >= reach:
-            continue
+        aside = (x + when * u) ** 2 + (y + when * w) ** 2
         for k in range(LANE_BINS):
             t = min(max(when, sight.edges[k]), sight.edges[k + 1])
-            distance = np.sqrt(aside * aside + square * (t - when) ** 2)
+            distance = np.sqrt(aside + square * (t - when) ** 2)
             lane[k] = min(lane[k], _beyond(distance - obstacles[o, 2], sight.length))
 
 
@@ -159,11 +162,20 @@ def way_clearance(p, slot, length, obstacles):
     """Least clearance on the straight way from ``p`` (2,) to ``slot`` (2,) [m] beyond d_OA = ``length`` [m], in d_OA."""
     u, w = slot[0] - p[0], slot[1] - p[1]
     square, least = u * u + w * w, np.inf
+    way = np.sqrt(square)
     for o in range(obstacles.shape[0]):
         x, y = p[0] - obstacles[o, 0], p[1] - obstacles[o, 1]
+        if _cannot_reach(x, y, way, obstacles[o, 2], length):
+            continue
         share = min(max(-(x * u + y * w) / square, 0.0), 1.0) if square > 0.0 else 0.0
         least = min(least, np.sqrt((x + share * u) ** 2 + (y + share * w) ** 2) - obstacles[o, 2])
     return _beyond(least, length)
+
+
+@allocation_free
+def _cannot_reach(x, y, way, radius, length):
+    """Whether an obstacle that is (x, y) [m] away changes no clearance within ``way`` [m], all of which are clipped."""
+    return x * x + y * y > (way + (1.0 + MOST_BEYOND) * length + radius) ** 2
 
 
 def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
