@@ -125,7 +125,7 @@ class GeneralConfig:
     """Cost, for every agent, of a mission at whose end one is out of its slot's tolerance."""
     violation_cost: Annotated[float, NOT_NEGATIVE] = 20.0
     """Cost of an agent that comes within the safe distance of an obstacle during a decision, under the null-space composition."""
-    switching_margin: float = 0.05
+    switching_margin: float = 0.1
     """The policy leaves an order only for one whose value is higher by more than this."""
     dwell: Annotated[int, AT_LEAST_ONE] = 3
     """Decisions that an agent keeps a new order for, at least, in flight; not while it learns, nor under the null-space
