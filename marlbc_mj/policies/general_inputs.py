@@ -139,16 +139,14 @@ def fill_lane(slot, sight, obstacles, lane):
         lane[k] = MOST_BEYOND
     first, last = sight.edges[0], sight.edges[LANE_BINS]
     middle, half = 0.5 * (first + last), 0.5 * (last - first)
-    way = half * np.sqrt(sight.path[1, 0] ** 2 + sight.path[1, 1] ** 2)
     for o in range(obstacles.shape[0]):
         x, y = slot[0] - obstacles[o, 0], slot[1] - obstacles[o, 1]
-        u, w, length = sight.path[1, 0], sight.path[1, 1], way
+        u, w = sight.path[1, 0], sight.path[1, 1]
         if obstacles.shape[1] > 3:
             u, w = u - obstacles[o, 3], w - obstacles[o, 4]
-            length = half * np.sqrt(u * u + w * w)
-        if _cannot_reach(x + middle * u, y + middle * w, length, obstacles[o, 2], sight.length):
-            continue
         square = u * u + w * w
+        if _cannot_reach(x + middle * u, y + middle * w, half * np.sqrt(square), obstacles[o, 2], sight.length):
+            continue
         when = -(x * u + y * w) / square if square > 0.0 else 0.0
         aside = (x + when * u) ** 2 + (y + when * w) ** 2
         for k in range(LANE_BINS):
@@ -204,19 +202,21 @@ def _fill_pooled(heard, age, pooled):
             least[:], total[:], most[:] = np.inf, 0.0, -np.inf
             count, oldest = 0, 0.0
             for s in range(senders):
-                known = np.isfinite(age[b, r, s])
-                if known:
-                    count, oldest = count + 1, max(oldest, age[b, r, s])
+                if not np.isfinite(age[b, r, s]):
+                    continue
+                count, oldest = count + 1, max(oldest, age[b, r, s])
                 for j in range(SENT):
                     entry = heard[b, r, s, j]
-                    least[j] = min(least[j], entry if known else np.float32(MOST_BEYOND))
-                    if known:
-                        total[j] += entry if j >= WAYS else np.float32(entry < 0.0)
+                    least[j] = min(least[j], entry)
+                    total[j] += entry if j >= WAYS else np.float32(entry < 0.0)
                 for j in range(changing):
-                    most[j] = max(most[j], heard[b, r, s, WAYS + j] if known else np.float32(0.0))
+                    most[j] = max(most[j], heard[b, r, s, WAYS + j])
+            if count < senders:  # an agent that was not heard counts as MOST_BEYOND in minima and as 0 in maxima
+                least[:], most[:] = np.minimum(least, np.float32(MOST_BEYOND)), np.maximum(most, np.float32(0.0))
+            count = max(count, 1)
             for j in range(SENT):
-                total[j] /= max(count, 1)
-            row[2 * SENT + changing] = max(count, 1) / senders
+                total[j] /= count
+            row[2 * SENT + changing] = count / senders
             row[2 * SENT + changing + 1] = 1.0 - np.exp(-oldest / COARSE)
 
 
