@@ -1,21 +1,27 @@
-"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; MAPPO; and imitation alone."""
+"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; MAPPO; imitation; distillation."""
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 import torch
+from test_general import random_policy
 
+from marlbc_mj.policies.general import read_general, write_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
 from marlbc_mj.training.general.ppo import PPOTrainer, with_team
 from marlbc_mj.training.general.rivals import Imitation, TeamMixer, TeamReplay, TeamVDN
-from marlbc_mj.training.general.run import make_general_trainer
+from marlbc_mj.training.general.run import make_general_trainer, train_general
+from marlbc_mj.training.general.shipping import ship_general
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.mappo import advantages
 from marlbc_mj.training.methods import PPO
 from marlbc_mj.training.replay import Batch
+from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.provenance import plain_data
 
 SMALL = GeneralConfig(
     families=("gates",), teams=("wedge-4", "line-6"), hidden=(8,), batch=20, updates=1, capacity=400, budget=2_000, learner="vdn"
@@ -149,6 +155,51 @@ def test_imitation_learns_what_the_guide_would_do() -> None:
     for _ in range(200):
         learner.update(batch, 0.01)
     assert (learner.values(state)[:, 0].argmax(axis=1) == shown[:, 0]).all()
+
+
+def test_a_distilled_network_learns_the_values_of_its_teachers(tmp_path: Path) -> None:
+    """The loss by hand; then a batch, learned again and again, has the teachers' leads, whatever its actions and rewards."""
+    paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
+    for k, path in enumerate(paths):
+        write_general(path, random_policy(k), {})
+    config = replace(SMALL, learner="distilled", teachers=tuple(map(str, paths)))
+    learner = GeneralTrainer(config).learner
+    rng = np.random.default_rng(1)
+    state, zeros = rng.normal(size=(30, INPUTS)).astype(np.float32), np.zeros((30, 1), dtype=np.float32)
+    batch = Batch(state, rng.integers(2, size=(30, 1)), rng.normal(size=(30, 1)).astype(np.float32), zeros, state, zeros)
+    wanted = np.mean([random_policy(k).values(state) for k in range(2)], axis=0).astype(np.float64)
+    found = learner.network(torch.from_numpy(state))[0].detach().numpy().astype(np.float64)
+
+    def huber(error: np.ndarray, linear: float) -> np.ndarray:
+        return np.where(abs(error) <= linear, error**2 / 2, linear * (abs(error) - linear / 2))
+
+    lead = (found[:, 1] - found[:, 0] - wanted[:, 1] + wanted[:, 0]) / 2
+    mean = found.mean(axis=1) - wanted.mean(axis=1)
+    loss, error = learner.loss(batch)
+    assert float(loss.detach()) == pytest.approx(2 * huber(lead, 0.25).mean() + 0.01 * huber(mean, 5.0).mean(), rel=1e-4)
+    np.testing.assert_allclose(error[0], abs(lead), rtol=1e-3, atol=1e-4)
+    for _ in range(300):
+        learner.update(batch, 0.01)
+    assert float(learner.loss(batch)[1].mean()) < 0.05 * float(error.mean())
+
+
+def test_teachers_are_told_in_the_header_and_on_the_card(tmp_path: Path) -> None:
+    """One of them is a mean of two, so three trainings are named."""
+    run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0}, "git_revision": "abc"}
+    for name, description in (("one", run), ("both", {"mean_of": [run, run]})):
+        write_general(tmp_path / f"{name}.safetensors", random_policy(0), description)
+    teachers = tuple(str(tmp_path / f"{name}.safetensors") for name in ("one", "both"))
+    train_general(replace(SMALL, learner="distilled", teachers=teachers), tmp_path / "run")
+    target = ship_general(tmp_path / "run", "mine", tmp_path)
+    assert read_general(target)[1]["teachers"] == [run, run, run]
+    card = target.with_suffix(".md").read_text()
+    assert card.count("marlbc train marlms-general") == 4 and card.count("abc") == 3
+    with pytest.raises(ConfigurationError, match="2 teachers"):
+        replace(SMALL, teachers=teachers)
+    with pytest.raises(ConfigurationError, match="learner distilled with 0 teachers"):
+        replace(SMALL, learner="distilled")
+    with pytest.raises(ConfigurationError, match="composition"):
+        GeneralTrainer(replace(SMALL, learner="distilled", teachers=teachers, composition="null-space"))
 
 
 def test_what_is_imitated_is_the_guide_and_not_what_was_taken() -> None:

@@ -11,7 +11,7 @@ from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.methods import PPO
-from marlbc_mj.util.errors import unknown
+from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.settings import AT_LEAST_ONE, NOT_NEGATIVE, POSITIVE, SHARE, Rule, check
 
 GENERAL = "marlms-general"
@@ -49,6 +49,8 @@ class GeneralConfig:
     """Mission steps, over all worlds."""
     start: str = ""
     """Checkpoint of a general policy whose network learning begins with; a random one by default."""
+    teachers: tuple[str, ...] = ()
+    """Checkpoints of general policies; the learner distilled learns the mean of their values."""
     first_temperature: Annotated[float, POSITIVE] = 1.0
     """Temperature at the start, below 1 for a network that has learned before."""
     families: Annotated[tuple[str, ...], _NAMED] = (*DRAWN, "field", "gates", "corridor")
@@ -101,10 +103,10 @@ class GeneralConfig:
     """Transitions of single agents in the replay buffer."""
     smoothing: Annotated[float, SHARE] = 0.9995
     """Memory of the running mean of the weights, which the policy is made of."""
-    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "mappo", "imitation"] = "vdn"
+    learner: Literal["lenient", "hysteretic", "plain", "vdn", "qmix", "mappo", "imitation", "distilled"] = "vdn"
     """vdn and qmix have one TD error for each whole team. With lenient, hysteretic and plain every agent has its own; some
     of the negative ones are overlooked, half of each counts, or all count. mappo learns from fresh rollouts, see ppo. Imitation
-    learns to do what a look-ahead does in all episodes."""
+    learns to do what a look-ahead does in all episodes; distilled learns the values of the teachers."""
     settle: Annotated[float, SHARE] = 0.5
     """Share of the budget from which lenient and hysteretic learners count all TD errors: values that were too high settle."""
     cool_by: Annotated[float, POSITIVE] = 0.5
@@ -158,6 +160,11 @@ class GeneralConfig:
                 raise unknown("group of inputs", name, HIDEABLE)
         for name in self.teams:
             read_team(name)
+        if (self.learner == "distilled") != bool(self.teachers):
+            raise ConfigurationError(
+                f"the learner distilled, and no other, has teachers: got learner {self.learner} with {len(self.teachers)} "
+                "teachers; set learner=distilled teachers=FILE,FILE"
+            )
 
 
 def training_scenarios(config: GeneralConfig) -> list[Scenario]:

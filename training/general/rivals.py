@@ -1,10 +1,12 @@
-"""Rivals of the general policy's learner: VDN and QMIX for teams of any size, with one error for a team, and imitation."""
+"""Learners of the general policy: VDN and QMIX for teams of any size, with one error for a team, imitation, and distillation."""
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from marlbc_mj.policies.general import GeneralPolicy
 from marlbc_mj.training.learner import Learner
+from marlbc_mj.training.networks import feed_forward
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import QMIX, MixingLayers
 
@@ -71,7 +73,44 @@ class Imitation(Learner):
         return each.mean(), 1.0 - torch.exp(-each.detach())[None]
 
 
-GENERAL_RIVALS: dict[str, type[Learner]] = {"vdn": TeamVDN, "qmix": TeamQMIX, "imitation": Imitation}
+LEAD_LINEAR = 0.25
+"""Errors of a lead, see :class:`Distilled`, count squared up to this and linearly beyond: far from a change nobody needs it."""
+MEAN_WEIGHT = 0.01
+"""Weight of the error of the values' mean, beside those of the leads."""
+
+
+class Distilled(Learner):
+    """Policy distillation (Rusu et al., ICLR 2016): one network learns the values of a teacher, a mean of several, in the states
+    that it comes to itself.
+
+    What decides is an action's lead over the mean of all, so leads are learned more exactly than the mean.
+    """
+
+    def teach(self, teacher: GeneralPolicy) -> None:
+        """Learn from this policy; before the first update."""
+        network = teacher.network
+        self.weights = [self.tensor(weight) for weight in network.weights]
+        self.biases = [self.tensor(bias) for bias in network.biases]
+
+    def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """The Huber loss of leads and values' means, and the largest error of a lead in each state (1, M)."""
+        state = self.tensor(batch.state)
+        with torch.no_grad():
+            wanted = self.network.split(feed_forward(self.weights, self.biases, state))[0].mean(dim=0)
+        found = self.network(state)[0]
+        mean, wanted_mean = found.mean(dim=-1, keepdim=True), wanted.mean(dim=-1, keepdim=True)
+        lead, wanted_lead = found - mean, wanted - wanted_mean
+        each = nn.functional.huber_loss(lead, wanted_lead, reduction="none", delta=LEAD_LINEAR).sum(dim=-1)
+        rest = nn.functional.huber_loss(mean, wanted_mean, delta=self.config.huber)
+        return each.mean() + MEAN_WEIGHT * rest, (lead - wanted_lead).detach().abs().amax(dim=-1)[None]
+
+
+GENERAL_RIVALS: dict[str, type[Learner]] = {
+    "vdn": TeamVDN,
+    "qmix": TeamQMIX,
+    "imitation": Imitation,
+    "distilled": Distilled,
+}
 """Learners by the setting ``learner``, where it names another than :class:`~marlbc_mj.training.learner.Learner`."""
 
 

@@ -56,20 +56,37 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
     policy = as_flown(mean_policy([part for part, _ in parts], config.switching_margin), config)
     target = folder / f"{name}.safetensors"
     check_target(target, overwrite=overwrite)
-    runs = [{key: part[key] for key in ("train", "evaluation", "git_revision")} for _, part in parts]
-    for run in runs:
-        run["train"] = {**run["train"], "start": "/".join(Path(run["train"].get("start", "")).parts[-3:])}
+    runs = [run for _, part in parts for run in trainings(part)]
     write_general(target, policy, {**provenance(), "mean_of": runs})
     with staged_file(target.with_suffix(".md"), overwrite=True) as staging:
         staging.write_text(_mean_card(name, policy, runs))
     return target
 
 
+def trainings(description: dict[str, Any]) -> list[dict[str, Any]]:
+    """Configuration, last evaluation and revision of each training of a checkpoint, from its header, one unless it is a mean. Of
+    the paths of files that a configuration names, the last three parts.
+    """
+    if "mean_of" in description:
+        return list(description["mean_of"])
+    run = {key: description[key] for key in ("train", "evaluation", "git_revision")}
+    files = {
+        "start": _within(run["train"].get("start", "")),
+        "teachers": [_within(path) for path in run["train"].get("teachers", ())],
+    }
+    return [{**run, "train": {**run["train"], **files}}]
+
+
+def _within(path: str) -> str:
+    return "/".join(Path(path).parts[-3:])
+
+
 def _what(train: dict[str, Any]) -> str:
     """What the policies of a training are."""
     composition = train.get("composition", "set-based")
+    method = "Policy distillation into" if train.get("teachers") else "Dueling Q-learning of"
     return (
-        "Dueling Q-learning of one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
+        f"{method} one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
         f"itself {_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
         f"that it pools of what it heard. It needs the {composition} composition, a formation with a column and a path that "
         "moves."
@@ -78,35 +95,53 @@ def _what(train: dict[str, Any]) -> str:
 
 def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> str:
     """The model card of a mean, in Markdown: a line per network."""
+    lines = [
+        f"# {name}",
+        "",
+        f"{_what(runs[0]['train'])} Its action values are the mean of those of {_trained(runs)}",
+        "",
+        _rules(policy.network.margin, policy.dwell, policy.deadline),
+        "",
+        _trainings(runs),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _trained(runs: list[dict[str, Any]]) -> str:
+    """The sentences above a table of trainings."""
+    return (
+        f"{len(runs)} networks, each trained by a command of its own at the revision beside it"
+        + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
+        + ". Commands name the settings that differ from the defaults of today; the header of the checkpoint has all of them."
+    )
+
+
+def _rules(margin: float, dwell: int, deadline: float) -> str:
+    """When an agent leaves its order."""
+    return (
+        f"An agent leaves its order only for one whose value is higher by more than {margin:g}"
+        + (f", and keeps a new one for at least {dwell} decisions." if dwell > 1 else ".")
+        + (
+            " It goes back to the formation when the time left, in settling times, is at most "
+            f"{deadline:g} times its way, in safe distances."
+            if deadline
+            else ""
+        )
+    )
+
+
+def _trainings(runs: list[dict[str, Any]]) -> str:
+    """A table with the command of each training."""
     rows = [
         (
-            f"`marlbc train {GENERAL} --seed {run['train']['seed']}{''.join(map(' {}'.format, _changed(run['train'])))}`",
+            f"`{_command(run['train'])}`",
             f"{run['evaluation']['mission_steps']:.0f}",
             f"{run['evaluation'].get('cpu_s', np.nan):.0f}",
             run["git_revision"],
         )
         for run in runs
     ]
-    lines = [
-        f"# {name}",
-        "",
-        f"{_what(runs[0]['train'])} Its action values are the mean of those of {len(runs)} networks, each trained by a command "
-        "of its own at the revision beside it"
-        + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
-        + ". Commands name the settings that differ from the defaults of today; the header of the checkpoint has all of them.",
-        "",
-        f"An agent leaves its order only for one whose value is higher by more than {policy.network.margin:g}"
-        + (f", and keeps a new one for at least {policy.dwell} decisions." if policy.dwell > 1 else ".")
-        + (
-            " It goes back to the formation when the time left, in settling times, is at most "
-            f"{policy.deadline:g} times its way, in safe distances."
-            if policy.deadline
-            else ""
-        ),
-        "",
-        pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows),
-    ]
-    return "\n".join(lines) + "\n"
+    return pipe_table(("trained by", "mission steps", "processor time [s]", "revision"), rows)
 
 
 def general_card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
@@ -119,15 +154,18 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
     """
     train, evaluation, versions = description["train"], description["evaluation"], description["versions"]
     families = [key.removeprefix("success_") for key in rows[0] if key.startswith("success_")]
+    teachers = description.get("teachers", [])
     lines = [
         f"# {name}",
         "",
-        _what(train),
+        _what(train) + (f" It learned the mean values of {_trained(teachers)}" if teachers else ""),
+        "",
+        _rules(description["margin"], description.get("dwell", 1), description.get("deadline", 0.0)),
         "",
         f"- Trained on {_counted(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
         f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
         "twice.",
-        f"- Command: `marlbc train {GENERAL} --seed {train['seed']}{''.join(map(' {}'.format, _changed(train)))}`",
+        f"- Command: `{_command(train)}`",
         f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
         f"{evaluation['cpu_s']:.0f} s of processor time on {train['threads']} thread(s) of {description['cpu']}.",
         f"- Evaluations: {train['layouts']} held-out layouts of each family and team, controller {JUDGED_WITH}; success at "
@@ -135,6 +173,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
         "",
         pipe_table(("mission steps", *families), [_curve_cells(row, families) for row in rows]),
+        *(("", "The teachers:", "", _trainings(teachers)) if teachers else ()),
     ]
     return "\n".join(lines) + "\n"
 
@@ -150,9 +189,9 @@ def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
     return (f"{float(row['mission_steps']):.0f}", *cells)
 
 
-def _changed(train: dict[str, Any]) -> list[str]:
-    """``--set`` and the settings that differ from the defaults; empty if none does."""
+def _command(train: dict[str, Any]) -> str:
+    """The command of a training: ``--set`` with the settings that differ from the defaults."""
     preset = flat_settings(plain_data(GeneralConfig()))
     changed = {k: v for k, v in flat_settings(train).items() if k != "seed" and preset.get(k) != v}
-    texts = [f"{k}={','.join(map(str, v)) if isinstance(v, list) else v}" for k, v in changed.items()]
-    return ["--set", *texts] if texts else []
+    texts = [f" {k}={','.join(map(str, v)) if isinstance(v, list) else v}" for k, v in changed.items()]
+    return f"marlbc train {GENERAL} --seed {train['seed']}" + (" --set" if texts else "") + "".join(texts)

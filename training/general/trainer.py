@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from marlbc_mj.policies.general import ACTIONS_UNDER, GeneralPolicy, make_general, orders_for, read_general
+from marlbc_mj.policies.general import ACTIONS_UNDER, GeneralPolicy, make_general, mean_policy, orders_for, read_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.base import check_device, prefixed, single_thread, unprefixed
 from marlbc_mj.training.general.config import (
@@ -18,7 +18,7 @@ from marlbc_mj.training.general.config import (
     learner_config,
     training_scenarios,
 )
-from marlbc_mj.training.general.rivals import GENERAL_RIVALS, TeamReplay
+from marlbc_mj.training.general.rivals import GENERAL_RIVALS, Distilled, TeamReplay
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
@@ -50,6 +50,8 @@ class GeneralTrainer:
         self.learner = self.kind()(learning, 1, ACTIONS_UNDER[config.composition], scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
+        if isinstance(self.learner, Distilled):
+            self.learner.teach(self._teacher())
         self.rng = np.random.default_rng(config.seed)
         self.sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])  # (T,) of the teams
         self.replay = self.make_replay(int(self.sizes.sum()))
@@ -102,6 +104,16 @@ class GeneralTrainer:
                 parameter.data.copy_(torch.from_numpy(array.copy()))
         for _ in range(self.config.copies):
             learner.push()
+
+    def _teacher(self) -> GeneralPolicy:
+        """The mean of the configuration's teachers.
+
+        Raises:
+            ConfigurationError: as :func:`read_general`, networks of different sizes, or of another composition.
+        """
+        teacher = mean_policy([read_general(Path(path))[0] for path in self.config.teachers], self.config.switching_margin)
+        orders_for(teacher, self.squads[0].scenario)
+        return teacher
 
     def advance(self) -> None:
         """One decision in every world, stored, and the updates after it.
