@@ -11,7 +11,7 @@ from marlbc_mj.policies.general import read_general, write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.ppo import PPOTrainer
-from marlbc_mj.training.general.shipping import trainings
+from marlbc_mj.training.general.shipping import training_command, trainings
 from marlbc_mj.training.general.trainer import GeneralTrainer
 from marlbc_mj.training.resuming import RESUME, saved_run
 from marlbc_mj.training.run import (
@@ -26,7 +26,7 @@ from marlbc_mj.training.run import (
 )
 from marlbc_mj.training.saved import CONFIG_FILE, SAVED_KINDS, check_origin, restore_trainer, saved_config, saved_rows
 from marlbc_mj.util.files import remove_leftovers
-from marlbc_mj.util.provenance import provenance
+from marlbc_mj.util.provenance import plain_data, provenance
 
 CURVE = "eval.csv"
 _SAVED = {**{name: kind for name, kind in SAVED_KINDS.items() if name != "curve"}, "cpu_s": (int, float)}
@@ -117,10 +117,10 @@ class GeneralRun:
         scenarios = judging_scenarios(config)
         self.judges = {k: Judge(each, JUDGED_WITH, config.layouts, config.threads) for k, each in scenarios.items()}
         self.origin = provenance()
-        self.taught: dict[str, Any] = {}  # how the teachers were trained, if there are any
+        self.origin["command"] = training_command(plain_data(config))
         if config.teachers:
             headers = [read_general(Path(path))[1] for path in config.teachers]
-            self.taught["teachers"] = [run for header in headers for run in trainings(header)]
+            self.origin["teachers"] = [run for header in headers for run in trainings(header)]
         self.evaluations: list[TrainingScores] = []
         self.wall = 0.0  # time of training so far, without evaluations [s]
         self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]
@@ -160,7 +160,7 @@ class GeneralRun:
         best = max((judged_rank(each) for each in self.evaluations), default=None)
         self.evaluations.append(row)
         write_table(self.out / CURVE, self.evaluations)
-        description: dict[str, Any] = {**self.origin, "train": self.config, "evaluation": row, **self.taught}
+        description: dict[str, Any] = {**self.origin, "train": self.config, "evaluation": row}
         write_general(self.out / CHECKPOINT / "last.safetensors", policy, description)
         if best is None or judged_rank(row) >= best:
             write_general(self.out / CHECKPOINT / "best.safetensors", policy, description)

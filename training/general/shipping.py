@@ -64,12 +64,14 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
 
 
 def trainings(description: dict[str, Any]) -> list[dict[str, Any]]:
-    """Configuration, last evaluation and revision of each training of a checkpoint, from its header, one unless it is a mean. Of
-    the paths of files that a configuration names, the last three parts.
+    """Command, configuration, last evaluation and revision of each training of a checkpoint, from its header, one unless it is a
+    mean. Of the paths of files that a configuration names, the last three parts.
     """
     if "mean_of" in description:
         return list(description["mean_of"])
-    run = {key: description[key] for key in ("train", "evaluation", "git_revision")}
+    run: dict[str, Any] = {
+        key: description[key] for key in ("command", "train", "evaluation", "git_revision") if key in description
+    }
     files = {
         "start": _within(run["train"].get("start", "")),
         "teachers": [_within(path) for path in run["train"].get("teachers", ())],
@@ -112,7 +114,7 @@ def _trained(runs: list[dict[str, Any]]) -> str:
     return (
         f"{len(runs)} networks, each trained by a command of its own at the revision beside it"
         + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
-        + ". Commands name the settings that differ from the defaults of today; the header of the checkpoint has all of them."
+        + ". Commands name the settings that differ from the defaults at that revision; the header of the checkpoint has all of them."
     )
 
 
@@ -134,7 +136,7 @@ def _trainings(runs: list[dict[str, Any]]) -> str:
     """A table with the command of each training."""
     rows = [
         (
-            f"`{_command(run['train'])}`",
+            f"`{_command(run)}`",
             f"{run['evaluation']['mission_steps']:.0f}",
             f"{run['evaluation'].get('cpu_s', np.nan):.0f}",
             run["git_revision"],
@@ -165,7 +167,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         f"- Trained on {_counted(train['families'])} with the teams {', '.join(train['teams'])}, point masses, drag times 0 "
         f"to {train['most_drag']:g}; controller {train['controller']}, substep {1e3 * train['substep']:g} ms. No layout is used "
         "twice.",
-        f"- Command: `{_command(train)}`",
+        f"- Command: `{_command(description)}`",
         f"- The checkpoint is the best of {len(rows)} evaluations: {evaluation['mission_steps']:.0f} mission steps, "
         f"{evaluation['cpu_s']:.0f} s of processor time on {train['threads']} thread(s) of {description['cpu']}.",
         f"- Evaluations: {train['layouts']} held-out layouts of each family and team, controller {JUDGED_WITH}; success at "
@@ -189,9 +191,14 @@ def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
     return (f"{float(row['mission_steps']):.0f}", *cells)
 
 
-def _command(train: dict[str, Any]) -> str:
-    """The command of a training: ``--set`` with the settings that differ from the defaults."""
+def training_command(train: dict[str, Any]) -> str:
+    """The command of a training with these settings: ``--set`` names those that differ from the defaults of this version."""
     preset = flat_settings(plain_data(GeneralConfig()))
     changed = {k: v for k, v in flat_settings(train).items() if k != "seed" and preset.get(k) != v}
     texts = [f" {k}={','.join(map(str, v)) if isinstance(v, list) else v}" for k, v in changed.items()]
     return f"marlbc train {GENERAL} --seed {train['seed']}" + (" --set" if texts else "") + "".join(texts)
+
+
+def _command(run: dict[str, Any]) -> str:
+    """The command in a header; checkpoints of older versions have none there."""
+    return str(run.get("command") or training_command(run["train"]))
