@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from marlbc_mj.engine.world import World
+from marlbc_mj.policies.general import decision_steps
+from marlbc_mj.policies.general_inputs import make_sight
 from marlbc_mj.scenarios import paper
-from marlbc_mj.studies import perf, perf_episode, perf_training
+from marlbc_mj.studies import decision_times, perf, perf_episode, perf_training
 from marlbc_mj.training import trainer
 from marlbc_mj.training.config import TrainConfig, make_config
 
@@ -133,3 +135,37 @@ def test_a_fleet_is_spread_over_the_mission() -> None:
         for b in np.flatnonzero(steps == k):
             np.testing.assert_array_equal(fleet.world.state.position[b], single.state.position[0])
         single.step(orders[k][None])
+
+
+def test_decision_times_are_of_every_step_and_of_decisions(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A supervisor that takes a millisecond per decision and nothing in between: its mean, median, and what a decision takes."""
+    scenario, clock = paper(duration=10.0), [0.0]
+    every = decision_steps(scenario, make_sight(scenario))
+
+    class Slow:
+        def start(self, scenario, teams):
+            return 0
+
+        def decide(self, observation, step):
+            clock[0] += 1e-3 * (step % every == 0)
+            return np.zeros(observation.command.shape, dtype=np.int64), step + 1
+
+    monkeypatch.setattr(decision_times, "perf_counter", lambda: clock[0])
+    monkeypatch.setattr(decision_times, "make_supervisor", lambda name: Slow())
+    monkeypatch.setattr(decision_times, "DECISIONS", 3)
+    for name in ("MISSIONS", "TEAM_SIZES"):
+        monkeypatch.setattr(decision_times, name, getattr(decision_times, name)[:1])
+    monkeypatch.setattr(decision_times, "mission_of", lambda family, agents: scenario)
+    times = decision_times.per_mission_step("field", 1)["lookahead"]
+    assert (
+        times.mean == pytest.approx(((scenario.mission_steps - 1) // every) / (scenario.mission_steps - 1))
+        and times.median == 0.0
+        and times.longest_hundredth == pytest.approx(1.0)
+    )
+    assert decision_times.per_decision(4, 1) == pytest.approx(1.0)
+    monkeypatch.setattr("sys.argv", ["decision_times", "1"])
+    decision_times.report_times()
+    said = capsys.readouterr().out
+    assert "field, Look-ahead: mean 0.0" in said and "4 agents in a field: a decision takes 1.000 ms" in said

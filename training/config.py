@@ -47,7 +47,7 @@ class TrainConfig:
     """Scenario that is trained on."""
     controller: str = "sorlc"
     """Controller that tracks the references."""
-    budget: Annotated[int, AT_LEAST_ONE] = 1_200_000
+    budget: Annotated[int, AT_LEAST_ONE] = 2_400_000
     """Mission steps, over all worlds."""
 
     worlds: Annotated[int, AT_LEAST_ONE] = 128
@@ -131,7 +131,7 @@ class TrainConfig:
     ppo: PPO = DEFAULT_PPO
     """Settings of MAPPO alone."""
 
-    evaluate_every: Annotated[int, AT_LEAST_ONE] = 50_000
+    evaluate_every: Annotated[int, AT_LEAST_ONE] = 20_000
     """Mission steps between evaluations on the case study."""
     save_every: Annotated[float, NOT_NEGATIVE] = 60.0
     """Time between saves for --resume [s]."""
@@ -179,6 +179,7 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
         TrainConfig(
             preset="paper",
             budget=200_000_000,
+            evaluate_every=50_000,
             state="printed",
             actions="orders",
             interval=1,

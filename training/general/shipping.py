@@ -114,7 +114,7 @@ def _trained(runs: list[dict[str, Any]]) -> str:
     return (
         f"{len(runs)} networks, each trained by a command of its own at the revision beside it"
         + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
-        + ". Commands name the settings that differ from the defaults at that revision; the header of the checkpoint has all of them."
+        + ". Commands name the settings that differ from the defaults at that revision; the header of the checkpoint has all."
     )
 
 
