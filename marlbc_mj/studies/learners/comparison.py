@@ -119,7 +119,7 @@ def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
     """Return and violation time against mission steps, a pair of panels per variant, placed by :func:`rows_of_panels`."""
     runs, evaluations = by_variant(rows), by_variant(curves)
     blocks = rows_of_panels(list(runs))
-    columns = max(3, *map(len, blocks))
+    columns = max(map(len, blocks))
     left, right, top, bottom, gap, inner, between = 0.48, 0.1, 0.42, 0.36, 0.1, 0.09, 0.46
     heights = 0.85, 0.6
     width = (pl.DOUBLE - left - right - (columns - 1) * gap) / columns
@@ -156,7 +156,7 @@ def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
                     axes.set_ylabel({"return": "return [10³]", "violation_time": "violation [s]"}[key])
                     axes.yaxis.set_label_coords(-0.34 / width, 0.5, transform=axes.transAxes)
     figure.supxlabel("mission steps [10⁶]", fontsize=8, y=0.0, va="bottom")
-    pl.legend_above(figure, _handles(), columnspacing=1.0)
+    pl.legend_above(figure, _handles(compared=set(runs) != {REFERENCE_VARIANT}), columnspacing=1.0)
     return figure
 
 
@@ -199,11 +199,13 @@ def _draw_panel(axes: Axes, key: str, rows: Sequence[CsvLine], curves: Sequence[
             axes.plot(float(row["final_mission_steps"]) / 1e6, np.clip(value, *axes.get_ylim()), **_END, clip_on=False)
 
 
-def _handles() -> list[Line2D | Patch]:
+def _handles(*, compared: bool) -> list[Line2D | Patch]:
+    """The legend; where variants are ``compared`` each panel has the reference's median, too."""
+    reference = Line2D([], [], color=REFERENCE_COLOR, label=f"median of {VARIANTS[REFERENCE_VARIANT].title}")
     return [
         Line2D([], [], color=COLOR, label="median"),
         Patch(color=COLOR, alpha=0.25, linewidth=0, label="range of runs"),
-        Line2D([], [], color=REFERENCE_COLOR, label=f"median of {VARIANTS[REFERENCE_VARIANT].title}"),
+        *([reference] if compared else []),
         Line2D([], [], color=pl.GREY, linewidth=0.6, linestyle=(0, (3, 2)), label="scripted supervisor"),
         Line2D([], [], **_GOAL, label="a run meets the goal"),
         Line2D([], [], **_END, label="a run fails"),
