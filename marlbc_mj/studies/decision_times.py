@@ -19,7 +19,7 @@ from marlbc_mj.supervisors import carry_out, make_supervisor
 from marlbc_mj.util.method_names import display_name
 
 DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
-MISSIONS = ("field", "forest", "gates", "corridor", "traffic")
+TIMED_FAMILIES = ("field", "forest", "gates", "corridor", "traffic")
 TEAM_SIZES = (4, 16, 64)
 LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
 DECISIONS = 60
@@ -79,7 +79,7 @@ def per_decision(agents: int, seed: int) -> float:
 def report_times() -> None:
     """Print all times, and how many times as fast as a search the policy is."""
     seed = int(sys.argv[1]) if len(sys.argv) > 1 else 90_000
-    for family in MISSIONS:
+    for family in TIMED_FAMILIES:
         found = per_mission_step(family, seed)
         for name, times in found.items():
             share = times.mean / found[DECIDERS[0]].mean
