@@ -154,10 +154,10 @@ def test_decision_times_are_of_every_step_and_of_decisions(
 
     monkeypatch.setattr(decision_times, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(decision_times, "make_supervisor", lambda name: Slow())
-    monkeypatch.setattr(decision_times, "DECISIONS", 3)
+    monkeypatch.setattr(decision_times, "TIMED_DECISIONS", 3)
     for name in ("TIMED_FAMILIES", "TEAM_SIZES"):
         monkeypatch.setattr(decision_times, name, getattr(decision_times, name)[:1])
-    monkeypatch.setattr(decision_times, "mission_of", lambda family, agents: scenario)
+    monkeypatch.setattr(decision_times, "timed_mission", lambda family, agents: scenario)
     times = decision_times.per_mission_step("field", 1)["lookahead"]
     assert (
         times.mean == pytest.approx(((scenario.mission_steps - 1) // every) / (scenario.mission_steps - 1))

@@ -22,7 +22,7 @@ DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
 TIMED_FAMILIES = ("field", "forest", "gates", "corridor", "traffic")
 TEAM_SIZES = (4, 16, 64)
 LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
-DECISIONS = 60
+TIMED_DECISIONS = 60
 """Decisions of a large team that are measured."""
 
 
@@ -34,7 +34,7 @@ class DecisionTimes(NamedTuple):
     longest_hundredth: float  # 99th percentile
 
 
-def mission_of(family: str, agents: int) -> Scenario:
+def timed_mission(family: str, agents: int) -> Scenario:
     """A held-out mission of a wedge under the set-based composition."""
     way = {"long_way": LARGEST_WAY} if agents >= TEAM_SIZES[-1] else {}
     return team_mission(family, "wedge", agents, composition="set-based", split="test", **way)
@@ -63,16 +63,16 @@ def per_mission_step(family: str, seed: int, deciders: Sequence[str] = DECIDERS)
     """Of each supervisor over one mission."""
     found = {}
     for name in deciders:
-        taken = times_of(mission_of(family, TEAM_SIZES[0]), name, seed)
+        taken = times_of(timed_mission(family, TEAM_SIZES[0]), name, seed)
         found[name] = DecisionTimes(float(taken.mean()), float(np.median(taken)), float(np.percentile(taken, 99)))
     return found
 
 
 def per_decision(agents: int, seed: int) -> float:
     """Median of what the general policy takes for the decisions of a wedge in a field [ms]."""
-    scenario = mission_of("field", agents)
+    scenario = timed_mission("field", agents)
     every = decision_steps(scenario, make_sight(scenario))
-    taken = times_of(scenario, DECIDERS[0], seed, min(scenario.mission_steps, 1 + DECISIONS * every))
+    taken = times_of(scenario, DECIDERS[0], seed, min(scenario.mission_steps, 1 + TIMED_DECISIONS * every))
     return float(np.median(taken[every - 1 :: every]))
 
 
