@@ -155,7 +155,7 @@ def test_decision_times_are_of_every_step_and_of_decisions(
     monkeypatch.setattr(decision_times, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(decision_times, "make_supervisor", lambda name: Slow())
     monkeypatch.setattr(decision_times, "TIMED_DECISIONS", 3)
-    for name in ("TIMED_FAMILIES", "TEAM_SIZES"):
+    for name in ("GROUNDS", "TEAM_SIZES"):
         monkeypatch.setattr(decision_times, name, getattr(decision_times, name)[:1])
     monkeypatch.setattr(decision_times, "timed_mission", lambda family, agents: scenario)
     times = decision_times.per_mission_step("field", 1)["lookahead"]

@@ -104,10 +104,21 @@ def _cells(row: dict[str, str]) -> tuple[str, ...]:
 
 def _settings(train: dict[str, object]) -> list[str]:
     """``--set`` and the settings that differ from the method's preset; empty if none does."""
-    preset = flat_settings(plain_data(make_config(str(train["preset"]), **METHODS[str(train["method"])][0])))
-    said = {"method", "preset", "seed", "budget", "threads"}
+    preset = make_config(str(train["preset"]), **METHODS[str(train["method"])][0])
+    return changed_settings(train, preset, said={"method", "preset", "seed", "budget", "threads"})
+
+
+def changed_settings(train: dict[str, Any], preset: Any, said: set[str]) -> list[str]:
+    """``--set`` and the settings of a run that differ from those of a preset; empty if none does.
+
+    Args:
+        train: JSON data of the run's configuration.
+        preset: configuration that it is compared with.
+        said: settings that the command names otherwise.
+    """
+    usual = flat_settings(plain_data(preset))
     changed = [
-        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if preset.get(name) != value and name not in said
+        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if usual.get(name) != value and name not in said
     ]
     return ["--set", *changed] if changed else []
 

@@ -4,7 +4,6 @@
 """
 
 import sys
-from collections.abc import Sequence
 from time import perf_counter
 from typing import NamedTuple
 
@@ -15,11 +14,11 @@ from marlbc_mj.policies.general import decision_steps
 from marlbc_mj.policies.general_inputs import make_sight
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.teams import team_mission
+from marlbc_mj.studies.safety import GROUNDS
 from marlbc_mj.supervisors import carry_out, make_supervisor
 from marlbc_mj.util.method_names import display_name
 
 DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
-TIMED_FAMILIES = ("field", "forest", "gates", "corridor", "traffic")
 TEAM_SIZES = (4, 16, 64)
 LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
 TIMED_DECISIONS = 60
@@ -59,10 +58,10 @@ def times_of(scenario: Scenario, supervisor: str, seed: int, steps: int | None =
     return np.array(taken[1:])
 
 
-def per_mission_step(family: str, seed: int, deciders: Sequence[str] = DECIDERS) -> dict[str, DecisionTimes]:
+def per_mission_step(family: str, seed: int) -> dict[str, DecisionTimes]:
     """Of each supervisor over one mission."""
     found = {}
-    for name in deciders:
+    for name in DECIDERS:
         taken = times_of(timed_mission(family, TEAM_SIZES[0]), name, seed)
         found[name] = DecisionTimes(float(taken.mean()), float(np.median(taken)), float(np.percentile(taken, 99)))
     return found
@@ -79,7 +78,7 @@ def per_decision(agents: int, seed: int) -> float:
 def report_times() -> None:
     """Print all times, and how many times as fast as a search the policy is."""
     seed = int(sys.argv[1]) if len(sys.argv) > 1 else 90_000
-    for family in TIMED_FAMILIES:
+    for family in GROUNDS:
         found = per_mission_step(family, seed)
         for name, times in found.items():
             share = times.mean / found[DECIDERS[0]].mean

@@ -6,7 +6,7 @@ from torch import Tensor, nn
 
 from marlbc_mj.policies.general import GeneralPolicy
 from marlbc_mj.training.learner import Learner
-from marlbc_mj.training.networks import feed_forward
+from marlbc_mj.training.networks import feed_forward, side_by_side
 from marlbc_mj.training.replay import Batch, Replay
 from marlbc_mj.training.rivals import QMIX, MixingLayers
 
@@ -91,12 +91,13 @@ class Distilled(Learner):
         network = teacher.network
         self.weights = [self.tensor(weight) for weight in network.weights]
         self.biases = [self.tensor(bias) for bias in network.biases]
+        self.first_layer = side_by_side(self.weights[0], self.biases[0])
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """The Huber loss of leads and values' means, and the largest error of a lead in each state (1, M)."""
         state = self.tensor(batch.state)
         with torch.no_grad():
-            wanted = self.network.split(feed_forward(self.weights, self.biases, state))[0].mean(dim=0)
+            wanted = self.network.split(feed_forward(self.weights, self.biases, state, self.first_layer))[0].mean(dim=0)
         found = self.network(state)[0]
         mean, wanted_mean = found.mean(dim=-1, keepdim=True), wanted.mean(dim=-1, keepdim=True)
         lead, wanted_lead = found - mean, wanted - wanted_mean

@@ -7,7 +7,7 @@ from time import monotonic, process_time
 from typing import Any
 
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
-from marlbc_mj.policies.general import read_general, write_general
+from marlbc_mj.policies.general import write_general
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig, judging_scenarios
 from marlbc_mj.training.general.judging import Judge, judge_policy
 from marlbc_mj.training.general.ppo import PPOTrainer
@@ -118,9 +118,8 @@ class GeneralRun:
         self.judges = {k: Judge(each, JUDGED_WITH, config.layouts, config.threads) for k, each in scenarios.items()}
         self.origin = provenance()
         self.origin["command"] = training_command(plain_data(config))
-        if config.teachers:
-            headers = [read_general(Path(path))[1] for path in config.teachers]
-            self.origin["teachers"] = [run for header in headers for run in trainings(header)]
+        if self.trainer.teachers:
+            self.origin["teachers"] = [run for _, header in self.trainer.teachers for run in trainings(header)]
         self.evaluations: list[TrainingScores] = []
         self.wall = 0.0  # time of training so far, without evaluations [s]
         self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]

@@ -11,11 +11,10 @@ from marlbc_mj.policies.general import GeneralPolicy, mean_policy, read_general,
 from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, SENT
 from marlbc_mj.policies.shipped import FOLDER
 from marlbc_mj.report.table import pipe_table
-from marlbc_mj.training.config import flat_settings
 from marlbc_mj.training.general.config import GENERAL, JUDGED_WITH, GeneralConfig, as_flown
-from marlbc_mj.training.ship import put_in_package
+from marlbc_mj.training.ship import changed_settings, put_in_package
 from marlbc_mj.util.files import check_target, staged_file
-from marlbc_mj.util.provenance import plain_data, provenance
+from marlbc_mj.util.provenance import provenance
 
 _DECIDES = {
     "set-based": "between formation and column",
@@ -100,16 +99,16 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
     lines = [
         f"# {name}",
         "",
-        f"{_what(runs[0]['train'])} Its action values are the mean of those of {_trained(runs)}",
+        f"{_what(runs[0]['train'])} Its action values are the mean of those of {_introduced(runs)}",
         "",
         _rules(policy.network.margin, policy.dwell, policy.deadline),
         "",
-        _trainings(runs),
+        _table_of_runs(runs),
     ]
     return "\n".join(lines) + "\n"
 
 
-def _trained(runs: list[dict[str, Any]]) -> str:
+def _introduced(runs: list[dict[str, Any]]) -> str:
     """The sentences above a table of trainings."""
     return (
         f"{len(runs)} networks, each trained by a command of its own at the revision beside it"
@@ -132,7 +131,7 @@ def _rules(margin: float, dwell: int, deadline: float) -> str:
     )
 
 
-def _trainings(runs: list[dict[str, Any]]) -> str:
+def _table_of_runs(runs: list[dict[str, Any]]) -> str:
     """A table with the command of each training."""
     rows = [
         (
@@ -160,7 +159,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
     lines = [
         f"# {name}",
         "",
-        _what(train) + (f" It learned the mean values of {_trained(teachers)}" if teachers else ""),
+        _what(train) + (f" It learned the mean values of {_introduced(teachers)}" if teachers else ""),
         "",
         _rules(description["margin"], description.get("dwell", 1), description.get("deadline", 0.0)),
         "",
@@ -175,7 +174,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
         f"- Revision {description['git_revision']}; " + ", ".join(f"{k} {v}" for k, v in versions.items()) + ".",
         "",
         pipe_table(("mission steps", *families), [_curve_cells(row, families) for row in rows]),
-        *(("", "The teachers:", "", _trainings(teachers)) if teachers else ()),
+        *(("", "The teachers:", "", _table_of_runs(teachers)) if teachers else ()),
     ]
     return "\n".join(lines) + "\n"
 
@@ -193,10 +192,7 @@ def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
 
 def training_command(train: dict[str, Any]) -> str:
     """The command of a training with these settings: ``--set`` names those that differ from the defaults of this version."""
-    preset = flat_settings(plain_data(GeneralConfig()))
-    changed = {k: v for k, v in flat_settings(train).items() if k != "seed" and preset.get(k) != v}
-    texts = [f" {k}={','.join(map(str, v)) if isinstance(v, list) else v}" for k, v in changed.items()]
-    return f"marlbc train {GENERAL} --seed {train['seed']}" + (" --set" if texts else "") + "".join(texts)
+    return " ".join([f"marlbc train {GENERAL} --seed {train['seed']}", *changed_settings(train, GeneralConfig(), said={"seed"})])
 
 
 def _command(run: dict[str, Any]) -> str:

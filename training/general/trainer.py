@@ -50,6 +50,7 @@ class GeneralTrainer:
         self.learner = self.kind()(learning, 1, ACTIONS_UNDER[config.composition], scale, generator, input_mask(config))
         if config.start:
             self._begin_with(read_general(Path(config.start))[0])
+        self.teachers = [read_general(Path(path)) for path in config.teachers]  # policies and their headers
         if isinstance(self.learner, Distilled):
             self.learner.teach(self._teacher())
         self.rng = np.random.default_rng(config.seed)
@@ -109,9 +110,9 @@ class GeneralTrainer:
         """The mean of the configuration's teachers.
 
         Raises:
-            ConfigurationError: as :func:`read_general`, networks of different sizes, or of another composition.
+            ConfigurationError: networks of different sizes, or of another composition.
         """
-        teacher = mean_policy([read_general(Path(path))[0] for path in self.config.teachers], self.config.switching_margin)
+        teacher = mean_policy([policy for policy, _ in self.teachers], self.config.switching_margin)
         orders_for(teacher, self.squads[0].scenario)
         return teacher
 
