@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from marlbc_mj import World, make_scenario, paper
+from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
@@ -23,6 +24,8 @@ from marlbc_mj.policies.general import (
     write_general,
 )
 from marlbc_mj.policies.shipped import shipped
+from marlbc_mj.scenarios.teams import team_mission
+from marlbc_mj.studies import validation
 from marlbc_mj.supervisors import General, make_supervisor
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import ConfigurationError
@@ -78,20 +81,19 @@ def test_a_new_order_is_kept_for_the_dwell(dwell: int) -> None:
     assert min(first) == memory.interval
 
 
-def at_distance(distance: float, left: float) -> np.ndarray:
-    """(F,) features of an agent so far from its slot in the formation [d_OA], with so much time left [T]."""
-    features = np.zeros(inputs.FEATURES, dtype=np.float32)
-    features[inputs.WAYS + 1], features[inputs.ENDING + 1] = np.tanh(distance / inputs.COARSE), np.exp(-left / inputs.COARSEST)
-    return features
+def returns(distance: float, left: float, deadline: float) -> bool:
+    """Whether an agent so far from its slot in the formation [d_OA], with so much time left [T], must return."""
+    entries = np.float32([np.tanh(distance / inputs.COARSE), np.exp(-left / inputs.COARSEST)])
+    return bool(must_return(*entries, deadline))
 
 
 @given(st.floats(0.0, 30.0), st.floats(0.05, 60.0), st.floats(0.2, 3.0))
 def test_an_agent_returns_when_its_way_takes_the_time_left(distance: float, left: float, deadline: float) -> None:
     """In the units of the features, whose entries saturate; farther than 36 d_OA counts as 36."""
     if abs(left / (deadline * distance + 1e-9) - 1.0) > 1e-2:
-        assert must_return(at_distance(distance, left), deadline) == (left < deadline * distance)
-    assert not must_return(at_distance(1e3, 40.0), 1.0)
-    assert must_return(at_distance(1e3, 30.0), 1.0)
+        assert returns(distance, left, deadline) == (left < deadline * distance)
+    assert not returns(1e3, 40.0, 1.0)
+    assert returns(1e3, 30.0, 1.0)
 
 
 @pytest.mark.parametrize("actions", [2, 4])
@@ -265,3 +267,46 @@ def test_it_flies_over_any_network(changes) -> None:
     taken = decisions(scenario)
     assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
     np.testing.assert_array_equal(decisions(scenario, worlds=1)[:, 0], taken[:, 0])
+
+
+def test_validation_missions_are_what_their_names_say() -> None:
+    """Each once, under the set-based composition, on layouts that no training draws."""
+    made = {name: validation.validation_mission(name) for name in validation.MISSIONS}
+    assert len(made) == 27
+    for name, scenario in made.items():
+        family, formation, agents, *different = name.replace("-", " ").split()
+        wanted = team_mission(family, formation, int(agents), composition="set-based", split="test")
+        assert (scenario.name, scenario.split, scenario.composition) == (family, "test", "set-based")
+        np.testing.assert_array_equal(scenario.formations[0], wanted.formations[0])
+        assert (scenario.communication.silent == (0,)) == ("silent" in different)
+        assert any(isinstance(b, LineFormation) for b in scenario.behaviors) == ("lines" in different)
+    with pytest.raises(ConfigurationError, match="gates wedge-4"):
+        validation.validation_mission("gate wedge-4")
+
+
+def test_validation_flies_the_mean_of_the_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """With the margin, the dwell time and the deadline that are asked for, whatever the files say."""
+    files = [str(tmp_path / f"{seed}.safetensors") for seed in range(2)]
+    policies = [random_policy(seed) for seed in range(2)]
+    for path, policy in zip(files, policies, strict=True):
+        write_general(Path(path), policy, {})
+    asked = [
+        "--missions",
+        "field wedge-4",
+        "--layouts",
+        "2",
+        "--seed",
+        "7",
+        "--margins",
+        "0.05,1e9",
+        "--dwell",
+        "2",
+        "--deadline",
+        "0",
+    ]
+    validation.validate([*files, *asked])
+    judge = Judge(validation.validation_mission("field wedge-4"), "sorlc", 2)
+    for margin, line in zip((0.05, 1e9), capsys.readouterr().out.splitlines()[::2], strict=True):
+        verdict = judge(General(mean_policy(policies, margin)._replace(dwell=2)), 7)
+        assert f"margin {margin:g}, field wedge-4: {verdict.success.sum()} of 2" in line
+        assert f"median return {np.median(verdict.total):.0f}, {np.median(verdict.switches) / 4:.2f} switches" in line

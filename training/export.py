@@ -27,7 +27,7 @@ from marlbc_mj.policies.general import (
     must_return,
     read_general,
 )
-from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
+from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, ENDING, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
@@ -191,9 +191,11 @@ class AgentPolicy(nn.Module):
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
         mean = values.mean(dim=0)
         kept, fresh = last.clamp(min=0), last < 0
-        chosen = torch.where(may_change(features, fresh, self.dwell), _choose(mean, kept, fresh, self.margin), kept)
+        free = may_change(features[..., AGE_ENTRIES], fresh, self.dwell)
+        chosen = torch.where(free, _choose(mean, kept, fresh, self.margin), kept)
         if self.deadline:
-            chosen = torch.where(must_return(features, self.deadline), chosen - chosen % len(MOTIONS), chosen)
+            back = must_return(features[..., WAYS + 1], features[..., ENDING + 1], self.deadline)
+            chosen = torch.where(back, chosen - chosen % len(MOTIONS), chosen)
         return mean, chosen
 
 

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from marlbc_mj.core.laws import compiled, inlined
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general_inputs import (
     AGE_ENTRIES,
@@ -89,45 +90,70 @@ class GeneralPolicy(NamedTuple):
         inputs = join_inputs(sensed.features, heard, age)
         values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
         chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
-        chosen = np.where(may_change(sensed.features, sensed.fresh[:, None], self.dwell), chosen, sensed.last)
-        if not self.deadline:
-            return chosen
-        return np.where(must_return(sensed.features, self.deadline), chosen - chosen % len(MOTIONS), chosen)
+        _keep_or_return(chosen, sensed, self.dwell, self.deadline)
+        return chosen
 
     def values(self, inputs: np.ndarray) -> np.ndarray:
         """(M, A) action values for inputs (M, S), one row per agent."""
-        values: np.ndarray = self.network.values(inputs).mean(axis=1)
-        return values
+        each = self.network.values(inputs)
+        return each[:, 0] if each.shape[1] == 1 else _mean_values(each)
 
 
-def may_change(features: Array, fresh: Array, dwell: int) -> Array:
+@compiled
+def _mean_values(values):
+    """(M, A) mean of the values (M, N, A) of N networks, added in their order."""
+    mean = values[:, 0].copy()
+    for i in range(1, values.shape[1]):
+        mean += values[:, i]
+    mean /= np.float32(values.shape[1])
+    return mean
+
+
+@compiled
+def _keep_or_return(chosen, sensed, dwell, deadline):
+    """Replace actions ``chosen`` (B, N) by those in force where agents :func:`may_change` nothing, and by formation where they
+    :func:`must_return`.
+    """
+    for b in range(chosen.shape[0]):
+        for i in range(chosen.shape[1]):
+            own = sensed.features[b, i]
+            if not may_change(own[AGE_ENTRIES], sensed.fresh[b], dwell):
+                chosen[b, i] = sensed.last[b, i]
+            if deadline > 0.0 and must_return(own[WAYS + 1], own[ENDING + 1], deadline):
+                chosen[b, i] -= chosen[b, i] % len(MOTIONS)
+
+
+@inlined
+def may_change(age: Array, fresh: Array, dwell: int) -> Array:
     """Bool (...,): whether an agent may leave its order.
 
     Who may do so at once can dither between two orders close to an obstacle, where the references jump and the tracking error
     ends in a violation; a dwell time bounds that (Hespanha and Morse 1999).
 
     Args:
-        features: (..., F) of the agents.
+        age: (...,) entry ``AGE_ENTRIES`` of the agents' features.
         fresh: (...,) bool, whether no order is in force yet.
         dwell: decisions that an order must be old, less a half, as the time of a decision is rounded to mission steps.
     """
     least = -math.expm1(-(dwell - 0.5) * INTERVAL / COARSE) if dwell > 1 else 0.0
-    result: Array = (features[..., AGE_ENTRIES] >= least) | fresh
+    result: Array = (age >= least) | fresh
     return result
 
 
-def must_return(features: Array, deadline: float) -> Array:
+@inlined
+def must_return(distance: Array, ending: Array, deadline: float) -> Array:
     """Bool (...,): whether the time left is at most ``deadline`` times an agent's distance from its slot in the formation.
 
     The time counts in settling times, of which one is more than a d_OA takes at full speed, the distance in d_OA; 36 and more
     count as 36.
 
     Args:
-        features: (..., F) of the agents.
+        distance: (...,) entry ``WAYS + 1`` of the agents' features, tanh(e / COARSE).
+        ending: (...,) entry ``ENDING + 1``, exp(-t / COARSEST).
         deadline: see :class:`GeneralPolicy`; positive.
     """
-    distance, ending = features[..., WAYS + 1], features[..., ENDING + 1]  # tanh(e / COARSE), exp(-t / COARSEST)
-    result: Array = (1.0 - distance).clip(1e-6) <= (1.0 + distance) * ending ** (2.0 * COARSEST / (COARSE * deadline))
+    reach = (1.0 + distance) * ending ** (2.0 * COARSEST / (COARSE * deadline))
+    result: Array = (1.0 - distance <= reach) & (reach >= 1e-6)
     return result
 
 

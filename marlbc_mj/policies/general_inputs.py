@@ -225,5 +225,20 @@ def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.
 
     ``heard`` (B, N, N, M) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, M) and (B, 1, N) where all hear all.
     """
-    pooled = pool_heard(heard, age)
-    return np.concatenate([features, np.broadcast_to(pooled, (*features.shape[:2], POOLED))], axis=-1)
+    inputs = np.empty((*features.shape[:2], INPUTS), dtype=np.float32)
+    _fill_inputs(features, np.ascontiguousarray(heard, dtype=np.float32), np.ascontiguousarray(age), inputs)
+    return inputs
+
+
+@compiled
+def _fill_inputs(features, heard, age, inputs):
+    """:func:`join_inputs` into ``inputs`` (B, N, S)."""
+    pooled = np.empty((heard.shape[0], heard.shape[1], POOLED), dtype=np.float32)
+    _fill_pooled(heard, age, pooled)
+    for b in range(inputs.shape[0]):
+        for i in range(inputs.shape[1]):
+            row, known = inputs[b, i], pooled[b, min(i, heard.shape[1] - 1)]
+            for j in range(FEATURES):
+                row[j] = features[b, i, j]
+            for j in range(POOLED):
+                row[FEATURES + j] = known[j]

@@ -77,7 +77,7 @@ class General:
         """An action for every agent: the one in force unless another is better by more than the margin."""
         began, due = perf_counter(), observation.step % memory.interval == 0
         if memory.layer is None:
-            memory = self._decide_due(observation, memory, due) if due.any() else memory
+            memory = self._decide_due(observation, memory, due) if np.count_nonzero(due) else memory
         else:
             memory = self._exchange_and_decide(observation, memory, due)
         orders = lift(memory.orders[memory.actions], observation, memory.way)
@@ -85,7 +85,7 @@ class General:
 
     def _decide_due(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
         """The memory with new actions of the teams ``due`` (B,), everybody heard at once."""
-        seen = observation if due.all() else Observation(*(field[due] for field in observation))
+        seen = observation if np.count_nonzero(due) == len(due) else Observation(*(field[due] for field in observation))
         features = sense_features(seen, memory.sight)
         sent = self.policy.messages(features)
         heard, age = sent[:, None], np.zeros((len(sent), 1, sent.shape[1]))
