@@ -49,6 +49,8 @@ class Policy(NamedTuple):
 
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
+FEW_OUTPUTS = 8
+"""Layers with fewer outputs are computed output by output."""
 RISK_SLACK = cast(float, np.float32(0.05))  # float32 in compiled code, as it is in torch
 """Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
 
@@ -138,10 +140,10 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):
         widest = max(widest, bias.shape[2])
     values = np.empty((len(state), networks, actions), dtype=np.float32)
     layers, risks = np.empty((2, widest), dtype=np.float32), np.empty(actions, dtype=np.float32)
-    for b in range(len(state)):
-        x = state[b] / scale
-        for i in range(networks):
-            y = x
+    scaled = state / scale
+    for i in range(networks):
+        for b in range(len(state)):
+            y = scaled[b]
             for k in range(last + 1):
                 z = layers[k % 2, : weights[k].shape[2]]
                 dense(y, weights[k][i], biases[k][i, 0], z)
@@ -173,13 +175,28 @@ def exclude_risky(values, logits, limit, risks):
 
 @compiled
 def dense(x, weight, bias, out):
-    """Write ``x @ weight + bias`` into ``out``, summed in the order of the inputs; inputs that are 0 are left out."""
+    """Write ``x @ weight + bias`` into ``out``, summed in the order of the inputs.
+
+    Four inputs at a time, of which four zeros are left out; for a few outputs, one output at a time. The sums are the same, bit
+    for bit; each way is the faster one for its layers.
+    """
+    if len(out) < FEW_OUTPUTS:
+        for o in range(len(out)):
+            total = bias[o]
+            for j in range(len(x)):
+                total += x[j] * weight[j, o]
+            out[o] = total
+        return
     out[:] = bias
-    for j in range(len(x)):
-        factor = x[j]
-        if factor != 0.0:
+    whole = len(x) - len(x) % 4
+    for j in range(0, whole, 4):
+        a, b, c, d = x[j], x[j + 1], x[j + 2], x[j + 3]
+        if a != 0.0 or b != 0.0 or c != 0.0 or d != 0.0:
             for o in range(len(out)):
-                out[o] += factor * weight[j, o]
+                out[o] = (((out[o] + a * weight[j, o]) + b * weight[j + 1, o]) + c * weight[j + 2, o]) + d * weight[j + 3, o]
+    for j in range(whole, len(x)):
+        for o in range(len(out)):
+            out[o] += x[j] * weight[j, o]
 
 
 @compiled
