@@ -271,7 +271,7 @@ def test_it_flies_over_any_network(changes) -> None:
 
 def test_validation_missions_are_what_their_names_say() -> None:
     """Each once, under the set-based composition, on layouts that no training draws."""
-    made = {name: validation.validation_mission(name) for name in validation.MISSIONS}
+    made = {name: validation.validation_mission(name) for name in validation.VALIDATION_MISSIONS}
     assert len(made) == 27
     for name, scenario in made.items():
         family, formation, agents, *different = name.replace("-", " ").split()

@@ -26,12 +26,12 @@ NEIGHBOR_DISTANCE = 6.0
 """Distance of neighbors in the wedge [m]."""
 POOR_RADIO = Communication(range=1.2 * NEIGHBOR_DISTANCE, delay=0.1, loss=0.2, silent=(0,))
 """Of missions with ``silent``: nobody hears the first agent, and the others miss a fifth of all messages."""
-SILENT, LINES = "silent", "lines"
+_SILENT, _LINES = "silent", "lines"
 """Ends of names: missions with :data:`POOR_RADIO`, and those where FR comes to its slots along their lines."""
-MISSIONS = (
+VALIDATION_MISSIONS = (
     *(f"{family} wedge-4" for family in GROUNDS),
-    *(f"{family} wedge-4 {SILENT}" for family in ("field", "gates", "corridor")),
-    *(f"gates {team}" for team in ("line-6", "circle-8", "grid-9", f"grid-9 {LINES}", "circle-12", "wedge-16", "grid-16")),
+    *(f"{family} wedge-4 {_SILENT}" for family in ("field", "gates", "corridor")),
+    *(f"gates {team}" for team in ("line-6", "circle-8", "grid-9", f"grid-9 {_LINES}", "circle-12", "wedge-16", "grid-16")),
     *(f"corridor {team}" for team in ("line-6", "circle-8", "grid-9", "circle-12")),
     *(f"field {team}" for team in ("circle-8", "grid-9", "circle-12", "wedge-16")),
     *(f"forest {team}" for team in ("circle-8", "grid-9")),
@@ -50,18 +50,18 @@ class Passed(NamedTuple):
 
 
 def validation_mission(name: str) -> Scenario:
-    """The scenario of one of :data:`MISSIONS`.
+    """The scenario of one of :data:`VALIDATION_MISSIONS`.
 
     Raises:
         ConfigurationError: another name.
     """
-    if name not in MISSIONS:
-        raise unknown("validation mission", name, MISSIONS)
+    if name not in VALIDATION_MISSIONS:
+        raise unknown("validation mission", name, VALIDATION_MISSIONS)
     family, team, *different = name.split()
     changes: dict[str, Any] = {"composition": "set-based", "split": "test"}
-    if SILENT in different:
+    if _SILENT in different:
         changes["communication"] = POOR_RADIO
-    if LINES in different:
+    if _LINES in different:
         changes["column_approach"] = "line"
     return team_mission(family, *read_team(team), **changes)
 
@@ -80,7 +80,7 @@ def validate(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("files", nargs="+", type=Path)
     parser.add_argument("--layouts", type=int, default=32)
     parser.add_argument("--seed", type=int, default=53_000)
-    parser.add_argument("--missions", default=",".join(MISSIONS))
+    parser.add_argument("--missions", default=",".join(VALIDATION_MISSIONS))
     parser.add_argument("--margins", default=str(default.switching_margin))
     parser.add_argument("--dwell", type=int, default=default.dwell)
     parser.add_argument("--deadline", type=float, default=default.deadline)
