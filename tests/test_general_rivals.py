@@ -24,7 +24,15 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import plain_data
 
 SMALL = GeneralConfig(
-    families=("gates",), teams=("wedge-4", "line-6"), hidden=(8,), batch=20, updates=1, capacity=400, budget=2_000, learner="vdn"
+    families=("gates",),
+    teams=("wedge-4", "line-6"),
+    hidden=(8,),
+    batch=20,
+    updates=1,
+    capacity=400,
+    budget=2_000,
+    learner="vdn",
+    layouts=1,
 )
 
 
