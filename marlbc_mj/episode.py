@@ -116,23 +116,25 @@ def run_episode(
         heard = None if world.scenario.communication == IDEAL else hearing(memory, observation.time)
         before = world.state.controller[0].copy(), decision_ms, body_poses(world)
         step = carry_out(world, decision)
-        frames.append(_frame(observation, step, before, heard))
+        frames.append(_frame(observation, step, before, heard, world.state.position[0].copy()))
         if on_frame is not None:
             on_frame(frames[-1])
         observation, done = step.observation, bool(step.done[0])
     return _trajectory(world, frames, observation, (seed, *names))
 
 
-def _frame(seen: Observation, step: Step, before: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None) -> Frame:
-    """One mission step; ``before`` are controller state, decision time and pose."""
+def _frame(
+    seen: Observation, step: Step, before: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None, after: np.ndarray
+) -> Frame:
+    """One mission step; ``before`` are controller state, decision time and pose, ``after`` is the position at its end (N, 2)."""
     if step.record is None:
         raise ConfigurationError("an episode needs a World that keeps every substep: World(..., record=True)")
     record = Record(*(rows[0] for rows in step.record))
     shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
     links = None if heard is None else heard.team(0)
-    after, (state, decision_ms, pose) = step.observation, before
-    verdicts = after.command[0], float(step.reward[0])
-    return Frame(seen.team(0), record, *verdicts, state, decision_ms, after.position[0], pose, shield, links)
+    state, decision_ms, pose = before
+    verdicts = step.observation.command[0], float(step.reward[0])
+    return Frame(seen.team(0), record, *verdicts, state, decision_ms, after, pose, shield, links)
 
 
 def _trajectory(world: World, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
@@ -151,8 +153,8 @@ def _trajectory(world: World, frames: list[Frame], last: Observation, names: tup
         seed=names[0],
         obstacles=(state.anchors if scenario.moving else state.obstacles)[0].copy(),
         time=np.arange(len(position)) * scenario.substep,
-        position=np.concatenate([position, last.position]),
-        velocity=np.concatenate([velocity, last.velocity]),
+        position=np.concatenate([position, state.position]),
+        velocity=np.concatenate([velocity, state.velocity]),
         reference=reference,
         reference_velocity=reference_velocity,
         force=force,

@@ -11,8 +11,12 @@ from marlbc_mj.engine.composition import keep, limit
 from marlbc_mj.engine.plan import make_behaviors
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
+from marlbc_mj.recording.reader import read_log
+from marlbc_mj.recording.writer import LogWriter
+from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, paper
-from marlbc_mj.supervisors import Scripted
+from marlbc_mj.studies.batches import evaluate_batch
+from marlbc_mj.supervisors import Scripted, make_supervisor
 from marlbc_mj.tasks.formation import make_environment
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -58,6 +62,21 @@ def test_noise_has_the_stated_size_and_another_seed_is_other_noise():
     np.testing.assert_allclose(spread, [0.02, 0.05], rtol=0.08)
     first = world.reset(1).position
     assert (first != world.reset(2).position).all()
+
+
+def test_where_robots_end_is_not_what_they_measure(tmp_path):
+    """Trajectories, logs, metrics and batches end at the true position, whatever the sensors say of it."""
+    scenario = paper(duration=1.0, imperfections=Imperfections(position_noise=0.5, velocity_noise=0.1))
+    world = World(scenario, PD(), record=True)
+    with LogWriter(tmp_path / "log.mcap", scenario, PD(), names=("fixed", "pd"), seed=1, config={}) as log:
+        flown = run_episode(world, make_supervisor("fixed"), seed=1, on_frame=log.write)
+    np.testing.assert_array_equal(flown.position[-1], world.state.position[0])
+    np.testing.assert_array_equal(flown.velocity[-1], world.state.velocity[0])
+    assert np.abs(world.observe().position[0] - flown.position[-1]).max() > 0.1
+    metrics = measure(flown)
+    assert measure(read_log(tmp_path / "log.mcap"))["team"] == metrics["team"]
+    batch = evaluate_batch(scenario, (0, 1), "fixed", "pd")[1].metrics
+    assert batch is not None and batch["team"]["end_error"] == metrics["team"]["end_error"]
 
 
 def test_a_lost_actuator_gives_its_share_from_its_time_on():

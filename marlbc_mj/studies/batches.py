@@ -173,10 +173,10 @@ class JointFlight:
     def _keep(self, m: int, step: Step) -> None:
         """Record mission step ``m``."""
         assert step.record is not None, "made with record=True"
-        substeps = self.world.scenario.substeps
+        substeps, state = self.world.scenario.substeps, self.world.state
         for tape, rows in zip(self.record, step.record, strict=True):
             tape[:, m * substeps : (m + 1) * substeps] = rows
-        self.record.position[:, -1], self.record.velocity[:, -1] = step.observation.position, step.observation.velocity
+        self.record.position[:, -1], self.record.velocity[:, -1] = state.position, state.velocity
         self.command[:, m], self.formation[:, m] = step.observation.command, step.observation.formation
         self.reward[:, m], self.shield = step.reward, step.shield
 

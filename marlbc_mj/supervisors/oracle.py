@@ -200,7 +200,7 @@ def evaluate(world: World, tables: np.ndarray) -> Evaluation:
     for k in range(tables.shape[1]):
         step = world.step(orders[:, k])
         assert step.record is not None, "evaluate needs World(record=True)"
-        after = np.concatenate([step.record.position[:, 1:], step.observation.position[:, None]], axis=1)  # (B, substeps, N, 2)
+        after = np.concatenate([step.record.position[:, 1:], world.state.position[:, None]], axis=1)  # (B, substeps, N, 2)
         reward[:, k] = step.reward
         violated[:, k] = violates(clearances(after, obstacles), scenario.safe_distance).any(axis=(1, 2))
     return Evaluation(reward, violated)

@@ -59,7 +59,7 @@ class Judge:
             violated |= violates(observation.clearance, scenario.safe_distance).any(axis=1)
             switches += (observation.command != previous.command).sum(axis=1) * (step > 0)
         centre = np.array(scenario.path_origin) + scenario.duration * np.array(scenario.path_velocity)
-        away = np.linalg.norm(observation.position - centre - scenario.formations[0], axis=-1)
+        away = np.linalg.norm(world.state.position - centre - scenario.formations[0], axis=-1)
         return Verdict(total, (away <= scenario.formation_tolerance).all(axis=1), violated, switches)
 
 
