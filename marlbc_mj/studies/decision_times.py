@@ -4,6 +4,8 @@
 """
 
 import sys
+from collections.abc import Iterator
+from itertools import islice
 from time import perf_counter
 from typing import NamedTuple
 
@@ -21,6 +23,8 @@ from marlbc_mj.util.method_names import display_name
 DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
 TEAM_SIZES = (4, 16, 64)
 LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
+TURN = 20
+"""Mission steps of one supervisor after which the next one flies."""
 TIMED_DECISIONS = 60
 """Decisions of a large team that are measured."""
 
@@ -39,40 +43,38 @@ def timed_mission(family: str, agents: int) -> Scenario:
     return team_mission(family, "wedge", agents, composition="set-based", split="test", **way)
 
 
-def times_of(scenario: Scenario, supervisor: str, seed: int, steps: int | None = None) -> np.ndarray:
-    """(M - 1,) what a supervisor took in each mission step but the first, one team alone [ms].
-
-    Args:
-        scenario: of the mission.
-        supervisor: its name.
-        seed: of the layout.
-        steps: M, mission steps; all by default.
-    """
-    world, decider, taken = World(scenario), make_supervisor(supervisor), []
+def flight_times(scenario: Scenario, supervisor: str, seed: int) -> Iterator[float]:
+    """Times that a supervisor takes in the mission steps of one mission but the first, one team alone [ms]."""
+    world, decider = World(scenario), make_supervisor(supervisor)
     observation, memory = world.reset(seed), decider.start(scenario, 1)
-    for _ in range(steps or scenario.mission_steps):
+    for step in range(scenario.mission_steps):
         began = perf_counter()
         decision, memory = decider.decide(observation, memory)
-        taken.append(1e3 * (perf_counter() - began))
+        taken = 1e3 * (perf_counter() - began)
         observation = carry_out(world, decision).observation
-    return np.array(taken[1:])
+        if step:
+            yield taken
 
 
 def per_mission_step(family: str, seed: int) -> dict[str, DecisionTimes]:
-    """Of each supervisor over one mission."""
-    found = {}
-    for name in DECIDERS:
-        taken = times_of(timed_mission(family, TEAM_SIZES[0]), name, seed)
-        found[name] = DecisionTimes(float(taken.mean()), float(np.median(taken)), float(np.percentile(taken, 99)))
-    return found
+    """Of each supervisor over one mission. They fly in turns, so that all see the same changes of the machine's speed."""
+    flights = {name: flight_times(timed_mission(family, TEAM_SIZES[0]), name, seed) for name in DECIDERS}
+    taken: dict[str, list[float]] = {name: [] for name in flights}
+    for _ in range(0, timed_mission(family, TEAM_SIZES[0]).mission_steps, TURN):
+        for name, flight in flights.items():
+            taken[name] += islice(flight, TURN)
+    return {
+        name: DecisionTimes(float(np.mean(times)), float(np.median(times)), float(np.percentile(times, 99)))
+        for name, times in taken.items()
+    }
 
 
 def per_decision(agents: int, seed: int) -> float:
     """Median of what the general policy takes for the decisions of a wedge in a field [ms]."""
     scenario = timed_mission("field", agents)
     every = decision_steps(scenario, make_sight(scenario))
-    taken = times_of(scenario, DECIDERS[0], seed, min(scenario.mission_steps, 1 + TIMED_DECISIONS * every))
-    return float(np.median(taken[every - 1 :: every]))
+    taken = islice(flight_times(scenario, DECIDERS[0], seed), every - 1, TIMED_DECISIONS * every, every)
+    return float(np.median(list(taken)))
 
 
 def report_times() -> None:
