@@ -23,8 +23,8 @@ from marlbc_mj.util.method_names import display_name
 DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
 TEAM_SIZES = (4, 16, 64)
 LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
-TURN = 20
-"""Mission steps of one supervisor after which the next one flies."""
+TURN = 200
+"""Mission steps of one supervisor after which the next one flies: many, so that its data stay in the processor's caches."""
 TIMED_DECISIONS = 60
 """Decisions of a large team that are measured."""
 
