@@ -7,7 +7,7 @@ knows to be blocked, its own among them. What was said more than ``hold`` ago do
 
 An agent that knows of fewer lanes than ``blocked`` asks for all of these: one that has heard of nobody goes by its own lane
 alone. So each connected component of the team decides for itself, and with ideal communication all decisions are those of the
-central rule.
+central rule under the set-based composition. What that rule adds under the null-space one is not here.
 """
 
 from dataclasses import dataclass, field
