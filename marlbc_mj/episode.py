@@ -120,7 +120,7 @@ def run_episode(
         if on_frame is not None:
             on_frame(frames[-1])
         observation, done = step.observation, bool(step.done[0])
-    return _trajectory(world, frames, observation, (seed, *names))
+    return _trajectory(world, frames, (seed, *names))
 
 
 def _frame(
@@ -137,15 +137,15 @@ def _frame(
     return Frame(seen.team(0), record, *verdicts, state, decision_ms, after, pose, shield, links)
 
 
-def _trajectory(world: World, frames: list[Frame], last: Observation, names: tuple[int, str, str]) -> Trajectory:
-    """The frames of a whole episode, and the ``last`` observation of its end, as one record.
+def _trajectory(world: World, frames: list[Frame], names: tuple[int, str, str]) -> Trajectory:
+    """The frames of a whole episode, and the state at its end, as one record.
 
     ``names`` are seed, supervisor and controller.
     """
     scenario, state = world.scenario, world.state
     position, velocity, *others = (np.concatenate(rows) for rows in zip(*(f.record for f in frames), strict=True))
     reference, reference_velocity, force = others
-    formation = [*(f.observation.formation for f in frames[1:]), last.formation[0]]
+    formation = [*(f.observation.formation for f in frames[1:]), state.formation[0]]
     return Trajectory(
         scenario=scenario,
         supervisor=names[1],

@@ -176,23 +176,17 @@ def _cannot_reach(x, y, way, radius, length):
     return x * x + y * y > (way + (1.0 + MOST_BEYOND) * length + radius) ** 2
 
 
-def pool_heard(heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+@compiled
+def pool_heard(heard, age):
     """(B, R, POOLED) float32 of what R receivers of B teams have heard; receivers may be one that stands for all.
 
     Minima and means are over the senders heard so far; the means of clearances are shares of negative ones: of blocked lanes.
 
     Args:
-        heard: (B, R, N, M) last vectors heard of each sender.
+        heard: (B, R, N, M) float32 last vectors heard of each sender.
         age: (B, R, N) how old they are [T]; infinite where nothing was heard.
     """
-    pooled = np.empty((*heard.shape[:2], POOLED), dtype=np.float32)
-    _fill_pooled(np.ascontiguousarray(heard, dtype=np.float32), np.ascontiguousarray(age), pooled)
-    return pooled
-
-
-@compiled
-def _fill_pooled(heard, age, pooled):
-    """:func:`pool_heard` into ``pooled`` (B, R, POOLED)."""
+    pooled = np.empty((heard.shape[0], heard.shape[1], POOLED), dtype=np.float32)
     changing = AGE_ENTRIES + 2 - WAYS
     senders = heard.shape[2]
     for b in range(heard.shape[0]):
@@ -218,6 +212,7 @@ def _fill_pooled(heard, age, pooled):
                 total[j] /= count
             row[2 * SENT + changing] = count / senders
             row[2 * SENT + changing + 1] = 1.0 - np.exp(-oldest / COARSE)
+    return pooled
 
 
 def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
@@ -233,12 +228,8 @@ def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.
 @compiled
 def _fill_inputs(features, heard, age, inputs):
     """:func:`join_inputs` into ``inputs`` (B, N, S)."""
-    pooled = np.empty((heard.shape[0], heard.shape[1], POOLED), dtype=np.float32)
-    _fill_pooled(heard, age, pooled)
+    pooled = pool_heard(heard, age)
     for b in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):
-            row, known = inputs[b, i], pooled[b, min(i, heard.shape[1] - 1)]
-            for j in range(FEATURES):
-                row[j] = features[b, i, j]
-            for j in range(POOLED):
-                row[FEATURES + j] = known[j]
+            inputs[b, i, :FEATURES] = features[b, i]
+            inputs[b, i, FEATURES:] = pooled[b, min(i, heard.shape[1] - 1)]

@@ -7,27 +7,22 @@
 import argparse
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
 
-import numpy as np
-
-from marlbc_mj.core.communication import Communication
-from marlbc_mj.policies.general import GeneralPolicy, mean_policy, read_general
+from marlbc_mj.policies.general import mean_policy, read_general
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
+from marlbc_mj.studies.communication import NetworkCase
 from marlbc_mj.studies.safety import GROUNDS
-from marlbc_mj.supervisors.general import General
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import MarlbcError, unknown
 
-NEIGHBOR_DISTANCE = 6.0
-"""Distance of neighbors in the wedge [m]."""
-POOR_RADIO = Communication(range=1.2 * NEIGHBOR_DISTANCE, delay=0.1, loss=0.2, silent=(0,))
+POOR_NETWORK = NetworkCase(range=1.2, delay=0.1, loss=0.2, silent=True)
 """Of missions with ``silent``: nobody hears the first agent, and the others miss a fifth of all messages."""
 _SILENT, _LINES = "silent", "lines"
-"""Ends of names: missions with :data:`POOR_RADIO`, and those where FR comes to its slots along their lines."""
+"""Ends of names: missions with :data:`POOR_NETWORK`, and those where FR comes to its slots along their lines."""
 VALIDATION_MISSIONS = (
     *(f"{family} wedge-4" for family in GROUNDS),
     *(f"{family} wedge-4 {_SILENT}" for family in ("field", "gates", "corridor")),
@@ -40,15 +35,6 @@ VALIDATION_MISSIONS = (
 """Names of the missions: family, team, and what is different."""
 
 
-class Passed(NamedTuple):
-    """Outcomes of a policy on layouts of one mission."""
-
-    success: int  # layouts on which everybody ended in its place, and nobody violated
-    violated: int
-    total: float  # median return
-    switches: float  # median per agent
-
-
 def validation_mission(name: str) -> Scenario:
     """The scenario of one of :data:`VALIDATION_MISSIONS`.
 
@@ -58,19 +44,9 @@ def validation_mission(name: str) -> Scenario:
     if name not in VALIDATION_MISSIONS:
         raise unknown("validation mission", name, VALIDATION_MISSIONS)
     family, team, *different = name.split()
-    changes: dict[str, Any] = {"composition": "set-based", "split": "test"}
-    if _SILENT in different:
-        changes["communication"] = POOR_RADIO
-    if _LINES in different:
-        changes["column_approach"] = "line"
-    return team_mission(family, *read_team(team), **changes)
-
-
-def passed(policy: GeneralPolicy, judge: Judge, seed: int) -> Passed:
-    """Fly the layouts of a judge."""
-    verdict = judge(General(policy), seed)
-    switches = float(np.median(verdict.switches)) / judge.scenario.agents
-    return Passed(int(verdict.success.sum()), int(verdict.violated.sum()), float(np.median(verdict.total)), switches)
+    approach = "line" if _LINES in different else "straight"
+    scenario = team_mission(family, *read_team(team), composition="set-based", split="test", column_approach=approach)
+    return replace(scenario, communication=POOR_NETWORK.settings(scenario)) if _SILENT in different else scenario
 
 
 def validate(arguments: Sequence[str] | None = None) -> None:
@@ -91,13 +67,13 @@ def validate(arguments: Sequence[str] | None = None) -> None:
         policy = mean_policy(policies, margin)._replace(dwell=given.dwell, deadline=given.deadline)
         successes = violations = 0
         for name, judge in judges.items():
-            found = passed(policy, judge, given.seed)
+            score = judge.score(policy, given.seed)
             print(
-                f"margin {margin:g}, {name}: {found.success} of {given.layouts} succeed, {found.violated} violate; "
-                f"median return {found.total:.0f}, {found.switches:.2f} switches per agent",
+                f"margin {margin:g}, {name}: {score.succeeded} of {score.layouts} succeed, {score.violated} violate; "
+                f"median return {score.total:.0f}, {score.switches:.2f} switches per agent",
                 flush=True,
             )
-            successes, violations = successes + found.success, violations + found.violated
+            successes, violations = successes + score.succeeded, violations + score.violated
         print(f"margin {margin:g}: {successes} of {given.layouts * len(judges)} succeed, {violations} violate", flush=True)
 
 

@@ -30,6 +30,16 @@ class Verdict(NamedTuple):
         return np.asarray(self.reached & ~self.violated)
 
 
+class JudgeScore(NamedTuple):
+    """Outcomes of one mission's layouts together."""
+
+    layouts: int
+    succeeded: int
+    violated: int
+    total: float  # median return
+    switches: float  # median, of an agent
+
+
 class Judge:
     """Whole missions on the same held-out layouts of one scenario, again and again.
 
@@ -62,13 +72,19 @@ class Judge:
         away = np.linalg.norm(world.state.position - centre - scenario.formations[0], axis=-1)
         return Verdict(total, (away <= scenario.formation_tolerance).all(axis=1), violated, switches)
 
+    def score(self, policy: GeneralPolicy, seed: int = VALIDATION_SEED) -> JudgeScore:
+        """All missions under a policy, as it is."""
+        verdict = self(General(policy), seed)
+        counts = int(verdict.success.sum()), int(verdict.violated.sum())
+        medians = float(np.median(verdict.total)), float(np.median(verdict.switches)) / self.scenario.agents
+        return JudgeScore(len(verdict.total), *counts, *medians)
+
 
 def judge_policy(policy: GeneralPolicy, judges: dict[str, Judge]) -> dict[str, float]:
     """Success rate, median return and median switches per agent of each family, by ``success_field`` and so on."""
     row: dict[str, float] = {}
     for name, judge in judges.items():
-        verdict = judge(General(policy))
-        row[f"success_{name}"] = float(verdict.success.mean())
-        row[f"return_{name}"] = float(np.median(verdict.total))
-        row[f"switches_{name}"] = float(np.median(verdict.switches)) / judge.scenario.agents
+        score = judge.score(policy)
+        row[f"success_{name}"] = score.succeeded / score.layouts
+        row[f"return_{name}"], row[f"switches_{name}"] = score.total, score.switches
     return row

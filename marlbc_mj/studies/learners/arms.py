@@ -22,7 +22,6 @@ from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.studies.learners.records import lines_by
 from marlbc_mj.studies.protocol import Report, Stopped, Watch
-from marlbc_mj.supervisors.general import General
 from marlbc_mj.training.general.config import DRAWN, JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.general.judging import VALIDATION_SEED, Judge
 from marlbc_mj.training.general.run import make_general_trainer
@@ -177,13 +176,8 @@ def _judges(layouts: int, composition: str) -> dict[str, Judge]:
 
 def _fly(policy: GeneralPolicy, margin: float, judges: Mapping[str, Judge], first: int) -> list[ArmScore]:
     """All missions from the layout ``first`` on, with a switching margin in the place of the policy's own, and no dwell time."""
-    supervisor, scores = General(mean_policy([policy], margin)), []
-    for mission, judge in judges.items():
-        verdict = judge(supervisor, first)
-        counts = int(verdict.success.sum()), int(verdict.violated.sum())
-        medians = float(np.median(verdict.total)), float(np.median(verdict.switches)) / judge.scenario.agents
-        scores.append(ArmScore(mission, len(verdict.total), *counts, *medians, margin))
-    return scores
+    flown = mean_policy([policy], margin)
+    return [ArmScore(mission, *judge.score(flown, first), margin) for mission, judge in judges.items()]
 
 
 def _standing(scores: Sequence[ArmScore]) -> tuple[int, float]:
