@@ -3,7 +3,7 @@
 SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DEFAULT_GOAL := help
-.PHONY: help venv benchmark test test-all kills slurm-test fuzz lint wheel wheel-test docs gallery clean
+.PHONY: help runtime venv benchmark test test-all kills slurm-test fuzz lint wheel wheel-test docs gallery clean
 
 PYTHON ?=
 CANDIDATES := python3.12 python3.11 python3 python
@@ -37,7 +37,7 @@ help:
 	@echo 'make gallery     draw the pictures in docs/gallery anew'
 	@echo 'make clean       remove .venv, builds and caches; results in out and runs stay'
 
-benchmark: venv
+benchmark: runtime
 	@$(BIN)/marlbc bench paper --out out/paper --overwrite
 
 test: venv
@@ -87,7 +87,7 @@ docs: venv
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --site-dir out/docs
 	@echo out/docs/index.html
 
-gallery: venv
+gallery: runtime
 	@MUJOCO_GL=$${MUJOCO_GL:-egl} $(BIN)/python docs/make_gallery.py
 
 clean:
@@ -104,7 +104,7 @@ endef
 
 # Installed again when the two files below change, made anew when the folder has moved or the Python is gone.
 # The lock is for two makes at once.
-venv:
+runtime:
 	@mkdir -p .cache; exec 9>.cache/venv.lock; if command -v flock >/dev/null; then flock 9; fi; \
 	wanted="$$(cat pyproject.toml constraints.txt | cksum) $$PWD"; \
 	found=$$(cat $(STAMP) 2>/dev/null || :); \
@@ -117,5 +117,15 @@ venv:
 		rm -rf .venv; "$$python" -m venv .venv;; \
 	esac; \
 	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
-	rm -f $(STAMP); $(INSTALL) -e '.[dev]'; \
+	rm -f $(STAMP)*; $(INSTALL) -e .; \
 	echo "$$wanted" > $(STAMP)
+
+# What the tests and the linters need beside it. The package itself stays as it is, so that it can run meanwhile.
+venv: runtime
+	@exec 9>.cache/venv.lock; if command -v flock >/dev/null; then flock 9; fi; \
+	if cmp -s $(STAMP) $(STAMP)-dev; then exit 0; fi; \
+	echo 'installing what the tests need into .venv, half a minute or more'; \
+	$(BIN)/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"]["optional-dependencies"]["dev"], sep="\n")' \
+		> .cache/dev.txt; \
+	$(INSTALL) -r .cache/dev.txt; \
+	cp $(STAMP) $(STAMP)-dev
