@@ -1,7 +1,7 @@
 """Teams that talk, in whole missions: the distributed look-ahead, its logs and pictures, and the study of what it costs."""
 
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,7 @@ from marlbc_mj.studies.communication import CASES, CommunicationStudy, NetworkCa
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.supervisors import DistributedLookAhead, LookAhead, make_supervisor
 from marlbc_mj.supervisors.communication import Hearing
+from marlbc_mj.supervisors.set_based_rule import IN_COLUMN, IN_FORMATION
 from marlbc_mj.util.errors import ConfigurationError
 
 POOR = Communication(range=7.2, delay=0.1, loss=0.2, silent=(0,), silent_from=1.0)
@@ -49,14 +50,20 @@ def orders_of(supervisor, scenario: Scenario, steps: int, worlds: int = 1) -> np
 # The distributed look-ahead -----------------------------------------------------------------------------------------------------
 
 
-def test_with_ideal_communication_it_is_the_central_rule():
-    """Order for order, also by flooding over a range that reaches everyone at once."""
-    scenario = gates()
-    central = orders_of(LookAhead(), scenario, 400)
+@pytest.mark.parametrize(
+    ("family", "composition", "steps"),
+    [("gates", "set-based", 400), ("field", "null-space", 300), ("corridor", "null-space", 850)],
+)
+def test_with_ideal_communication_it_is_the_central_rule(family, composition, steps):
+    """Order for order, also by flooding over a range that reaches everyone at once.
+
+    Without the two conditions of null-space other orders are given from step 178 of the field and 787 of the corridor on.
+    """
+    scenario = make_scenario(family, composition=composition)
+    central = orders_of(LookAhead(), scenario, steps)
     assert len(np.unique(central)) == 2
-    np.testing.assert_array_equal(orders_of(DistributedLookAhead(), scenario, 400), central)
-    near = gates(communication=Communication(range=1000.0))
-    np.testing.assert_array_equal(orders_of(DistributedLookAhead(), near, 400), central)
+    for given in (scenario, replace(scenario, communication=Communication(range=1000.0))):
+        np.testing.assert_array_equal(orders_of(DistributedLookAhead(), given, steps), central)
 
 
 def test_poor_communication_changes_decisions_and_no_team_depends_on_the_batch():
@@ -79,8 +86,24 @@ def test_poor_communication_changes_decisions_and_no_team_depends_on_the_batch()
     ],
 )
 def test_an_agent_counts_the_votes_that_it_knows(votes, age, expected):
-    given = [np.array(row, dtype=float)[None, None] for row in (votes, age)]
-    assert DistributedLookAhead().agree(*given).tolist() == [[expected]]
+    heard, ages = (np.array(row, dtype=float)[None, None] for row in (votes, age))
+    motion = DistributedLookAhead().agree(heard[..., None], ages, np.array([[IN_FORMATION]]))
+    assert motion.tolist() == [[IN_COLUMN if expected else IN_FORMATION]]
+
+
+@pytest.mark.parametrize(
+    ("narrow", "shut", "last", "expected"),
+    [
+        (0, 0, IN_FORMATION, IN_COLUMN),
+        (1, 0, IN_FORMATION, IN_FORMATION),  # a column whose own lane is blocked helps nobody
+        (1, 1, IN_FORMATION, IN_FORMATION),
+        (1, 1, IN_COLUMN, IN_COLUMN),  # nobody leaves the column while one is shut in
+        (1, 0, IN_COLUMN, IN_FORMATION),
+    ],
+)
+def test_under_null_space_one_agent_is_enough_against_a_column_or_for_it(narrow, shut, last, expected):
+    votes = np.array([[[[1, 0, 0], [1, narrow, 0], [0, 0, shut]]]], dtype=float)
+    assert DistributedLookAhead().agree(votes, np.zeros((1, 1, 3)), np.array([[last]])).tolist() == [[expected]]
 
 
 def test_a_hold_that_cannot_be_is_refused():

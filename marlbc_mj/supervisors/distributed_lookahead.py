@@ -1,13 +1,14 @@
 """Look ahead without a center: every agent watches its own lane, tells the others, and decides from what it has heard.
 
 The rule is that of :mod:`marlbc_mj.supervisors.lookahead`: the column while at least ``blocked`` lanes are blocked, else the
-formation. An agent knows the plan and the obstacles along its own lane. What it says is whether that lane is blocked; the
-communication layer of the scenario carries it (:mod:`marlbc_mj.supervisors.communication`). Each agent counts the lanes that it
-knows to be blocked, its own among them. What was said more than ``hold`` ago does not count.
+formation. An agent knows the plan and the obstacles along its own lane. What it says is whether that lane is blocked and, under
+the null-space composition, whether its lane of the column is and whether it is shut in. The communication layer of the scenario
+carries it (:mod:`marlbc_mj.supervisors.communication`). Each agent counts those of whom it knows that they see such a thing,
+itself among them. What was said more than ``hold`` ago does not count.
 
 An agent that knows of fewer lanes than ``blocked`` asks for all of these: one that has heard of nobody goes by its own lane
 alone. So each connected component of the team decides for itself, and with ideal communication all decisions are those of the
-central rule under the set-based composition. What that rule adds under the null-space one is not here.
+central rule.
 """
 
 from dataclasses import dataclass, field
@@ -18,7 +19,7 @@ import numpy as np
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
-from marlbc_mj.supervisors.lookahead import Lanes, LookAhead, blocked_lanes
+from marlbc_mj.supervisors.lookahead import Lanes, LookAhead
 from marlbc_mj.supervisors.set_based_rule import IN_COLUMN, IN_FORMATION, rule_orders
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -28,6 +29,7 @@ class Votes(NamedTuple):
 
     lanes: Lanes
     layer: Layer
+    motion: np.ndarray  # (B, N) of every agent, in force: IN_FORMATION or IN_COLUMN
     network: Any  # the layer's memory
 
 
@@ -52,23 +54,28 @@ class DistributedLookAhead:
         Raises:
             ConfigurationError: the scenario lacks an order.
         """
-        layer = make_layer(scenario)
-        return Votes(self.rule.start(scenario, teams), layer, layer.start(teams, 1))
+        lanes, layer = self.rule.start(scenario, teams), make_layer(scenario)
+        motion = np.full((teams, scenario.agents), IN_FORMATION)
+        return Votes(lanes, layer, motion, layer.start(teams, 3 if lanes.exposed else 1))
 
     def decide(self, observation: Observation, memory: Votes) -> tuple[np.ndarray, Votes]:
         """Motion and avoidance per agent."""
         lanes, now = memory.lanes, observation.time
-        own = blocked_lanes(observation, lanes, (-self.rule.behind, self.rule.ahead))[..., None].astype(np.float64)
+        own = self.rule.watch(observation, lanes).astype(np.float64)
         (heard, stamp), network = memory.layer.exchange(now, observation.position, own, memory.network, observation.noise_seed)
-        column = self.agree(heard[..., 0], now[:, None, None] - stamp)
-        either = (rule_orders(observation, np.full(len(now), motion), lanes.rule) for motion in (IN_COLUMN, IN_FORMATION))
-        return np.where(column, *either), memory._replace(network=network)
+        motion = self.agree(heard, now[:, None, None] - stamp, memory.motion)
+        column, formation = (rule_orders(observation, np.full(len(now), each), lanes.rule) for each in (IN_COLUMN, IN_FORMATION))
+        return np.where(motion == IN_COLUMN, column, formation), memory._replace(motion=motion, network=network)
 
-    def agree(self, votes: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, N) bool: who goes for the column, from the votes that each agent heard and their ages [s], (B, N, N) each.
+    def agree(self, votes: np.ndarray, age: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """(B, N) motion of every agent.
 
-        Votes are 0 or 1; under consensus each is the agent's estimate of their mean, so half a vote decides.
+        Args:
+            votes: (B, N, N, M) 0 or 1, what each agent heard of each that it sees; M as :meth:`LookAhead.watch` has it. Under
+                consensus each is the agent's estimate of their mean.
+            age: (B, N, N) of these votes [s].
+            last: (B, N) the motion in force.
         """
         known = age <= self.hold + 1e-9
-        most = np.minimum(self.rule.blocked, known.sum(axis=2))
-        return np.asarray((votes * known).sum(axis=2) >= most - 0.5)
+        enough = np.minimum(self.rule.blocked, known.sum(axis=2))
+        return self.rule.motion((votes * known[..., None]).sum(axis=2), enough, last)

@@ -81,13 +81,32 @@ class LookAhead:
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
         """One motion per team, avoidance per agent."""
-        column = blocked_lanes(observation, memory, (-self.behind, self.ahead)).sum(axis=1) >= self.blocked
-        if memory.exposed:
-            narrow = blocked_lanes(observation, memory._replace(slots=memory.column), (0.0, self.ahead)).any(axis=1)
-            stays = (memory.motion == IN_COLUMN) & shut_in(observation, memory, self.change).any(axis=1)
-            column = (column & ~narrow) | stays
-        motion = np.where(column, IN_COLUMN, IN_FORMATION)
+        agents = self.watch(observation, memory).sum(axis=1)
+        motion = self.motion(agents, np.full(len(agents), self.blocked), memory.motion)
         return rule_orders(observation, motion, memory.rule), memory._replace(motion=motion)
+
+    def watch(self, observation: Observation, lanes: Lanes) -> np.ndarray:
+        """(B, N, M) bool, what each agent sees by itself: whether its lane of the formation is blocked (M = 1).
+
+        Where orders lead into obstacles, also whether its lane of the column is, and whether it is shut in (M = 3).
+        """
+        sights = [blocked_lanes(observation, lanes, (-self.behind, self.ahead))]
+        if lanes.exposed:
+            sights.append(blocked_lanes(observation, lanes._replace(slots=lanes.column), (0.0, self.ahead)))
+            sights.append(shut_in(observation, lanes, self.change))
+        return np.stack(sights, axis=-1)
+
+    def motion(self, agents: np.ndarray, enough: np.ndarray, last: np.ndarray) -> np.ndarray:
+        """IN_COLUMN or IN_FORMATION, from how many ``agents`` (..., M) see each thing that :meth:`watch` names.
+
+        ``enough`` (...,) blocked lanes make a column, and ``last`` (...,) is the motion in force. Numbers of agents may be
+        estimates: half an agent decides.
+        """
+        column = agents[..., 0] >= enough - 0.5
+        if agents.shape[-1] > 1:
+            narrow, shut = np.moveaxis(agents[..., 1:] >= 0.5, -1, 0)
+            column = (column & ~narrow) | ((last == IN_COLUMN) & shut)
+        return np.where(column, IN_COLUMN, IN_FORMATION)
 
 
 def blocked_lanes(observation: Observation, lanes: Lanes, span: tuple[float, float]) -> np.ndarray:
