@@ -9,7 +9,7 @@ import numpy as np
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.core.motion import obstacles_at
 from marlbc_mj.core.orders import SEPARATOR
-from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.base import Scenario, desired_centroid
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -108,8 +108,7 @@ class Route:
 
     def _centre(self, step: int) -> np.ndarray:
         """(2,) desired centroid at a mission step [m]."""
-        scenario = self.scenario
-        return np.array(scenario.path_origin) + step * scenario.mission_step * np.array(scenario.path_velocity)
+        return desired_centroid(self.scenario, step * self.scenario.mission_step)
 
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
         """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""

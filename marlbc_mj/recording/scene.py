@@ -18,7 +18,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from marlbc_mj.core.motion import NUMBERS, obstacles_at
 from marlbc_mj.engine.assembly import OBSTACLE_HEIGHT, POINT_RADIUS
 from marlbc_mj.recording.links import drawn_links
-from marlbc_mj.scenarios import Scenario
+from marlbc_mj.scenarios.base import Scenario, desired_centroid
 from marlbc_mj.supervisors.communication import Hearing
 from marlbc_mj.util.palette import BEHAVIOR_COLORS, agent_color, rgba
 
@@ -190,11 +190,10 @@ def _paths(series: list[tuple[str, str]]) -> list[dict[str, Any]]:
 
 def _scene_panel(scenario: Scenario) -> dict[str, Any]:
     """The 3D panel, seen from above the middle of the path."""
-    travel = 0.5 * scenario.duration * np.array(scenario.path_velocity)
-    middle = (np.array(scenario.path_origin) + travel).tolist()
+    middle = desired_centroid(scenario, 0.5 * scenario.duration).tolist()
     camera = {
         "perspective": True,
-        "distance": float(20.0 + 2.0 * np.linalg.norm(travel)),
+        "distance": float(20.0 + scenario.duration * np.linalg.norm(scenario.path_velocity)),
         "phi": 0.0,
         "thetaOffset": 0.0,
         "targetOffset": [*middle, 0.0],

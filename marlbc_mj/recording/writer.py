@@ -32,7 +32,6 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import check_target, take_name
 from marlbc_mj.util.locks import is_held, lock
 from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
-from marlbc_mj.util.seeding import stream
 
 METADATA = "marlbc"
 """Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
@@ -82,7 +81,7 @@ class LogWriter:
     ) -> None:
         self.path = Path(path)
         self._overwrite = overwrite
-        draw = _draw(scenario, seed)
+        draw = scenario.draw_of(seed)
         metadata = {
             "supervisor": names[0],
             "controller": names[1],
@@ -278,11 +277,6 @@ def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list
         (MODEL, "application/xml", model.encode()),
         (LAYOUT, "application/json", json.dumps(foxglove_layout(scenario)).encode()),
     ]
-
-
-def _draw(scenario: Scenario, seed: int) -> Draw:
-    """The draw with which ``World.reset(seed)`` starts its world 0, from the same stream."""
-    return scenario.draw(stream(seed))
 
 
 def _weight_table(state: np.ndarray) -> np.ndarray:

@@ -10,6 +10,7 @@ from marlbc_mj.core.safety import violates
 from marlbc_mj.core.shield import ShieldCounts
 from marlbc_mj.episode import Trajectory, clearances_after
 from marlbc_mj.recording.log import Course, EpisodeLog, course_of, shield_counts_of
+from marlbc_mj.scenarios.base import Scenario, desired_centroid
 from marlbc_mj.util.errors import ConfigurationError
 
 
@@ -163,14 +164,14 @@ def _shield_totals(flown: _Flown, agent: int) -> tuple[float, float, int]:
 
 
 def _team(flown: _Flown) -> TeamMetrics:
-    positions = flown.position[1:]
+    positions, course = flown.position[1:], flown.course
     return {
         "return": float(flown.reward.sum()),
         "decision_ms_median": float(np.median(flown.decision_ms)),
         "decision_ms_p99": float(np.percentile(flown.decision_ms, 99)),
         "agent_distance_min": float(spacing(positions).min()),
-        "end_error": _end_error(flown),
-        "formation_error": float(_slot_distance(positions, flown.course).mean()),
+        "end_error": float(slot_error(flown.position[-1], course, len(flown.force) * course.substep).max()),
+        "formation_error": float(_slot_distance(positions, course).mean()),
     }
 
 
@@ -189,14 +190,12 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
     return np.where(after < len(above), after * trajectory.scenario.substep, np.nan)
 
 
-def _end_error(flown: _Flown) -> float:
-    """Greatest distance of an agent from its slot around the desired centroid at the end [m]: whether the mission was
-    accomplished.
+def slot_error(positions: np.ndarray, course: Course | Scenario, time: float) -> np.ndarray:
+    """(..., N) distance [m] of agents at ``positions`` (..., N, 2) [m] from their slots at ``time`` [s].
+
+    The slots are those of the first formation around the desired centroid. At the end it says whether a mission was accomplished.
     """
-    course = flown.course
-    end = len(flown.force) * course.substep
-    centroid = np.array(course.path_origin) + end * np.array(course.path_velocity)
-    return float(np.linalg.norm(flown.position[-1] - centroid - course.formations[0], axis=-1).max())
+    return np.asarray(np.linalg.norm(positions - desired_centroid(course, time) - course.formations[0], axis=-1))
 
 
 def _slot_distance(positions: np.ndarray, course: Course) -> np.ndarray:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from math import factorial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from marlbc_mj.robots import RobotFleet, make_fleet
 from marlbc_mj.scenarios.layout import SPLITS, Layout, Motion, check_motions, layout_number, motion_array
 from marlbc_mj.scenarios.robot_names import PAPER_ROBOT, settle_robots
 from marlbc_mj.util.errors import ConfigurationError, unknown
+from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.settings import check_kinds
 
 Point = tuple[float, float]
@@ -29,6 +30,20 @@ COMPOSITIONS = ("null-space", "set-based")
 """Avoidance as an equality task (12), or as an inequality."""
 YOUNG = {"young": True}
 """Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
+
+
+class OnPath(Protocol):
+    """What has a mission's path: a scenario, or what a log keeps of one."""
+
+    @property
+    def path_origin(self) -> Point: ...
+    @property
+    def path_velocity(self) -> Point: ...
+
+
+def desired_centroid(mission: OnPath, time: float) -> np.ndarray:
+    """(2,) p_cd of a mission at ``time`` [s], in m."""
+    return np.array(mission.path_origin) + time * np.array(mission.path_velocity)
 
 
 class Obstacle(NamedTuple):
@@ -213,6 +228,14 @@ class Scenario:
             if (gaps > 0).all():
                 return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)), motions, number)
         raise ConfigurationError(f"scenario {self.name!r}: {spread} puts an obstacle on a start in every one of 100 draws")
+
+    def draw_of(self, seed: int) -> Draw:
+        """The draw with which ``World.reset(seed)`` starts its world 0.
+
+        Raises:
+            ConfigurationError: as :meth:`draw`.
+        """
+        return self.draw(stream(seed))
 
     def _lay_out(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int | None]:
         """Obstacles (K, 3), motions (K, 6) or (0, 6), and the number of the layout if there is one."""

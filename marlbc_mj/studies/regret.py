@@ -29,7 +29,6 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
-from marlbc_mj.util.seeding import stream
 
 
 class RegretJob(NamedTuple):
@@ -125,7 +124,7 @@ def frozen(scenario: Scenario, seed: int) -> Scenario:
     Raises:
         ConfigurationError: obstacles move, which the search cannot plan around.
     """
-    draw = scenario.draw(stream(seed))
+    draw = scenario.draw_of(seed)
     if len(draw.motions):
         raise ConfigurationError(f"mission {scenario.name!r} has obstacles that move; the search plans around those at rest")
     return replace(

@@ -8,6 +8,7 @@ from marlbc_mj.controllers import make_controller
 from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.general import GeneralPolicy
+from marlbc_mj.results.metrics import slot_error
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.base import Supervisor
 from marlbc_mj.supervisors.general import General
@@ -68,9 +69,8 @@ class Judge:
             total += world.state.reward
             violated |= violates(observation.clearance, scenario.safe_distance).any(axis=1)
             switches += (observation.command != previous.command).sum(axis=1) * (step > 0)
-        centre = np.array(scenario.path_origin) + scenario.duration * np.array(scenario.path_velocity)
-        away = np.linalg.norm(world.state.position - centre - scenario.formations[0], axis=-1)
-        return Verdict(total, (away <= scenario.formation_tolerance).all(axis=1), violated, switches)
+        away = slot_error(world.state.position, scenario, scenario.duration).max(axis=1)
+        return Verdict(total, away <= scenario.formation_tolerance, violated, switches)
 
     def score(self, policy: GeneralPolicy, seed: int = VALIDATION_SEED) -> JudgeScore:
         """All missions under a policy, as it is."""
