@@ -102,8 +102,8 @@ for candidate in $(if $(PYTHON),'$(PYTHON)',$(CANDIDATES)); do \
 done
 endef
 
-# Installed again when the two files below change, made anew when the folder has moved or the Python is gone.
-# The lock is for two makes at once.
+# The package, with what its robots need. Installed again when the two files below change, made anew when the folder has moved
+# or the Python is gone. The lock is for two makes at once.
 runtime:
 	@mkdir -p .cache; exec 9>.cache/venv.lock; if command -v flock >/dev/null; then flock 9; fi; \
 	wanted="$$(cat pyproject.toml constraints.txt | cksum) $$PWD"; \
@@ -117,7 +117,7 @@ runtime:
 		rm -rf .venv; "$$python" -m venv .venv;; \
 	esac; \
 	echo "installing into .venv with $$($(BIN)/python --version), a minute or more"; \
-	rm -f $(STAMP)*; $(INSTALL) -e .; \
+	rm -f $(STAMP)*; $(INSTALL) -e '.[robots]'; \
 	echo "$$wanted" > $(STAMP)
 
 # What the tests and the linters need beside it. The package itself stays as it is, so that it can run meanwhile.
