@@ -193,9 +193,9 @@ class World:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
             SimulationError: a number left the physical range or is NaN; names world, agent and time.
         """
-        step = self.try_step(orders, velocity)
-        self.raise_if_diverged()
-        return step
+        if self._advance_checked(orders, velocity):
+            self.raise_if_diverged()
+        return self._outcome()
 
     def try_step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
         """:meth:`step`, but worlds that diverge stop no other: ``state.status`` is not 0 where one did.
@@ -203,12 +203,8 @@ class World:
         Raises:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
         """
-        orders = self._checked(orders)
-        if velocity is not None:
-            velocity = self._checked_velocity(velocity)
-        self.advance(orders, velocity)
-        done = self.state.steps >= self.scenario.mission_steps
-        return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
+        self._advance_checked(orders, velocity)
+        return self._outcome()
 
     def rollout(self, orders: np.ndarray) -> np.ndarray:
         """Many mission steps with orders known beforehand, in one compiled call: a schedule, or candidates of a search.
@@ -261,6 +257,15 @@ class World:
             return self._play(self._returns, orders[np.newaxis], given)
         mission_step = laws.plain(loop.mission_step)
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
+
+    def _advance_checked(self, orders: np.ndarray, velocity: np.ndarray | None) -> int:
+        """:meth:`advance` with what a caller hands in; how many worlds failed."""
+        return self.advance(self._checked(orders), None if velocity is None else self._checked_velocity(velocity))
+
+    def _outcome(self) -> Step:
+        """What the mission step that was just made returns."""
+        done = self.state.steps >= self.scenario.mission_steps
+        return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 
     def _checked(self, orders: np.ndarray) -> np.ndarray:
         return team.check_orders(self.plan, self.scenario.orders.read(orders), self.worlds)

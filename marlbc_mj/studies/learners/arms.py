@@ -35,35 +35,46 @@ from marlbc_mj.util.provenance import provenance
 class Arm(NamedTuple):
     """One way to train the general policy."""
 
+    title: str
     line: str
     changes: Mapping[str, Any] = {}
 
 
 ARMS: dict[str, Arm] = {
-    "full": Arm("the defaults: VDN, one TD error for the mean of a team's values"),
-    "no-pooling": Arm("an agent hears nobody", {"hide": ("pooled",)}),
-    "no-lanes": Arm("no clearance along the lanes of the slots, own or heard", {"hide": ("lanes",)}),
-    "hysteretic": Arm("every agent learns by itself, and half of each negative TD error counts", {"learner": "hysteretic"}),
-    "lenient": Arm("every agent learns by itself, and overlooks some negative TD errors", {"learner": "lenient"}),
-    "plain": Arm("every agent learns by itself, and all TD errors count", {"learner": "plain"}),
-    "qmix": Arm("QMIX: one TD error for a monotonic mixture of the team's values", {"learner": "qmix"}),
+    "full": Arm("VDN, the default", "one TD error for the mean of a team's values"),
+    "no-pooling": Arm("no pooling", "an agent hears nobody", {"hide": ("pooled",)}),
+    "no-lanes": Arm("no lanes", "no clearance along the lanes of the slots, own or heard", {"hide": ("lanes",)}),
+    "hysteretic": Arm(
+        "hysteretic", "every agent learns by itself, and half of each negative TD error counts", {"learner": "hysteretic"}
+    ),
+    "lenient": Arm("lenient", "every agent learns by itself, and overlooks some negative TD errors", {"learner": "lenient"}),
+    "plain": Arm("plain", "every agent learns by itself, and all TD errors count", {"learner": "plain"}),
+    "qmix": Arm("QMIX", "one TD error for a monotonic mixture of the team's values", {"learner": "qmix"}),
     # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
     "mappo": Arm(
-        "MAPPO: one actor for all agents, a critic that sees the team, and no cost of a switch",
+        "MAPPO",
+        "one actor for all agents, a critic that sees the team, and no cost of a switch",
         {"learner": "mappo", "switch_cost": 0.0},
     ),
-    "imitation": Arm("no rewards: in all episodes the look-ahead that guides a quarter is imitated", {"learner": "imitation"}),
-    "no-guide": Arm("no episodes under a look-ahead", {"guided": 0.0}),
-    "no-joint-exploration": Arm("every agent explores by itself", {"together": 0.0}),
-    "no-switch-cost": Arm("a switch costs nothing while learning", {"switch_cost": 0.0}),
-    "all-heard": Arm("no episodes with a silent agent", {"silent": 0.0}),
+    "imitation": Arm(
+        "imitation alone",
+        "no rewards; in all episodes the look-ahead that guides a quarter is imitated",
+        {"learner": "imitation"},
+    ),
+    "no-guide": Arm("no guide", "no episodes under a look-ahead", {"guided": 0.0}),
+    "no-joint-exploration": Arm("no joint exploration", "every agent explores by itself", {"together": 0.0}),
+    "no-switch-cost": Arm("no switch cost", "a switch costs nothing while learning", {"switch_cost": 0.0}),
+    "all-heard": Arm("no silent agents", "no episodes with a silent agent", {"silent": 0.0}),
     "null-space": Arm(
+        "null-space composition",
         "learns and flies under the composition of the paper: an agent also decides whether avoidance is on top",
         {"composition": "null-space"},
     ),
-    "two-families": Arm("gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),
+    "two-families": Arm("two families", "gates and corridor alone", {"families": ("gates", "corridor", "gates", "corridor")}),
     **{
-        f"without-{left}": Arm(f"never trained on {left}", {"families": tuple(f for f in GeneralConfig().families if f != left)})
+        f"without-{left}": Arm(
+            f"without {left}", f"never trained on {left}", {"families": tuple(f for f in GeneralConfig().families if f != left)}
+        )
         for left in DRAWN
     },
 }
@@ -209,13 +220,13 @@ def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
         each = [fixed(float(np.mean(success_of_seeds(lines, [mission]))), 1) for mission in missions]
         violated, flights = (sum(row[key] for row in lines) for key in ("violated", "layouts"))
         spread = f"{np.mean(every):.1f} [{min(every):.1f}, {max(every):.1f}]"
-        cells.append((name, str(len(every)), spread, *each, f"{violated} of {flights}"))
+        cells.append((ARMS[name].title, str(len(every)), spread, *each, f"{violated} of {flights}"))
     columns = (
         *(Column("", "arm"), Column("", "trainings"), Column("five families", "mean (least to greatest)", "%")),
         *(Column("success", mission, "%") for mission in missions),
         Column("", "violated"),
     )
-    notes = tuple(f"{name}: {ARMS[name].line}" for name in arms)
+    notes = tuple(f"{ARMS[name].title}: {ARMS[name].line}" for name in arms)
     return Table("arms", "Ablations of the general policy", columns, tuple(cells), notes)
 
 
@@ -231,7 +242,7 @@ def draw_arms(rows: Sequence[Mapping[str, Any]]) -> Figure:
     axes.set_xscale("symlog", linthresh=1.0)
     axes.set_xticks([0, 0.5, 1, 10, 100], ["0", "0.5", "1", "10", "100"])
     axes.set_xlim(-0.08, 110)
-    axes.set_yticks(range(len(arms)), list(arms))
+    axes.set_yticks(range(len(arms)), [ARMS[name].title for name in arms])
     axes.set_ylim(len(arms) - 0.5, -0.5)
     axes.grid(axis="x", linewidth=0.3)
     return figure
