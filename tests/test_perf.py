@@ -58,6 +58,8 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
         rates += figures[key].values()
     assert np.isfinite(rates).all()
     assert min(rates) > 0
+    assert set(figures["loop_parts_us"]) == {perf.BARE, *perf.LOOP_PARTS}
+    assert np.isfinite(list(figures["loop_parts_us"].values())).all() and figures["loop_parts_us"][perf.BARE] > 0
     assert figures["episode_s"] > 0
     assert figures["record_s"] > 0
     for threads, shares in figures["training_profile"].items():

@@ -1,8 +1,9 @@
 """How fast the benchmark is on this machine: one job per group of variants, which take turns so that their ratios hold."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from time import process_time
@@ -11,7 +12,9 @@ from typing import Any, NamedTuple
 import numba
 import numpy as np
 
-from marlbc_mj.controllers import SORLC, Controller
+from marlbc_mj.controllers import PD, SORLC, Controller
+from marlbc_mj.core import laws
+from marlbc_mj.core.disturbances import ConstantWind, Disturbance, PaperDrag
 from marlbc_mj.core.laws import compiled, plain, threaded
 from marlbc_mj.engine.native import call_step, step_address
 from marlbc_mj.engine.world import World
@@ -26,6 +29,7 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
+BARE = "bare mj_step"
 BATCH = 64  # worlds of the physics comparison
 BATCHES = (1, 64, 1024)  # worlds of the mission-step figures
 SUPERVISED = ("fsams", "fms", "marlms")
@@ -34,6 +38,38 @@ SUPERVISED_WORLDS = 1024
 SUPERVISED_STEPS = 10  # mission steps in one measurement, as many as a decision of marlms holds for
 BURST = 12_800  # physics steps in one measurement of a variant
 PYTHON_STEPS = 20  # mission steps in one measurement of the Python loops
+
+
+@laws.controller(gains="limit")
+def _no_law(gains, state, p, v, p_r, v_r, drag, h, force_out):
+    """u = 0."""
+    for axis in range(2):
+        force_out[axis] = 0.0
+
+
+@dataclass(frozen=True)
+class _Idle:
+    """A controller that does nothing: what the loop costs around a law."""
+
+    limited: bool = True
+    linear_gains: tuple[float, float] | None = None
+    law = staticmethod(_no_law)
+
+    def params(self, agent: int, limit: float) -> laws.Numbers:
+        return {"limit": limit}
+
+    def initial_state(self, agent: int) -> laws.Numbers:
+        return {}
+
+
+LOOP_PARTS: dict[str, tuple[Controller, Disturbance]] = {
+    "references, composition, scores": (_Idle(), ConstantWind(force=(0.0, 0.0))),
+    "the drag (43)": (_Idle(), PaperDrag()),
+    "saturated PD": (PD(), PaperDrag()),
+    "SORLC's compensator": (SORLC(basis="off"), PaperDrag()),
+    "SORLC's networks, inputs in range": (SORLC(basis="scaled"), PaperDrag()),
+}
+"""Closed loops, each with one thing more than the one before it, by that thing."""
 
 
 class _PlainSORLC(SORLC):
@@ -231,6 +267,25 @@ def measure_physics(threads: tuple[int, ...], rounds: int, progress: Progress = 
     return {"physics_steps_per_s": physics, "ratios": ratios}
 
 
+def measure_loop(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
+    """Processor time of one physics step of a team, bare and in the loops of LOOP_PARTS, on one thread."""
+    progress("where the time of the closed loop goes", 0, 1)
+    orders, steps = scripted_orders(paper()), BURST // (BATCH * paper().substeps)
+    fleets = {
+        name: Fleet(replace(paper(), disturbance=disturbance), BATCH, 1, orders, controller=controller)
+        for name, (controller, disturbance) in LOOP_PARTS.items()
+    }
+    variants: dict[Any, Callable[[], None]] = {BARE: _bare(next(iter(fleets.values())), 1)}
+    variants |= {name: partial(fleet.advance_compiled, steps) for name, fleet in fleets.items()}
+    taken = interleaved(variants, rounds, process_time)
+    names = list(taken)
+    more = {
+        after: median(1e6 * (b - a) / BURST for a, b in zip(taken[before], taken[after], strict=True))
+        for before, after in pairwise(names)
+    }
+    return {"loop_parts_us": {BARE: 1e6 * median(taken[BARE]) / BURST, **more}}
+
+
 def measure_missions(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
     """Mission steps per second by batch size and threads."""
     progress("mission steps by batch size", 0, 1)
@@ -262,6 +317,7 @@ def measure_supervised(threads: tuple[int, ...], rounds: int, progress: Progress
 
 PERF_PARTS: dict[str, Callable[[tuple[int, ...], int, Progress], dict[str, Any]]] = {
     "physics": measure_physics,
+    "loop": measure_loop,
     "missions": measure_missions,
     "supervised": measure_supervised,
     "episode": measure_episode,
@@ -279,6 +335,7 @@ def perf_lines(figures: dict[str, Any]) -> list[str]:
         for threads, rate in physics[name].items()
     ]
     lines += [f"{name}: {physics[name]:,.0f} physics steps/s" for name in ("python_loop", "python_loop_compiled_laws")]
+    lines += [f"of a physics step, {name}: {spent:.2f} us" for name, spent in figures["loop_parts_us"].items()]
     lines += [
         f"World.step, B = {batch}, {threads} thread(s): {rate:,.0f} mission steps/s"
         for batch, rates in figures["mission_steps_per_s"].items()
