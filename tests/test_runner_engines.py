@@ -81,7 +81,7 @@ def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[s
 
 
 def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results that came after the end of the study are found by the next run; only what failed is submitted again."""
+    """Results that came after the end of the study are found by the next run; only what failed is submitted again, once."""
     from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
 
     tasks = [Task(k, f"{k:064x}", k) for k in range(5)]
@@ -89,6 +89,7 @@ def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypat
     ArrayShare(replace(work, study=Roots(trouble="it fell")), tuple(tasks), tmp_path / "0-0.pack")()
     engine = SlurmArray(2, "local")
     submitted: list[Task] = []
+    retried: list[str] = []
 
     def submit(work: Work, tasks: list[Task], scratch: Path, tries: int) -> list[object]:
         submitted.extend(tasks)
@@ -96,9 +97,10 @@ def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypat
         return []
 
     monkeypatch.setattr(engine, "_submit", submit)
-    found = dict(engine.map(work, tasks, Ears()))
+    found = dict(engine.map(work, tasks, Ears(retried=retried.append)))
     assert (
         [task.place for task in submitted] == [3]
+        and not retried
         and sorted(found) == list(range(5))
         and found[4].tobytes() == np.sqrt(np.arange(4.0, 7.0)).tobytes()
     )

@@ -92,10 +92,10 @@ class SlurmArray:
     def _rounds(self, work: Work[JobT, ResultT], array: "_Array", ears: Ears) -> Generator[tuple[int, ResultT]]:
         """An array, and others for what tasks that died have left."""
         for tries in range(MOST_TRIES):
-            if tries:
-                ears.retried(f"tasks of SLURM ended without {len(array.left)} of their results")
             if not array.left:
                 return
+            if tries:
+                ears.retried(f"tasks of SLURM ended without {len(array.left)} of their results")
             jobs = self._submit(work, list(array.left.values()), work.scratch, tries)
             looked = monotonic()
             while array.left:
