@@ -12,7 +12,7 @@ import numpy as np
 
 from marlbc_mj.robots import MODELS, Robot, RobotFleet
 from marlbc_mj.robots.standard import quiet
-from marlbc_mj.scenarios import Obstacle, Scenario
+from marlbc_mj.scenarios.base import Obstacle, Scenario, desired_centroid
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
 from marlbc_mj.util.text import one_line
@@ -184,7 +184,7 @@ def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario, length: float) -> None
 
 def _mission_bounds(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper corner (2,) [m] of a box around starts, obstacles and the formations' way along the path."""
-    ends = np.array(scenario.path_origin) + np.outer((0.0, scenario.duration), scenario.path_velocity)
+    ends = np.stack([desired_centroid(scenario, time) for time in (0.0, scenario.duration)])
     slots = ends[:, None] + scenario.formations.reshape(1, -1, 2)
     obstacles = scenario.obstacle_array()
     zone = obstacles[:, 2:] + scenario.safe_distance

@@ -278,10 +278,9 @@ def measure_loop(threads: tuple[int, ...], rounds: int, progress: Progress = sil
     variants: dict[Any, Callable[[], None]] = {BARE: _bare(next(iter(fleets.values())), 1)}
     variants |= {name: partial(fleet.advance_compiled, steps) for name, fleet in fleets.items()}
     taken = interleaved(variants, rounds, process_time)
-    names = list(taken)
     more = {
         after: median(1e6 * (b - a) / BURST for a, b in zip(taken[before], taken[after], strict=True))
-        for before, after in pairwise(names)
+        for before, after in pairwise(taken)
     }
     return {"loop_parts_us": {BARE: 1e6 * median(taken[BARE]) / BURST, **more}}
 

@@ -56,7 +56,7 @@ class DistributedLookAhead:
         """
         lanes, layer = self.rule.start(scenario, teams), make_layer(scenario)
         motion = np.full((teams, scenario.agents), IN_FORMATION)
-        return Votes(lanes, layer, motion, layer.start(teams, 3 if lanes.exposed else 1))
+        return Votes(lanes, layer, motion, layer.start(teams, lanes.sights))
 
     def decide(self, observation: Observation, memory: Votes) -> tuple[np.ndarray, Votes]:
         """Motion and avoidance per agent."""

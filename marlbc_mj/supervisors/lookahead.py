@@ -45,6 +45,11 @@ class Lanes(NamedTuple):
     rule: LocalRule
     exposed: bool  # whether orders lead into obstacles: the composition does not avoid by itself
 
+    @property
+    def sights(self) -> int:
+        """M, how many things :meth:`LookAhead.watch` looks for."""
+        return 3 if self.exposed else 1
+
 
 @dataclass(frozen=True)
 class LookAhead:
@@ -82,7 +87,7 @@ class LookAhead:
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
         """One motion per team, avoidance per agent."""
         agents = self.watch(observation, memory).sum(axis=1)
-        motion = self.motion(agents, np.full(len(agents), self.blocked), memory.motion)
+        motion = self.motion(agents, self.blocked, memory.motion)
         return rule_orders(observation, motion, memory.rule), memory._replace(motion=motion)
 
     def watch(self, observation: Observation, lanes: Lanes) -> np.ndarray:
@@ -96,7 +101,7 @@ class LookAhead:
             sights.append(shut_in(observation, lanes, self.change))
         return np.stack(sights, axis=-1)
 
-    def motion(self, agents: np.ndarray, enough: np.ndarray, last: np.ndarray) -> np.ndarray:
+    def motion(self, agents: np.ndarray, enough: np.ndarray | int, last: np.ndarray) -> np.ndarray:
         """IN_COLUMN or IN_FORMATION, from how many ``agents`` (..., M) see each thing that :meth:`watch` names.
 
         ``enough`` (...,) blocked lanes make a column, and ``last`` (...,) is the motion in force. Numbers of agents may be
