@@ -52,7 +52,7 @@ class FormationBatch:
         worlds: B.
         threads: the worlds are shared out over this many.
         interval: mission steps that a decision holds for.
-        state: ``"extended"`` or ``"printed"``.
+        state: ``"extended"`` or ``"published"``.
         actions: set that agents choose from, see :func:`order_of`.
         starts: where episodes begin.
 

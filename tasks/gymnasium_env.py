@@ -45,7 +45,7 @@ class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
     Args:
         scenario: a scenario, or the name of one.
         controller: the force law, or its name; SORLC by default.
-        state: ``"extended"`` or ``"printed"``.
+        state: ``"extended"`` or ``"published"``.
         actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
         interval: mission steps that a decision holds for.
         render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.

@@ -24,7 +24,7 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
     Args:
         scenario: a scenario, or the name of one.
         controller: the force law, or its name; SORLC by default.
-        observation: ``"extended"`` or ``"printed"``.
+        observation: ``"extended"`` or ``"published"``.
         actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
         interval: mission steps that a decision holds for.
         render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.

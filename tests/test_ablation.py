@@ -47,11 +47,11 @@ def shortened(question: Question, duration: float) -> Question:
     )
 
 
-def test_scaled_learns_and_printed_does_not() -> None:
-    """Drag times 20 on the cruise: `scaled` at least 5 times better than `off` in RMS velocity error, `printed` not at all."""
+def test_scaled_learns_and_published_does_not() -> None:
+    """Drag times 20 on the cruise: `scaled` at least 5 times better than `off` in RMS velocity error, `published` not at all."""
     rows = compare(cruise(disturbance=PaperDrag(20.0), duration=40.0))
     assert (rows["scaled"].first_over_this or 0.0) >= 5.0
-    assert abs((rows["printed"].first_over_this or 0.0) - 1.0) < 0.01
+    assert abs((rows["published"].first_over_this or 0.0) - 1.0) < 0.01
 
 
 def test_nothing_beats_the_known_model() -> None:

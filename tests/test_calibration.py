@@ -26,9 +26,9 @@ def result(request: pytest.FixtureRequest, switch: Scenario) -> Calibration:
     return calibrate(request.param, switch, tolerance=1e-4)
 
 
-def test_search_finds_the_printed_maximum(result: Calibration) -> None:
+def test_search_finds_the_published_maximum(result: Calibration) -> None:
     """The largest maximum is the published one, within the tolerance; found gain and default differ by less than 1 %."""
-    assert max(result.at_found) == pytest.approx(max(result.printed), rel=1e-4)
+    assert max(result.at_found) == pytest.approx(max(result.published), rel=1e-4)
     assert result.found == pytest.approx(result.shipped, rel=0.01)
     assert result.shipped == CALIBRATED[result.controller].velocity_gain
     assert result.episodes < 12
@@ -48,7 +48,7 @@ def test_maxima_occur_at_the_switch(name: str, switch: Scenario) -> None:
 
 
 def test_shipped_gains_are_the_registered_ones() -> None:
-    """The calibrated laws are those that `--controllers` offers, with printed maxima to compare with."""
+    """The calibrated laws are those that `--controllers` offers, with published maxima to compare with."""
     for name, law in CALIBRATED.items():
         assert make_controller(name) == law
         assert name in PUBLISHED_INPUT_MAX.values

@@ -119,7 +119,7 @@ def test_headers_of_another_kind_are_one_line(text, tmp_path):
         ({**SAID, **signed(interval=0)}, "interval = 0"),
         ({**SAID, **signed(interval=True)}, "interval = True"),
         ({**SAID, **signed(interval="10")}, "interval = '10'"),
-        ({**SAID, **signed(state="pixels")}, "state = 'pixels', not one of printed, extended"),
+        ({**SAID, **signed(state="pixels")}, "state = 'pixels', not one of published, extended"),
         ({**SAID, **signed(actions="all")}, "actions = 'all', not one of commands"),
         ({**SAID, **signed(agents=None)}, "agents = None"),
         ({**SAID, **signed(safe_distance=None)}, "safe_distance = None"),

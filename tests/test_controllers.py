@@ -82,7 +82,7 @@ def assert_close(actual, expected, relative=1e-12):
 
 
 @pytest.mark.parametrize("tau_sign", [-1, 1])
-@pytest.mark.parametrize("basis", ["printed", "scaled", "own scales", "off"])
+@pytest.mark.parametrize("basis", ["published", "scaled", "own scales", "off"])
 def test_sorlc_is_the_textbook_law(basis, tau_sign):
     """Force, weights and tau equal (30), (36)-(41) over 2000 substeps of random states, half of them saturated."""
     if basis == "own scales":
@@ -121,7 +121,7 @@ def test_sorlc_off_is_pd_with_the_compensator():
     assert not weights(state).tau.any()
 
 
-def test_far_from_its_centres_the_printed_basis_is_silent():
+def test_far_from_its_centres_the_published_basis_is_silent():
     """Positions beyond [-6, 6]: Psi = 0, actor and critic stand still and the identifier only leaks (erratum 13)."""
     gains = SORLC()
     state = start(gains)
@@ -261,7 +261,7 @@ def test_unknown_names_are_refused_with_the_valid_ones():
     """Controller, basis, sign of tau."""
     with pytest.raises(ConfigurationError, match="'nonsense'; choose from: sorlc"):
         make_controller("nonsense")
-    with pytest.raises(ConfigurationError, match="'nonsense'; choose from: printed, scaled, off"):
+    with pytest.raises(ConfigurationError, match="'nonsense'; choose from: published, scaled, off"):
         SORLC(basis="nonsense")
     with pytest.raises(ConfigurationError, match="tau_sign .* 0"):
         SORLC(tau_sign=0)

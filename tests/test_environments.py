@@ -42,7 +42,7 @@ def test_a_whole_episode_is_the_mission_of_world():
     world, rng = World(paper(duration=20.0)), np.random.default_rng(3)
     actions = rng.integers(4, size=(100, 4))
     for interval in (1, 4):
-        env = PaperFormation(state="printed", interval=interval, duration=20.0)
+        env = PaperFormation(state="published", interval=interval, duration=20.0)
         state, _ = env.reset(seed=0)
         world.reset(0)
         assert (state == world.observe().state()[0].astype(np.float32)).all()
@@ -400,7 +400,7 @@ def test_ages_count_from_the_last_change_of_command():
 @pytest.mark.parametrize(
     ("build", "fragments"),
     [
-        (lambda: PaperFormation(state="pixels"), ["state", "pixels", "extended", "printed"]),
+        (lambda: PaperFormation(state="pixels"), ["state", "pixels", "extended", "published"]),
         (lambda: PaperFormation(actions="all"), ["action set", "all", "commands", "orders"]),
         (lambda: PaperFormation(interval=3), ["2000", "3"]),
         (lambda: PaperFormation("maze"), ["maze", "paper"]),

@@ -257,8 +257,8 @@ def test_the_own_entries_of_a_state_are_the_agents_own(name):
         return state(observation)[0]
 
     velocity, command, age = rng.normal(size=(1, 4, 2)), np.zeros((1, 4), dtype=np.int64), np.ones((1, 4))
-    seen = 3 if name == "printed" else 5  # the printed state has no age
-    assert (mask.sum(axis=0) <= 1).all() and mask.sum() == state.size - (1 if name == "printed" else 3)
+    seen = 3 if name == "published" else 5  # the published state has no age
+    assert (mask.sum(axis=0) <= 1).all() and mask.sum() == state.size - (1 if name == "published" else 3)
     for j in range(4):
         faster, other, older = velocity.copy(), command.copy(), age.copy()
         faster[0, j] += 0.1
@@ -411,7 +411,7 @@ def test_every_rival_goes_on_bit_for_bit(method):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("method", "state"), [("rlms", "printed"), ("central", "extended"), ("mappo", "extended")])
+@pytest.mark.parametrize(("method", "state"), [("rlms", "published"), ("central", "extended"), ("mappo", "extended")])
 def test_a_checkpoint_of_a_rival_gives_the_evaluated_episode(method, state, tmp_path):
     """From train to the supervisor; a run that was interrupted while it learnt ends with the same networks, to the bit."""
     config = small(method, state=state, budget=12_800, ppo=PPO(rollout=4, epochs=1))

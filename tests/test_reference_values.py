@@ -18,7 +18,7 @@ from marlbc_mj.supervisors import make_supervisor
 
 ROOT = Path(__file__).resolve().parents[1]
 
-TABLE = {  # scripted + SORLC with the printed basis, virtual reference, 5 ms, one-sided OA, drag (43)
+TABLE = {  # scripted + SORLC with the published basis, virtual reference, 5 ms, one-sided OA, drag (43)
     "switches": (4, 2, 2, 4),
     "clearance_min": (2.098, 4.000, 3.322, 2.095),
     "force_max_inf": (200.0, 200.0, 200.0, 200.0),
@@ -36,7 +36,7 @@ def agents(metrics, name: str) -> list[float]:
 @pytest.mark.parametrize("controller", ["sorlc", "sorlc-off"])
 @pytest.mark.parametrize("row", TABLE)
 def test_scripted_sorlc_reproduces_the_reference_table(episode, controller, row):
-    """To the digits printed, with the networks and without: with the printed basis they make no difference (erratum 13)."""
+    """To the digits published, with the networks and without: with the published basis they make no difference (erratum 13)."""
     measured = agents(measure(episode("scripted", controller)), row)
     assert measured == pytest.approx(TABLE[row], rel=2e-4)
 
@@ -70,8 +70,8 @@ def test_two_sided_avoidance_settles_inside_the_safe_distance(episode):
     assert max(times) == pytest.approx(1.7, abs=0.05) and times[1] == times[2] == 0.0
 
 
-def test_the_printed_automaton_chatters_into_the_discs(episode):
-    """FSAMS as printed: switches 162/122/70/124, agents 3 and 4 inside discs."""
+def test_the_published_automaton_chatters_into_the_discs(episode):
+    """FSAMS as published: switches 162/122/70/124, agents 3 and 4 inside discs."""
     metrics = measure(episode("fsams", "sorlc"))
     assert agents(metrics, "switches") == [162, 122, 70, 124]
     assert [d < 0.0 for d in agents(metrics, "clearance_min")][2:] == [True, True]
@@ -95,14 +95,14 @@ def test_the_scripted_team_keeps_its_slots(episode):
     assert (clearances(trajectory.position, trajectory.obstacles) > 2.0).all()
 
 
-def test_the_scaled_basis_keeps_learning_and_the_printed_one_does_not(episode):
-    """At 30 s on the slots PD alone leaves e_p = f / 100, and so does the printed identifier; the scaled one under a tenth."""
+def test_the_scaled_basis_keeps_learning_and_the_published_one_does_not(episode):
+    """At 30 s on the slots PD alone leaves e_p = f / 100, and so does the published identifier; the scaled one under a tenth."""
     drag_of_agent_1 = np.sin(6.0) ** 2  # v = (1, 0) at y = 6
-    printed, scaled, off = (
+    published, scaled, off = (
         float(np.abs(t.position[6000] - t.reference[6000])[0, 0])
         for t in (episode("scripted", name) for name in ("sorlc", "sorlc-scaled", "sorlc-off"))
     )
-    assert printed == pytest.approx(off, rel=1e-3) == pytest.approx(drag_of_agent_1 / 100.0, rel=0.1)
+    assert published == pytest.approx(off, rel=1e-3) == pytest.approx(drag_of_agent_1 / 100.0, rel=0.1)
     assert scaled < 0.1 * off
 
 

@@ -56,7 +56,7 @@ def predefined_time(e_p: float, e_v: float) -> float:
 
 
 FORMULAS = {
-    "sorlc": lambda e_p, e_v: -100 * e_p - 100 * e_v,  # its printed basis is silent where this is tried
+    "sorlc": lambda e_p, e_v: -100 * e_p - 100 * e_v,  # its published basis is silent where this is tried
     "sorlc-off": lambda e_p, e_v: -100 * e_p - 100 * e_v,
     "pd": lambda e_p, e_v: -100 * e_p - 100 * e_v,
     "rlc": lambda e_p, e_v: -100 * e_p - 2.35 * e_v,
@@ -75,7 +75,7 @@ small = st.tuples(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
 @pytest.mark.parametrize("name", [name for name in CONTROLLERS if name != "sorlc-scaled"])  # its basis sees the errors
 @given(errors | small, st.tuples(st.floats(-100, 100), st.floats(-100, 100)) | small, st.floats(-2, 2))
 def test_every_law_is_its_formula(name, e_p, e_v, drag):
-    """Far from the printed basis' centres, fresh state; -f^ where the law knows the drag; clipped where it is limited."""
+    """Far from the published basis' centres, fresh state; -f^ where the law knows the drag; clipped where it is limited."""
     controller, bare = make_controller(name), name.removesuffix("-limited")
     limit = LIMIT if controller.limited else np.inf
     p, v = np.array([60.0, 70.0]), np.array([3.0, -4.0])
@@ -156,7 +156,7 @@ TABLE = {  # return, force_max_inf, effort_integral, cost_max [1e4], cost_integr
 
 @pytest.mark.parametrize("name", TABLE)
 def test_rivals_reproduce_the_reference_table(episode, name):
-    """Within 1 %, or within the rounding of the printed digit where that is coarser."""
+    """Within 1 %, or within the rounding of the published digit where that is coarser."""
     total, force, effort, cost_max, cost = TABLE[name]
     assert measure(episode("scripted", name))["team"]["return"] == pytest.approx(total, rel=0.01)
     assert agents(episode("scripted", name), "force_max_inf") == pytest.approx(force, rel=0.01)
@@ -165,10 +165,10 @@ def test_rivals_reproduce_the_reference_table(episode, name):
     assert agents(episode("scripted", name), "cost_integral") == pytest.approx(cost, rel=0.01)
 
 
-@pytest.mark.parametrize(("name", "printed"), [("finite-time", (384, 384, 768, 768)), ("fixed-time", (960, 960, 1920, 1920))])
-def test_maximum_inputs_are_table_6s(episode, name, printed):
-    """8 and 20 times the jumps of v_r, 48 and 96 m/s, within 1 % (agent 2's printed 1061 excepted)."""
-    assert agents(episode("scripted", name), "force_max_inf") == pytest.approx(printed, rel=0.01)
+@pytest.mark.parametrize(("name", "published"), [("finite-time", (384, 384, 768, 768)), ("fixed-time", (960, 960, 1920, 1920))])
+def test_maximum_inputs_are_table_6s(episode, name, published):
+    """8 and 20 times the jumps of v_r, 48 and 96 m/s, within 1 % (agent 2's published 1061 excepted)."""
+    assert agents(episode("scripted", name), "force_max_inf") == pytest.approx(published, rel=0.01)
 
 
 @pytest.mark.parametrize("name", ["terminal-sliding", "terminal-sliding-limited", "predefined-time", "predefined-time-limited"])

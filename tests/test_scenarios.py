@@ -19,7 +19,7 @@ COLUMN = paper().behaviors[2].offsets
 PRINTED_COLUMN = ((4.5, 0.0), (1.5, 0.0), (1.5, 0.0), (4.5, 0.0))  # Gamma_3 and Gamma_4 negative (erratum 4)
 
 
-def test_the_case_study_is_the_printed_one():
+def test_the_case_study_is_the_published_one():
     """Section 4.1 and Tables 1 and 2, with Gamma positive (erratum 4)."""
     scenario = paper()
     gamma = np.array([9, 3, 3, 9]) / 5.0
@@ -113,7 +113,7 @@ def test_numbers_must_be_positive_and_finite(name, value):
     ids=str,
 )
 def test_what_cannot_be_run_is_refused_when_the_scenario_is_built(changes, fragments):
-    """Clocks, numbers, teams, obstacles on starts, and slots that overlap as the printed Gamma's do (erratum 4)."""
+    """Clocks, numbers, teams, obstacles on starts, and slots that overlap as the published Gamma's do (erratum 4)."""
     with refusal(*fragments):
         paper(**changes)
 

@@ -133,7 +133,7 @@ def test_json_data_make_an_equal_configuration(preset):
         ({"budget": "many"}, ("budget must be a whole number, got 'many'",)),
         ({"hidden": 8}, ("hidden must be a list, got 8",)),
         ({"shaping": {"type": "Shaping", "margn": 1.0}}, ("unknown key 'shaping.margn'", "shaping.margin")),
-        ({"state": "pixels"}, ("unknown state 'pixels'", "extended, printed")),
+        ({"state": "pixels"}, ("unknown state 'pixels'", "extended, published")),
         ({"shaping": {"scale": 0.0}}, ("shaping.scale must be positive, got 0.0",)),
     ],
 )
@@ -167,8 +167,8 @@ def test_texts_are_read_by_the_fields_they_are_for():
     """Whole numbers for a field of floats too, and infinity."""
     together = with_settings(TrainConfig(), ("worlds=100000", "capacity=1000000", "shaping.dwell=3", "shaping.margin=0.2"))
     assert (together.rows, together.shaping.dwell, together.shaping.margin) == (10, 3.0, 0.2)  # neither alone would do
-    config = with_settings(TrainConfig(), ("huber=inf", "cool_by=1", "state=printed", "shaping.dwell=2", "dueling=FALSE"))
-    assert (config.huber, config.cool_by, config.state, config.dueling) == (math.inf, 1.0, "printed", False)
+    config = with_settings(TrainConfig(), ("huber=inf", "cool_by=1", "state=published", "shaping.dwell=2", "dueling=FALSE"))
+    assert (config.huber, config.cool_by, config.state, config.dueling) == (math.inf, 1.0, "published", False)
     assert config.shaping.dwell == 2.0 and type(config.cool_by) is float
 
 

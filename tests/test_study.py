@@ -242,7 +242,7 @@ def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
         "no-exploring-starts": {"exploring_starts": 0.0},
         "uniform-starts": {"focus": 0.0, "turning": 0.0},
         "no-joint-exploration": {"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
-        "printed-state": {"state": "printed"},
+        "published-state": {"state": "published"},
         "no-centring": {"shaping": replace(base.shaping, centre=0.0)},
     }
     for name, changes in switches.items():

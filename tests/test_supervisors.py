@@ -109,7 +109,7 @@ def test_automaton_settings_must_be_finite_and_not_negative(hysteresis, value):
     ("clearance", "order"),
     [(-1, OA), (0, OA), (2, OA), (np.nextafter(2, 3), FR), (3, FR), (4, FR), (np.nextafter(4, 5), FM), (9, FM), (np.inf, FM)],
 )
-def test_the_printed_rule_at_its_thresholds(clearance, order):
+def test_the_published_rule_at_its_thresholds(clearance, order):
     """d <= d_OA: OA; d_OA < d <= 2 d_OA: FR; else FM (section 4.2.1, erratum 8), per agent and from any state."""
     others = [(9.0, 9.0, 9.0, 9.0), (1.0, 1.0, 1.0, 1.0), (3.0, 3.0, 3.0, 3.0)]
     for before in others:
@@ -117,7 +117,7 @@ def test_the_printed_rule_at_its_thresholds(clearance, order):
 
 
 @given(clearance_sequences)
-def test_the_printed_rule_has_no_memory(clearances):
+def test_the_published_rule_has_no_memory(clearances):
     """Without hysteresis and dwell the orders are a function of the clearance of the same step."""
     d = np.array(clearances)
     np.testing.assert_array_equal(run(FSAMS(), clearances), np.where(d <= 2.0, OA, np.where(d <= 4.0, FR, FM)))
@@ -187,7 +187,7 @@ def test_every_named_supervisor_keeps_the_protocol(name):
     assert orders.shape == (1, 4) and ((orders >= 0) & (orders < 6)).all()
 
 
-def test_the_fair_automaton_is_the_printed_one_with_hysteresis_and_dwell():
+def test_the_fair_automaton_is_the_published_one_with_hysteresis_and_dwell():
     """0.3 m and 0.5 s."""
     fair = make_supervisor("fsams-hysteresis")
     assert (fair.hysteresis, fair.dwell, fair.dwell_delays_urgent) == (0.3, 0.5, False)

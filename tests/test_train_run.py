@@ -56,7 +56,7 @@ def equal(a, b):
 
 
 @pytest.mark.usefixtures("quick_warm_up")
-@pytest.mark.parametrize("changes", [{}, {"hash": "plain", "learner": "hysteretic", "actions": "orders", "state": "printed"}])
+@pytest.mark.parametrize("changes", [{}, {"hash": "plain", "learner": "hysteretic", "actions": "orders", "state": "published"}])
 def test_a_restored_trainer_goes_on_bit_for_bit(changes):
     config = small(**FEW, **changes)
     one = Trainer(config)

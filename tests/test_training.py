@@ -134,7 +134,7 @@ def test_networks_have_a_hidden_layer():
         TeamNetwork(NetworkSize(N, S, A, ()), torch.ones(S))
 
 
-def test_leniency_is_the_printed_formula():
+def test_leniency_is_the_published_formula():
     t = np.array([0.0, 0.05, 0.5, 1.0])
     assert np.allclose(leniency(t), 1.0 - np.exp(-KAPPA * t))
 
@@ -485,7 +485,7 @@ def outcome(**changes):
     return DecisionOutcome(**{**fields, **changes})
 
 
-def test_the_printed_reward_is_unshaped():
+def test_the_published_reward_is_unshaped():
     assert shaped_reward(outcome(), Shaping()).tolist() == [[37.0] * 3, [-20.0] * 3]
     assert lost(outcome(), Shaping(), 2.0).tolist() == [[False] * 3, [True, False, False]]
 
@@ -524,7 +524,7 @@ def test_what_an_agent_does_when_lost_is_its_own_business():
 def test_presets_and_json():
     paper = make_config("paper")
     assert (paper.learning_rate, paper.capacity, paper.budget, paper.interval) == (1e-4, 50_000, 200_000_000, 1)
-    assert (paper.state, paper.actions, paper.shaping) == ("printed", "orders", Shaping())
+    assert (paper.state, paper.actions, paper.shaping) == ("published", "orders", Shaping())
     from marlbc_mj.util.provenance import plain_data
 
     config = make_config("fast", seed=4, hidden=(8, 9))

@@ -52,8 +52,8 @@ class TrainConfig:
 
     worlds: Annotated[int, AT_LEAST_ONE] = 128
     """Worlds stepped together."""
-    state: Literal["extended", "printed"] = "extended"
-    """State that the networks see; ``printed`` is the published one."""
+    state: Literal["extended", "published"] = "extended"
+    """State that the networks see; ``published`` is that of the paper."""
     actions: Literal["commands", "orders", "avoidance"] = "commands"
     """Action set: commands (the distinct ones), orders (all permutations) or avoidance (formation, with obstacles or not)."""
     interval: Annotated[int, AT_LEAST_ONE] = 10
@@ -180,7 +180,7 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
             preset="paper",
             budget=200_000_000,
             evaluate_every=50_000,
-            state="printed",
+            state="published",
             actions="orders",
             interval=1,
             exploring_starts=0.0,

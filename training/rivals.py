@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.policies.states import TEAM_ENTRIES, PrintedState, State
+from marlbc_mj.policies.states import TEAM_ENTRIES, PublishedState, State
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.replay import Batch
@@ -211,10 +211,10 @@ def own_entries(state: State, agents: int) -> np.ndarray:
         agents: N.
     """
     mask = np.zeros((agents, state.size), dtype=np.float32)
-    printed = isinstance(state, PrintedState)
-    width = 4 if printed else (state.size - TEAM_ENTRIES) // agents
+    published = isinstance(state, PublishedState)
+    width = 4 if published else (state.size - TEAM_ENTRIES) // agents
     for i in range(agents):
         mask[i, i * width : (i + 1) * width] = 1.0
-        if printed:  # the commands follow all positions and velocities
+        if published:  # the commands follow all positions and velocities
             mask[i, agents * width + i] = 1.0
     return mask

@@ -14,7 +14,7 @@ from marlbc_mj.core import laws
 
 @dataclass(frozen=True)
 class RLC:
-    """Identifier, actor and critic as in SORLC with the basis ``printed``.
+    """Identifier, actor and critic as in SORLC with the basis ``published``.
 
     Source: ``position_gain`` and the networks from Table 2; ``damping`` fitted to the published time of convergence.
     """

@@ -51,7 +51,7 @@ STATE = laws.Names.of(
     }
 )
 
-BASES = ("printed", "scaled", "off")
+BASES = ("published", "scaled", "off")
 NEGLIGIBLE = 45.0  # exp(-45) = 3e-20 is taken as zero
 
 
@@ -163,13 +163,13 @@ def weights(state: np.ndarray) -> Weights:
 class SORLC:
     """Gains of Table 2, and the readings of the basis.
 
-    ``printed`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law.
+    ``published`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law.
     ``scaled`` feeds the basis the tracking errors over ``position_scale`` and ``velocity_scale`` instead, so the identifier
     sees signals inside its range along the whole run; ``off`` has no networks. With the published Gamma_f and nu_f the leak
     holds the identifier below a fifth of the PD terms, so ``scaled`` has its own: see :meth:`scaled`.
     """
 
-    basis: Literal["printed", "scaled", "off"] = "printed"
+    basis: Literal["published", "scaled", "off"] = "published"
     position_error_gain: float = 100.0  # xi_p [1/s^2]
     velocity_error_gain: float = 100.0  # xi_v [1/s]
     compensator_gain: float = 50.0  # xi_tau [1/s]

@@ -61,7 +61,7 @@ def obstacles_at(time: float, anchors: np.ndarray, motions: np.ndarray) -> np.nd
     """(K, 3) x, y, radius [m] at ``time`` [s]; ``motions`` (0, 6) leaves the anchors (K, 3) where they are."""
     if len(motions) == 0:
         return anchors
-    return np.asarray(moved(np.array([time]), anchors, motions)[0, :, :3])
+    return np.ascontiguousarray(moved(np.array([time]), anchors, motions)[0, :, :3])  # compiled functions are made for such
 
 
 def nearest_places(times: np.ndarray, positions: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:

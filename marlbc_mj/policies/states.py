@@ -41,7 +41,7 @@ class State(Protocol):
         ...
 
 
-class PrintedState:
+class PublishedState:
     """s = (X, Pr, G) as published: positions [m] and velocities [m/s] agent by agent, commands, G. (2n+1)N+1 numbers."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -132,7 +132,7 @@ def _fill(observation, slots, path, safe, out):
         out[b, agents * width + observation.formation[b]] = 1.0
 
 
-STATES: dict[str, Callable[[Scenario], State]] = {"printed": PrintedState, "extended": ExtendedState}
+STATES: dict[str, Callable[[Scenario], State]] = {"published": PublishedState, "extended": ExtendedState}
 """Factory by name."""
 
 

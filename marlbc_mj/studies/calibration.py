@@ -34,7 +34,7 @@ class Calibration:
     """What the search found for one controller."""
 
     controller: str
-    printed: tuple[float, ...]  # Table 6, per agent [N]
+    published: tuple[float, ...]  # Table 6, per agent [N]
     found: float  # velocity gain whose largest maximum is the largest published one [1/s]
     shipped: float  # the dataclass's default [1/s]
     at_found: tuple[float, ...]  # max |u|_inf per agent with the gain found [N]
@@ -44,12 +44,12 @@ class Calibration:
     @property
     def errors(self) -> tuple[float, ...]:
         """Relative error of the maxima per agent, with the gain found."""
-        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_found, self.printed, strict=True))
+        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_found, self.published, strict=True))
 
     @property
     def shipped_errors(self) -> tuple[float, ...]:
         """Relative error of the maxima per agent, with the default gain."""
-        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_shipped, self.printed, strict=True))
+        return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_shipped, self.published, strict=True))
 
 
 class CalibrationJob(NamedTuple):
@@ -110,10 +110,10 @@ def calibrate(
     if not tolerance > 0.0:
         raise ConfigurationError(f"tolerance must be positive, got {tolerance}")
     scenario = scenario or paper()
-    law, printed = CALIBRATED[name], PUBLISHED_INPUT_MAX.values[name]
-    if scenario.agents != len(printed):
-        raise ConfigurationError(f"Table 6 has {len(printed)} agents, the scenario {scenario.agents}")
-    target = max(printed)
+    law, published = CALIBRATED[name], PUBLISHED_INPUT_MAX.values[name]
+    if scenario.agents != len(published):
+        raise ConfigurationError(f"Table 6 has {len(published)} agents, the scenario {scenario.agents}")
+    target = max(published)
     tried: dict[float, tuple[float, ...]] = {}
 
     def excess(gain: float) -> float:
@@ -124,7 +124,7 @@ def calibrate(
 
     found = _root(excess, law.velocity_gain / 4.0, law.velocity_gain * 4.0, tolerance)
     shipped = maxima(law, scenario)
-    return Calibration(name, tuple(map(float, printed)), found, law.velocity_gain, tried[found], shipped, len(tried))
+    return Calibration(name, tuple(map(float, published)), found, law.velocity_gain, tried[found], shipped, len(tried))
 
 
 def maxima(controller: FiniteTime | FixedTime, scenario: Scenario) -> tuple[float, ...]:
@@ -140,7 +140,7 @@ def calibration_lines(results: Sequence[Calibration]) -> list[str]:
         "|---|---:|---:|---:|",
     ]
     for result in results:
-        lines.append(f"| {result.controller}, published | – | {_slashed(result.printed, 'g')} | – |")
+        lines.append(f"| {result.controller}, published | – | {_slashed(result.published, 'g')} | – |")
         rows = (
             ("found", result.found, result.at_found, result.errors),
             ("shipped", result.shipped, result.at_shipped, result.shipped_errors),

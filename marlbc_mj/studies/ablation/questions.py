@@ -16,7 +16,7 @@ from marlbc_mj.util.errors import check_named_once, unknown
 DRAG_SCALES = (0.0, 1.0, 5.0, 20.0)
 RATES = (250.0, 500.0, 1000.0, 2000.0, 4000.0, 8000.0)
 WIDTHS = (2.0, 4.0, 6.0)
-BASES_COMPARED: tuple[Literal["off", "printed", "scaled"], ...] = ("off", "printed", "scaled")
+BASES_COMPARED: tuple[Literal["off", "published", "scaled"], ...] = ("off", "published", "scaled")
 SIGNS: dict[str, Literal[-1, 1]] = {"−": -1, "+": 1}
 SUBSTEPS = (0.010, 0.005, 0.002, 0.001)  # [s]
 TRACKING = ("velocity_error", "position_error", "ratio")
@@ -52,7 +52,7 @@ def half_mission(scale: float) -> Scenario:
 
 def variants() -> dict[str, Controller]:
     """The bases, and the limit that a perfectly known drag sets."""
-    return {"off": SORLC(basis="off"), "printed": SORLC(), "scaled": SORLC.scaled(), "exact model": ExactModel()}
+    return {"off": SORLC(basis="off"), "published": SORLC(), "scaled": SORLC.scaled(), "exact model": ExactModel()}
 
 
 def _basis_cases() -> list[Case]:

@@ -52,7 +52,7 @@ VARIANTS: dict[str, Variant] = {
         "preset",
         changes={"hold": 1, "together": 0.0, "turning": 0.0, "agreement": 0.0},
     ),
-    "printed-state": Variant("Published state", "the published state", "preset", changes={"state": "printed"}),
+    "published-state": Variant("Published state", "the published state", "preset", changes={"state": "published"}),
     "no-centring": Variant("No centring", "rewards are not centred", "preset", changes=_UNCENTRED),
     "paper": Variant("Published settings", "the published hyper-parameters, state, reward and orders", "preset", preset="paper"),
     "hysteretic": Variant("Hysteretic", "a negative TD error counts half", "rival", "hysteretic"),
