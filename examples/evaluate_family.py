@@ -1,6 +1,6 @@
-"""Two supervisors on held-out layouts of a family: how often does the mission succeed?
+"""Compare two supervisors on held-out obstacle layouts of the family "field": how often does each succeed?
 
-The same from the command line, with tables and intervals:
+The same comparison from the command line, with tables and confidence intervals:
 marlbc evaluate field --composition set-based --supervisors fixed lookahead --seeds 200 --out DIR
 """
 

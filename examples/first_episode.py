@@ -1,4 +1,4 @@
-"""One episode: the scripted supervisor and the controller of the paper, on the first 20 s of the case study."""
+"""Run one episode: the first 20 s of the paper's case study, with its scripted supervisor and its controller."""
 
 from marlbc_mj import Scripted, World, measure, paper, run_episode
 

@@ -1,4 +1,4 @@
-"""Write an episode to an MCAP log, read it back, and plot the clearance of every agent."""
+"""Write an episode to an MCAP log, read it back, and plot each agent's clearance from the nearest obstacle."""
 
 import tempfile
 from pathlib import Path

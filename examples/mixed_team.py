@@ -1,6 +1,6 @@
-"""Two different robots in one mission, and a third: pucks, a wheeled base and a quadrotor pass a gate as one team.
+"""Different robots in one team: two pucks, a wheeled base and a quadrotor pass a gate together.
 
-The same from the command line: marlbc run robot_gate --controller pd --set robots=disc,disc,omni,crazyflie --out DIR
+The same mission from the command line: marlbc run robot_gate --controller pd --set robots=disc,disc,omni,crazyflie --out DIR
 """
 
 from marlbc_mj import PD, Scripted, World, make_scenario, measure, run_episode

@@ -1,4 +1,4 @@
-"""A controller of your own: PID with anti-windup, compiled into the simulation loop."""
+"""Write your own controller: a PID with anti-windup, compiled into the simulation loop."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from marlbc_mj import Scripted, World, laws, measure, paper, run_episode
 
 @laws.controller(gains=("position_gain", "velocity_gain", "integral_gain", "limit"), state={"integral": 2})
 def pid(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """Force of one agent; the integral stands still while the force is at its limit."""
+    """Write the force of one agent to ``force_out``; the integral is frozen while the force is at its limit."""
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
         wanted = -gains.position_gain * e_p - gains.velocity_gain * e_v - gains.integral_gain * state.integral[axis]
@@ -18,7 +18,7 @@ def pid(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class PID:
-    """Gains per unit mass: 1/s^2, 1/s, 1/s^3."""
+    """PID gains per unit mass, in 1/s^2, 1/s and 1/s^3."""
 
     position_gain: float = 100.0
     velocity_gain: float = 100.0
@@ -28,15 +28,15 @@ class PID:
 
     @property
     def linear_gains(self):
-        """Gains on the errors of position and velocity."""
+        """The gains on the position and velocity errors."""
         return self.position_gain, self.velocity_gain
 
     def params(self, agent, limit):
-        """Values of the law's gains for one agent."""
+        """The values of the gains for one agent, passed to ``pid`` as ``gains``."""
         return laws.gains_of(self, limit=limit)
 
     def initial_state(self, agent):
-        """The integral starts at 0."""
+        """Initial values of the state, if not 0; the integral starts at 0."""
         return {}
 
 

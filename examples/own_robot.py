@@ -1,4 +1,4 @@
-"""A robot of your own: one MJCF file. Its joints, motors and limits are found by what they do."""
+"""Use your own robot, described by one MJCF file. Its joints, motors and limits are identified by their effect."""
 
 import tempfile
 from pathlib import Path

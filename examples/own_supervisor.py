@@ -1,4 +1,4 @@
-"""A supervisor of your own: the column while an obstacle is near some agent, else the wide formation.
+"""Write your own supervisor: form the column while any agent is near an obstacle, and the wide formation otherwise.
 
 It also runs from the command line: marlbc run paper --composition set-based --supervisor own_supervisor.py:Careful
 """
@@ -12,16 +12,16 @@ from marlbc_mj import World, measure, paper, run_episode
 
 @dataclass(frozen=True)
 class Careful:
-    """FR while the least clearance of the team is below ``near``, else FM."""
+    """Choose FR (column) while the team's least clearance is below ``near``, and FM (formation) otherwise."""
 
     near: float = 6.0  # [m]
 
     def start(self, scenario):
-        """Memory of one episode: the indices of the two orders."""
+        """Called at the start of an episode; returns its memory, here the indices of the two orders."""
         return scenario.orders.index("FM"), scenario.orders.index("FR")
 
     def decide(self, observation, memory):
-        """One order for every agent, and the memory for the next decision."""
+        """Return one order per agent, and the memory for the next decision."""
         wide, column = memory
         order = column if observation.clearance.min() < self.near else wide
         return np.full(len(observation.clearance), order), memory

@@ -1,4 +1,4 @@
-"""A shield: the same supervisor with and without a filter that keeps every agent able to stop in time."""
+"""Run the same supervisor with and without a shield, a filter that keeps every agent able to stop in time."""
 
 from marlbc_mj import World, make_supervisor, measure, paper, run_episode
 

@@ -1,4 +1,4 @@
-"""Train MARLMS for a moment, and fly what it has learned. The full run: marlbc train marlms --out runs/mine"""
+"""Train MARLMS briefly and fly the learned policy. For a full training run: marlbc train marlms --out runs/mine"""
 
 import tempfile
 from pathlib import Path

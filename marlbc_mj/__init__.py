@@ -1,7 +1,7 @@
-"""marlbc_mj: a MuJoCo benchmark for teams of robots that must decide and control at once.
+"""marlbc_mj: a MuJoCo benchmark for teams of robots that must decide and control at the same time.
 
-The public names are those of ``__init__.pyi``. Each loads when it is first used, so that the command line can choose a renderer
-before MuJoCo is imported.
+``__init__.pyi`` lists the public names. Each is loaded on first use, so that the command line can choose a renderer before MuJoCo
+is imported.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""``python -m marlbc_mj`` is ``marlbc``."""
+"""Run the command ``marlbc`` as ``python -m marlbc_mj``."""
 
 from marlbc_mj.cli import main
 

@@ -1,4 +1,4 @@
-"""One episode: supervisor and world in turn, and the trajectory they leave behind."""
+"""One episode: supervisor and world run in turn, and the resulting trajectory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -20,24 +20,24 @@ from marlbc_mj.supervisors.communication import Hearing, hearing
 from marlbc_mj.util.errors import ConfigurationError
 
 NO_POSE = np.zeros((0, 7))
-"""Pose of robots that are where their p is and never turn."""
+"""Pose of robots without a free joint, which are at their p and never turn."""
 LEVEL_POSE = (0.0, 1.0, 0.0, 0.0, 0.0)
-"""Height and quaternion of such robots in a team of which others have a pose."""
+"""Height and quaternion of such robots in a team in which others have a pose."""
 
 
 class Frame(NamedTuple):
-    """One mission step as it is recorded: what orders were given on, and what they led to."""
+    """Record of one mission step: the observation on which orders were given, and the results."""
 
-    observation: Observation  # of the one team, at the start of the mission step
+    observation: Observation  # of the team, at the start of the mission step
     record: Record  # (substeps, N, 2) each
     command: np.ndarray  # (N,) index into scenario.orders.commands
     reward: float  # r1 + r2 of this mission step
     controller_state: np.ndarray  # (N, S) at the start of the mission step
-    decision_ms: float  # what the supervisor took [ms]
+    decision_ms: float  # computing time of the supervisor [ms]
     after: np.ndarray  # (N, 2) position at the end of the mission step [m]
-    pose: np.ndarray = NO_POSE  # (N, 7) of bodies with a free joint: x, y, z [m], quaternion; (0, 7) for others
-    shield: ShieldCounts | None = None  # (N,) each, since the episode began, at the end of the mission step; with a shield only
-    hearing: Hearing | None = None  # (N, N) each, when orders were given; where messages are not ideal, of a supervisor with any
+    pose: np.ndarray = NO_POSE  # (N, 7) x, y, z [m], quaternion of each body; (0, 7) without free joints
+    shield: ShieldCounts | None = None  # (N,) each, from the start of the episode to the end of this step; with a shield only
+    hearing: Hearing | None = None  # (N, N) each, when orders were given; None if messages are ideal or not used
 
     @property
     def first(self) -> Record:
@@ -53,7 +53,7 @@ class Trajectory:
     supervisor: str
     controller: str
     seed: int
-    obstacles: np.ndarray  # (K, 3) this episode's x, y, radius [m]; of one that moves, its place without motion
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m] in this episode; the anchors of moving obstacles
     time: np.ndarray  # (T,) start of each substep [s]
     position: np.ndarray  # (T + 1, N, 2) [m]
     velocity: np.ndarray  # (T + 1, N, 2) [m/s]
@@ -64,19 +64,19 @@ class Trajectory:
     formation: np.ndarray  # (M,) G at the end of each mission step
     reward: np.ndarray  # (M,)
     controller_state: np.ndarray  # (M, N, S) at the start of each mission step
-    decision_ms: np.ndarray  # (M,) [ms]
-    motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as motion.move has them; (0, 6): at rest
+    decision_ms: np.ndarray  # (M,) computing time of the supervisor [ms]
+    motions: np.ndarray = field(default_factory=lambda: np.zeros((0, NUMBERS)))  # (K, 6) as in motion.move; (0, 6): at rest
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7) at the start of each mission step, see Frame
     shield: ShieldCounts | None = None  # (M, N) each, at the end of each mission step, see Frame
     hearing: Hearing | None = None  # (M, N, N) each, see Frame
 
     def clearances(self) -> np.ndarray:
-        """(T, N) clearance at the end of every substep [m], from obstacles where they are then."""
+        """(T, N) clearance at the end of every substep [m], from the obstacles at that time."""
         return clearances_after(self.position[1:], self.obstacles, self.motions, self.scenario.substep)
 
 
 def clearances_after(positions: np.ndarray, obstacles: np.ndarray, motions: np.ndarray, substep: float) -> np.ndarray:
-    """(T, N) clearance [m] at ``positions`` (T, N, 2) at the ends of T substeps, from obstacles where they are then."""
+    """(T, N) clearance [m] at ``positions`` (T, N, 2) at the ends of T substeps, from the obstacles at those times."""
     if len(motions) == 0:
         return clearances(positions, obstacles)
     ends = (1 + np.arange(len(positions))) * substep
@@ -94,14 +94,14 @@ def run_episode(
     """Run one whole episode in a world made with ``worlds=1, record=True``.
 
     Args:
-        world: where the episode happens.
+        world: the World in which the episode runs.
         supervisor: decides for B teams, or for one, see :func:`~marlbc_mj.supervisors.one_team.batched`.
-        seed: which draw of the scenario.
-        names: supervisor's and controller's, for tables and logs.
-        on_frame: called after every mission step, a log writer for example.
+        seed: seed of the scenario's draw.
+        names: names of supervisor and controller, for tables and logs.
+        on_frame: called after every mission step, for example a log writer.
 
     Raises:
-        ConfigurationError: more than one world, one that keeps no substeps, or a decision of wrong shape or type.
+        ConfigurationError: more than one world, a world that records no substeps, or a decision of wrong shape or type.
         SimulationError: the world diverged, or supervisor or law raised an error.
     """
     if world.worlds != 1:
@@ -126,7 +126,7 @@ def run_episode(
 def _frame(
     seen: Observation, step: Step, before: tuple[np.ndarray, float, np.ndarray], heard: Hearing | None, after: np.ndarray
 ) -> Frame:
-    """One mission step; ``before`` are controller state, decision time and pose, ``after`` is the position at its end (N, 2)."""
+    """The frame of a mission step; ``before``: controller state, decision time and pose; ``after``: final position (N, 2)."""
     if step.record is None:
         raise ConfigurationError("an episode needs a World that keeps every substep: World(..., record=True)")
     record = Record(*(rows[0] for rows in step.record))
@@ -138,7 +138,7 @@ def _frame(
 
 
 def _trajectory(world: World, frames: list[Frame], names: tuple[int, str, str]) -> Trajectory:
-    """The frames of a whole episode, and the state at its end, as one record.
+    """Combine the frames of a whole episode and the state at its end into one trajectory.
 
     ``names`` are seed, supervisor and controller.
     """
@@ -171,7 +171,7 @@ def _trajectory(world: World, frames: list[Frame], names: tuple[int, str, str]) 
 
 
 def _shield(frames: list[Frame]) -> ShieldCounts | None:
-    """What a shield did by the end of each mission step; None without a shield."""
+    """Counts of a shield at the end of each mission step; None without a shield."""
     counts = [f.shield for f in frames if f.shield is not None]
     return ShieldCounts(*(np.array(rows) for rows in zip(*counts, strict=True))) if counts else None
 
@@ -183,7 +183,7 @@ def _hearing(frames: list[Frame]) -> Hearing | None:
 
 
 def body_poses(world: World, b: int = 0) -> np.ndarray:
-    """(N, 7) of the bodies of world ``b``, (0, 7) where none has a free joint; those without one lie level on the ground."""
+    """(N, 7) poses of the bodies of world ``b``, level on the ground without a free joint; (0, 7) if no body has one."""
     fleet, qpos, index = world.plan.fleet, world.data[b].qpos, world.plan.plant.qpos_index
     if not fleet.floating:
         return NO_POSE

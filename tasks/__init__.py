@@ -1,4 +1,4 @@
-"""Views of the benchmark for other people's tools: dm_control, Gymnasium and PettingZoo environments."""
+"""The benchmark as dm_control, Gymnasium and PettingZoo environments."""
 
 from typing import Any
 
@@ -33,12 +33,12 @@ def load(
     Args:
         domain: ``"formation"``.
         task: a scenario, or the name of one.
-        controller: the force law, or its name; SORLC by default.
-        random_state: seed of the episodes' draws.
-        **changes: any field of the scenario, ``substep=0.001`` for example.
+        controller: a force law, or the name of one; SORLC by default.
+        random_state: random seed or generator from which episodes are drawn.
+        **changes: scenario fields to change, for example ``substep=0.001``.
 
     Raises:
-        ConfigurationError: unknown domain or scenario, or a change that cannot be run.
+        ConfigurationError: unknown domain or scenario, or an invalid change.
     """
     if domain not in DOMAINS:
         raise unknown("domain", domain, DOMAINS)

@@ -1,4 +1,4 @@
-"""B missions at once for a learner: a decision every few mission steps, rewards by term, episodes that restart by themselves."""
+"""B missions in parallel for a learner: decisions every few mission steps, rewards by term, episodes restarted automatically."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -18,19 +18,19 @@ from marlbc_mj.util.seeding import stream
 
 
 class DecisionOutcome(NamedTuple):
-    """Outcome of one decision of every team."""
+    """Outcome of one decision in every world."""
 
-    state: np.ndarray  # (B, S) of the next decision; where an episode ended, of the new one
-    final_state: np.ndarray  # (B, S) the same, but the true successor where an episode ended
-    formation: np.ndarray  # (B,) r1 without violations: 5 G a mission step (14), summed over the decision
-    violation: np.ndarray  # (B,) -10 a mission step with an agent at or inside the safe distance (14)
+    state: np.ndarray  # (B, S) at the next decision; where an episode ended, at the start of the new one
+    final_state: np.ndarray  # (B, S) like ``state``, but the true successor where an episode ended
+    formation: np.ndarray  # (B,) r1 without violations (14), 5 G per mission step, summed over the decision
+    violation: np.ndarray  # (B,) -10 per mission step with an agent at or within the safe distance (14), likewise
     switching: np.ndarray  # (B,) r2 (15): -3 if any agent's command changed
-    switches: np.ndarray  # (B, N) bool, whose command changed
+    switches: np.ndarray  # (B, N) bool, the agent's command changed
     clearance: np.ndarray  # (B, N) least clearance at the ends of the decision's mission steps [m]
-    age: np.ndarray  # (B, N) how long the commands before the decision had been in force [s]; infinite where the episode began so
+    age: np.ndarray  # (B, N) age of the commands before the decision [s]; infinite for those that began the episode
     steps: np.ndarray  # (B,) mission steps made
     terminal: np.ndarray  # (B,) bool, the mission is over
-    truncated: np.ndarray  # (B,) bool, the episode was cut
+    truncated: np.ndarray  # (B,) bool, the episode was cut short
 
     @property
     def reward(self) -> np.ndarray:
@@ -39,7 +39,7 @@ class DecisionOutcome(NamedTuple):
 
     @property
     def ended(self) -> np.ndarray:
-        """(B,) bool, a new episode has begun."""
+        """(B,) bool, the episode ended and a new one has begun."""
         return np.asarray(self.terminal | self.truncated)
 
 
@@ -47,17 +47,17 @@ class FormationBatch:
     """B worlds of one scenario as a cooperative Markov game.
 
     Args:
-        scenario: the problem instance; every episode is a draw of it.
-        controller: the force law; SORLC by default.
+        scenario: the problem instance; every episode is a random draw of it.
+        controller: a force law; SORLC by default.
         worlds: B.
-        threads: the worlds are shared out over this many.
-        interval: mission steps that a decision holds for.
+        threads: number of threads that share the worlds.
+        interval: mission steps per decision.
         state: ``"extended"`` or ``"published"``.
-        actions: set that agents choose from, see :func:`order_of`.
+        actions: name of the action set, see :func:`order_of`.
         starts: where episodes begin.
 
     Raises:
-        ConfigurationError: a setting that cannot be run.
+        ConfigurationError: a setting is invalid.
     """
 
     def __init__(
@@ -90,39 +90,39 @@ class FormationBatch:
         self.read = make_state(state, scenario)
         self.world = World(scenario, controller, worlds=worlds, threads=threads)
         self.starts = starts or Starts()
-        self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which an episode ends
+        self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which the episode is cut
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
-        self.turn = np.full(worlds, -1)  # action with which the whole team is to begin the episode, by Starts.turning; -1: none
-        self.rngs = [stream(0, b) for b in range(worlds)]  # of the episodes that each world begins
+        self.turn = np.full(worlds, -1)  # action with which the whole team should begin, from Starts.turning; -1: none
+        self.rngs = [stream(0, b) for b in range(worlds)]  # each world's episodes are drawn from its own
         self.route = Route(scenario, self.starts, interval, command_of)
 
     @property
     def actions(self) -> int:
-        """Number of actions of an agent."""
+        """Number of actions per agent."""
         return len(self.order_of)
 
     @property
     def decisions(self) -> int:
-        """Decisions of a whole mission."""
+        """Number of decisions in a whole mission."""
         return self.route.decisions
 
     @property
     def fresh(self) -> np.ndarray:
-        """(B,) bool, no action is in force yet: the mission has just begun."""
+        """(B,) bool, the mission has just begun and no action is in force yet."""
         return np.asarray(self.world.state.steps == 0)
 
     def reset(self, seed: int | Sequence[int | None] = 0, mask: np.ndarray | None = None) -> np.ndarray:
-        """Start episodes anew; (B, S) states.
+        """Start new episodes; returns the states (B, S).
 
-        World b draws this and all later episodes from its own stream, (seed, b), so what it does depends on neither B nor the
-        other worlds.
+        World b draws this and all later episodes from its own random stream, (seed, b), so its episodes depend on neither B nor
+        the other worlds.
 
         Args:
-            seed: of all worlds, or one for each; where it is None, the world's stream goes on.
-            mask: (B,) bool, the worlds that start anew; all by default.
+            seed: one seed for all worlds, or one per world; for None, the world's stream continues.
+            mask: (B,) bool, the worlds to restart; all by default.
 
         Raises:
-            ConfigurationError: a negative seed, another number of seeds than worlds, or a mask that is not (B,) bool.
+            ConfigurationError: a seed is negative, the number of seeds is not B, or the mask is not (B,) bool.
         """
         worlds = self.world.worlds
         seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed] * worlds
@@ -140,14 +140,14 @@ class FormationBatch:
         return self.states()
 
     def states(self) -> np.ndarray:
-        """(B, S) of all worlds."""
+        """(B, S) current states of all worlds."""
         return self.read(self.world.observe())
 
     def step(self, actions: np.ndarray) -> DecisionOutcome:
-        """One decision of every team; ``actions`` (B, N) are indices into the action set.
+        """Make one decision in every world; ``actions`` (B, N) are indices into the action set.
 
         Raises:
-            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+            ConfigurationError: actions have the wrong shape, are not integers, or are out of range.
             SimulationError: a world diverged.
         """
         self.last = self._checked(actions)
@@ -176,8 +176,8 @@ class FormationBatch:
         )
 
     def _hold(self, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Orders (B, N) for all mission steps of a decision: (B,) sums of r1 + r2, of the formation's and of the violation's part
-        of r1, and (B, N) least clearances at the steps' ends [m].
+        """Apply orders (B, N) for all mission steps of a decision. Returns the (B,) sums of r1 + r2 and of the formation and
+        violation parts of r1, and the (B, N) least clearances at the ends of the steps [m].
 
         Raises:
             SimulationError: a world diverged.
@@ -196,7 +196,7 @@ class FormationBatch:
         return reward, formation, violation, clearance
 
     def _checked(self, actions: Any) -> np.ndarray:
-        """A copy of ``actions`` as (B, N) int64, because the compiled loop trusts what it is given."""
+        """A checked copy of ``actions`` as (B, N) int64, because the compiled loop does no checks."""
         shape, most = self.last.shape, self.actions - 1
         try:
             given = array_from(actions)
@@ -213,7 +213,7 @@ class FormationBatch:
         return given.astype(np.int64)
 
     def _restart(self, mask: np.ndarray) -> None:
-        """New episodes where ``mask`` is true."""
+        """Start new episodes where ``mask`` is true."""
         self.cut[mask] = self.scenario.mission_steps
         self.turn[mask] = -1
         for b in np.flatnonzero(mask):
@@ -224,7 +224,7 @@ class FormationBatch:
             self.last[b] = self.action_of[self.world.state.command[b]]
 
     def _explore(self, b: int, rng: np.random.Generator) -> None:
-        """Begin world ``b`` along the route; as it is where no start is found."""
+        """Move world ``b`` to an exploring start along the route, if one is found."""
         scenario, state = self.scenario, self.world.state
         anchors = state.anchors[b] if scenario.moving else state.obstacles[b]
         start = self.route.draw(rng, anchors, state.motions[b])

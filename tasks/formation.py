@@ -1,7 +1,7 @@
 """The benchmark's scenarios as dm_control composer tasks: the action is one priority order per agent.
 
-The arena is made from the very MJCF that the engine compiles, and composer's hooks call the parts of the very mission step that
-the compiled loop runs, so a composer episode equals a :class:`~marlbc_mj.engine.world.World` episode.
+The arena is made from the same MJCF that the engine compiles, and composer's hooks call the same functions as the compiled
+loop's mission step. So a composer episode equals a :class:`~marlbc_mj.engine.world.World` episode.
 """
 
 from dataclasses import replace
@@ -24,7 +24,7 @@ from marlbc_mj.util.seeding import stream
 
 
 class FormationArena(composer.Arena):
-    """Ground, obstacles and all agents: one MJCF text, parsed into dm_control's own model tree."""
+    """Ground, obstacles and all agents, parsed from one MJCF text into dm_control's model tree."""
 
     def _build(self, xml: str) -> None:
         self._mjcf_root = mjcf.from_xml_string(xml)
@@ -37,18 +37,18 @@ NO_COPY = (
 
 
 class FormationEnvironment(composer.Environment):
-    """A composer environment that refuses to be copied; ConfigurationError says what to do instead."""
+    """A composer environment that cannot be copied; the ConfigurationError raised on copying names alternatives."""
 
     def __reduce_ex__(self, protocol: Any) -> NoReturn:
         raise ConfigurationError(NO_COPY)
 
 
 class FormationTask(composer.Task):
-    """A team under a mission supervisor that the agent (in dm_control's sense) plays.
+    """A team whose mission supervisor is the agent in dm_control's sense.
 
     Args:
-        scenario: the problem instance; every episode is drawn with the environment's random state.
-        controller: the force law; SORLC by default.
+        scenario: the problem instance; every episode is drawn from it with the environment's random state.
+        controller: a force law; SORLC by default.
         shield: see :class:`~marlbc_mj.engine.world.World`.
     """
 
@@ -61,8 +61,8 @@ class FormationTask(composer.Task):
         self.state = team.make_team(self.plan, worlds=1)
         self._arena = FormationArena(self.plan.xml)
         self._record = team.make_record(self.plan, worlds=1, recording=False)
-        self._orders_alone = np.zeros((1, 0, 2))  # the orders make v_r
-        self._present: Arguments  # what the loop takes; from initialize_episode on
+        self._orders_alone = np.zeros((1, 0, 2))  # no velocities given: orders determine v_r
+        self._present: Arguments  # arguments of the loop; set by initialize_episode
         parts = (loop.start_compiled, loop.apply_compiled, loop.settle_compiled)
         self._start, self._apply, self._settle = parts if self.plan.native else (loop.start, loop.apply, loop.settle)
         self._substep = 0
@@ -92,12 +92,12 @@ class FormationTask(composer.Task):
         return made
 
     def action_spec(self, physics: mjcf.Physics) -> specs.BoundedArray:
-        """(N,) int64: index into ``scenario.orders`` for each agent."""
+        """(N,) int64: each agent's index into ``scenario.orders``."""
         most = len(self.scenario.orders) - 1
         return specs.BoundedArray((self.scenario.agents,), np.int64, 0, most, name="orders")
 
     def initialize_episode(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Draw the episode: from the seed that makes world 0 of ``World.reset(seed)``, for a seed taken from ``random_state``."""
+        """Draw the episode of world 0 after ``World.reset(seed)``, with a seed drawn from ``random_state``."""
         qpos_index, qvel_index, ctrl_index = find_indices(physics.model.ptr, self.scenario)
         plant = self.plan.plant._replace(qpos_index=qpos_index, qvel_index=qvel_index, ctrl_index=ctrl_index)
         side = self.plan.compiled_side if self.plan.native else self.plan.python_side
@@ -108,10 +108,10 @@ class FormationTask(composer.Task):
         team.put(self.plan, self.state, 0, physics.data, starts, np.zeros_like(starts))
 
     def before_step(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Orders become reference velocities for this mission step.
+        """Turn the orders into reference velocities for this mission step.
 
         Raises:
-            ConfigurationError: another shape, no whole numbers, or an index that is no order.
+            ConfigurationError: orders have the wrong shape, are not integers, or are out of range.
         """
         orders = team.check_orders(self.plan, self.scenario.orders.read(action)[None], 1)
         a = self._present
@@ -119,38 +119,38 @@ class FormationTask(composer.Task):
         self._substep = 0
 
     def before_substep(self, physics: mjcf.Physics, action: np.ndarray, random_state: np.random.RandomState) -> None:
-        """Force law, drag and robot of every agent, into ctrl and qfrc_applied."""
+        """Write ctrl and qfrc_applied from each agent's force law, drag and robot."""
         a = self._present
         failed = self._apply(0, self._substep, a.mission, a.native, a.plant, a.team)
         if failed:
             raise team.diverged(self.plan, self.state, 0, failed, int(self.state.steps[0]))
 
     def after_substep(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Measure, and advance the reference position."""
+        """Measure the state and advance the reference positions."""
         a = self._present
         self._settle(0, self._substep, a.mission, a.native, a.plant, a.team, a.record)
         self._substep += 1
 
     def after_step(self, physics: mjcf.Physics, random_state: np.random.RandomState) -> None:
-        """Clearances, formation identifier and reward."""
+        """Compute clearances, the formation identifier and the reward."""
         loop.finish(0, self._present.mission, self._present.team)
 
     def get_reward(self, physics: mjcf.Physics) -> float:
-        """r1 + r2 of (13)."""
+        """The reward r1 + r2 (13) of the last mission step."""
         return float(self.state.reward[0])
 
     def should_terminate_episode(self, physics: mjcf.Physics) -> bool:
-        """True once the mission's last step has been made."""
+        """Whether the mission's last step has been made."""
         return bool(self.state.steps[0] >= self.scenario.mission_steps)
 
     def get_discount(self, physics: mjcf.Physics) -> float:
-        """1: a mission ends by the clock, not by a terminal state."""
+        """Always 1, as a mission ends by time, not in a terminal state."""
         return 1.0
 
 
 def make_environment(
     scenario: Scenario, controller: Controller | None = None, random_state: int | np.random.RandomState | None = None
 ) -> dm_env.Environment:
-    """A dm_control environment of a scenario; one step is one mission step."""
+    """A dm_control environment for a scenario, in which one step is one mission step."""
     task = FormationTask(scenario, controller)
     return FormationEnvironment(task, random_state=random_state, strip_singleton_obs_buffer_dim=True)

@@ -1,4 +1,4 @@
-"""Arguments of the environments: scenarios and controllers, by name or made in Python, and arrays of actions."""
+"""Conversion of arguments of the environments: scenarios and controllers by name or as objects, and arrays of actions."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -12,14 +12,14 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.text import one_line
 
 RENDER_MODES = ("rgb_array",)
-"""How the Gymnasium and PettingZoo views draw; None: not at all."""
+"""Render modes of the Gymnasium and PettingZoo environments, besides None for no drawing."""
 
 
 def scenario_from(given: Any, changes: Mapping[str, Any]) -> Scenario:
-    """A scenario by its name, from a ``.toml`` file or as it is, with any of its fields changed.
+    """A scenario from its name, a ``.toml`` file or a Scenario, with the fields in ``changes`` replaced.
 
     Raises:
-        ConfigurationError: anything else, an unknown name or field, or a change that cannot be run.
+        ConfigurationError: ``given`` has another type, a name or field is unknown, or a change is invalid.
     """
     if isinstance(given, Scenario):
         check_fields(Scenario, changes)
@@ -30,10 +30,10 @@ def scenario_from(given: Any, changes: Mapping[str, Any]) -> Scenario:
 
 
 def controller_from(given: Any) -> Controller | None:
-    """A controller by its name or as it is; None: the default one.
+    """A controller from its name, or the given one; None stands for the default.
 
     Raises:
-        ConfigurationError: an unknown name, or an object without what a controller has.
+        ConfigurationError: the name is unknown, or the object lacks an attribute of controllers.
     """
     if isinstance(given, str):
         return make_controller(given)
@@ -47,19 +47,19 @@ def controller_from(given: Any) -> Controller | None:
 
 
 def array_from(given: Any) -> np.ndarray:
-    """Actions as an array: from nested lists, another library's array or a tensor in main memory.
+    """Actions as a NumPy array, from nested lists, another library's array or a tensor in main memory.
 
     Raises:
-        ConfigurationError: nothing that an array can be made of.
+        ConfigurationError: ``given`` cannot be converted.
     """
     try:
         return np.asarray(given)
-    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; a tensor on a GPU, or one that wants gradients
+    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; a tensor on a GPU or with gradients
         raise ConfigurationError(f"actions must be an array of whole numbers, got {given!r}: {one_line(error)}") from None
 
 
 def check_render_mode(mode: str | None) -> str | None:
-    """The mode itself; ConfigurationError for one that the views do not have."""
+    """The render mode itself; raises ConfigurationError if it is not supported."""
     if mode is not None and mode not in RENDER_MODES:
         raise unknown("render_mode", mode, (*RENDER_MODES, "None"))
     return mode

@@ -1,6 +1,6 @@
-"""Gymnasium views of the missions: one team as an ``Env``, B teams as a ``VectorEnv`` on :class:`~marlbc_mj.World`.
+"""Gymnasium environments of the missions: an ``Env`` for one team, and a ``VectorEnv`` for B teams in one World.
 
-``gymnasium.make`` and ``gymnasium.make_vec`` know them once :mod:`marlbc_mj.tasks` is imported.
+Importing :mod:`marlbc_mj.tasks` registers them for ``gymnasium.make`` and ``gymnasium.make_vec``.
 """
 
 from collections.abc import Mapping
@@ -21,12 +21,12 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 def state_space(state: State) -> gymnasium.spaces.Box:
-    """The Box of a state."""
+    """The observation space of a state."""
     return gymnasium.spaces.Box(state.low.astype(np.float32), state.high.astype(np.float32), dtype=np.float32)
 
 
 def terms(outcome: DecisionOutcome, safe_distance: float) -> dict[str, np.ndarray]:
-    """Per-world infos of a decision: the reward's terms (14), (15) and what safety is judged by."""
+    """Per-world infos of a decision: the reward terms (14) and (15), switches, and clearance with violations."""
     return {
         "formation_reward": outcome.formation,
         "violation_reward": outcome.violation,
@@ -38,24 +38,24 @@ def terms(outcome: DecisionOutcome, safe_distance: float) -> dict[str, np.ndarra
 
 
 class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
-    """One team: a MultiDiscrete joint order in, the team's state and shared reward (13) out.
+    """One team as an ``Env``: actions are MultiDiscrete joint orders, observations are the team's state, the reward is (13).
 
-    An episode is the whole mission and ends by termination. ``info`` has the reward's terms, switches and clearance.
+    An episode is a whole mission and ends by termination. ``info`` contains the reward terms, switches and clearance.
 
     Args:
         scenario: a scenario, or the name of one.
-        controller: the force law, or its name; SORLC by default.
+        controller: a force law, or the name of one; SORLC by default.
         state: ``"extended"`` or ``"published"``.
-        actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
-        interval: mission steps that a decision holds for.
-        render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.
-        **changes: any field of the scenario, ``duration=20.0`` for example.
+        actions: ``"commands"`` (one order per distinct command) or ``"orders"`` (all permutations).
+        interval: mission steps per decision.
+        render_mode: ``"rgb_array"`` makes :meth:`render` draw the team; None disables drawing.
+        **changes: scenario fields to change, for example ``duration=20.0``.
 
     Raises:
-        ConfigurationError: a setting that cannot be run.
+        ConfigurationError: a setting is invalid.
     """
 
-    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012  # declared so by Gymnasium
+    metadata = {"render_modes": list(RENDER_MODES), "render_fps": 20}  # noqa: RUF012  # Gymnasium's own declaration
 
     def __init__(
         self,
@@ -74,15 +74,15 @@ class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = state_space(self.batch.read)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; the draw of the scenario comes from ``seed``."""
+        """Begin an episode; ``seed`` determines the draw of the scenario."""
         super().reset(seed=seed)
         return self.batch.reset(int(self.np_random.integers(2**31)))[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """One decision; ``action`` (N,).
+        """Make one decision; ``action`` (N,) holds one action per agent.
 
         Raises:
-            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+            ConfigurationError: actions have the wrong shape, are not integers, or are out of range.
         """
         outcome = self.batch.step(array_from(action)[None])
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
@@ -92,17 +92,17 @@ class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
 class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """B teams in one World, stepped by the compiled loop; episodes restart in the step that ends them (same-step autoreset).
 
-    As Gymnasium's SyncVectorEnv has it: what the last decision of an episode led to is in ``infos["final_obs"]`` and
-    ``infos["final_info"]``, valid where ``infos["_final_obs"]`` is true; the terms in ``infos`` itself are of the other worlds.
-    Parameters that are not listed are those of :class:`PaperFormation`.
+    As in Gymnasium's SyncVectorEnv, the outcome of an episode's last decision is in ``infos["final_obs"]`` and
+    ``infos["final_info"]``, valid where ``infos["_final_obs"]`` is true. The terms in ``infos`` itself are those of the other
+    worlds. Parameters not listed here are those of :class:`PaperFormation`.
 
     Args:
         num_envs: B.
-        threads: the worlds are shared out over this many.
+        threads: number of threads that share the worlds.
         starts: where episodes begin; at the start of the mission by default.
 
     Raises:
-        ConfigurationError: a setting that cannot be run.
+        ConfigurationError: a setting is invalid.
     """
 
     def __init__(
@@ -141,14 +141,14 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
     def reset(
         self, *, seed: int | list[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin episodes. World b of one ``seed`` does the same for any B.
+        """Begin episodes. For one ``seed``, the episodes of world b are the same for any B.
 
         Args:
-            seed: of all worlds, or a list with one for each; a world whose entry is None goes on with its random numbers.
-            options: ``"reset_mask"`` (B,) bool chooses the worlds that begin anew; all by default.
+            seed: one seed for all worlds, or a list with one per world; for None in the list, a world's random stream continues.
+            options: ``"reset_mask"`` (B,) bool selects the worlds to restart; all by default.
 
         Raises:
-            ConfigurationError: a list or a mask of another length than B, or a mask without a world.
+            ConfigurationError: the list or the mask does not have length B, or the mask selects no world.
         """
         if not isinstance(options, Mapping | None):
             raise ConfigurationError(f"options must be a dictionary, got {options!r}")
@@ -161,10 +161,10 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         return self.batch.reset(int(self.np_random.integers(2**31)), mask), {}
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """One decision of every team; ``actions`` (B, N).
+        """Make one decision in every world; ``actions`` (B, N) holds one action per agent.
 
         Raises:
-            ConfigurationError: another shape, no whole numbers, or an index that is no action.
+            ConfigurationError: actions have the wrong shape, are not integers, or are out of range.
         """
         outcome = self.batch.step(actions)
         found, ended = terms(outcome, self.batch.scenario.safe_distance), outcome.ended
@@ -177,20 +177,20 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         return outcome.state, outcome.reward, outcome.terminal, outcome.truncated, infos
 
     def render(self) -> tuple[np.ndarray, ...] | None:
-        """(height, width, 3) uint8 of every team as it is now; None without a render mode.
+        """One (height, width, 3) uint8 image of the current state of each team; None without a render mode.
 
         Raises:
-            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL disables it.
         """
         return None if self.render_mode is None else tuple(self.painter.draw(self.batch.world, b) for b in range(self.num_envs))
 
     def close_extras(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self.painter.close()
 
 
 def where(found: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:
-    """Infos of the worlds in ``mask`` (B,) as a vector environment gives them: zeros elsewhere, and the mask under ``_name``."""
+    """Infos of the worlds in ``mask`` (B,) in Gymnasium's vector format: zeros elsewhere, and the mask under ``_name``."""
     if not mask.any():
         return {}
     given = {name: np.where(mask, values, np.zeros_like(values)) for name, values in found.items()}

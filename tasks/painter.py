@@ -1,4 +1,4 @@
-"""Frames of an environment as it runs: one world, drawn off-screen."""
+"""Off-screen rendering of one world of a running environment."""
 
 import atexit
 from typing import Any
@@ -16,10 +16,10 @@ from marlbc_mj.tasks.given import check_render_mode
 
 
 class Painter:
-    """Draws worlds of one scenario. OpenGL starts with the first frame and ends with :meth:`close`; a copy starts its own.
+    """Draws worlds of one scenario. The OpenGL context lasts from the first frame to :meth:`close`; a copy creates its own.
 
     Args:
-        width, height: of the frames [pixels].
+        width, height: size of the frames [pixels].
     """
 
     def __init__(self, width: int = 640, height: int = 480) -> None:
@@ -30,10 +30,10 @@ class Painter:
         return Painter, (self.width, self.height)
 
     def draw(self, world: World, b: int = 0) -> np.ndarray:
-        """(height, width, 3) uint8: world ``b`` as it is now.
+        """(height, width, 3) uint8 image of the current state of world ``b``.
 
         Raises:
-            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL disables it.
         """
         log = from_world(world, b)
         if self._drawing is None:
@@ -41,7 +41,7 @@ class Painter:
             camera = make_camera("track", stage, self.width / self.height)
             self._drawing = stage, Offscreen(stage, camera, self.width, self.height)
             atexit.unregister(_close_all)
-            atexit.register(_close_all)  # after MuJoCo's, which ends OpenGL: what is registered later runs earlier
+            atexit.register(_close_all)  # registered after MuJoCo's handler, which ends OpenGL, so as to run before it
             _painting.add(self)
         first, offscreen = self._drawing
         offscreen.stage = restage(first, log)
@@ -49,7 +49,7 @@ class Painter:
         return np.ascontiguousarray(offscreen.render(float(log.time[0])))
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         if self._drawing is not None:
             self._drawing[1].close()
             self._drawing = None
@@ -59,14 +59,14 @@ class Painter:
 
 
 class Drawn:
-    """A view of one team that draws itself.
+    """Mixin of environments of one team: holds the batch and renders it.
 
     Args:
-        batch: the team.
-        render_mode: ``"rgb_array"``: :meth:`render` draws it; None: it does not.
+        batch: the team, a batch of one world.
+        render_mode: ``"rgb_array"`` makes :meth:`render` draw the team; None disables drawing.
 
     Raises:
-        ConfigurationError: another render mode.
+        ConfigurationError: the render mode is not supported.
     """
 
     def __init__(self, batch: FormationBatch, render_mode: str | None) -> None:
@@ -75,20 +75,20 @@ class Drawn:
         self.painter = Painter()
 
     def render(self) -> np.ndarray | None:
-        """(height, width, 3) uint8: the team as it is now; None without a render mode.
+        """(height, width, 3) uint8 image of the current state of the team; None without a render mode.
 
         Raises:
-            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL switches it off.
+            ConfigurationError: no OpenGL backend works here, or MUJOCO_GL disables it.
         """
         return None if self.render_mode is None else self.painter.draw(self.batch.world)
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self.painter.close()
 
 
 _painting: WeakSet[Painter] = WeakSet()
-"""All painters with an OpenGL context; one that is not closed gives it back before the interpreter ends."""
+"""All painters with an OpenGL context; contexts still open are released before the interpreter exits."""
 
 
 def _close_all() -> None:

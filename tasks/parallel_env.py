@@ -1,4 +1,4 @@
-"""PettingZoo view of the missions: every agent chooses its own order and shares the team's reward."""
+"""PettingZoo environment of the missions: every agent chooses its own order, and all share the team's reward."""
 
 from collections.abc import Mapping
 from typing import Any, ClassVar
@@ -19,19 +19,19 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
     """One team as a PettingZoo ``ParallelEnv``; agents are ``agent_1`` to ``agent_N``.
 
-    Everybody observes the team's state; ``state()`` returns it too.
+    Every agent observes the team's state, which ``state()`` returns too.
 
     Args:
         scenario: a scenario, or the name of one.
-        controller: the force law, or its name; SORLC by default.
+        controller: a force law, or the name of one; SORLC by default.
         observation: ``"extended"`` or ``"published"``.
-        actions: ``"commands"`` (the distinct ones) or ``"orders"`` (all permutations).
-        interval: mission steps that a decision holds for.
-        render_mode: ``"rgb_array"``: :meth:`render` draws the team; None: it does not.
-        **changes: any field of the scenario, ``duration=20.0`` for example.
+        actions: ``"commands"`` (one order per distinct command) or ``"orders"`` (all permutations).
+        interval: mission steps per decision.
+        render_mode: ``"rgb_array"`` makes :meth:`render` draw the team; None disables drawing.
+        **changes: scenario fields to change, for example ``duration=20.0``.
 
     Raises:
-        ConfigurationError: a setting that cannot be run.
+        ConfigurationError: a setting is invalid.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"name": "paper_formation_v0", "render_modes": list(RENDER_MODES), "render_fps": 20}
@@ -58,20 +58,20 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         self._seeds = np.random.default_rng()
 
     def observation_space(self, agent: str) -> Space[np.ndarray]:
-        """Box of the team's state."""
+        """The Box of the team's state, the same for every agent."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> Space[Any]:
-        """Discrete: the agent's order."""
+        """The Discrete space of an agent's order."""
         return self.action_spaces[agent]
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode; the draw of the scenario comes from ``seed``.
+        """Begin an episode; ``seed`` determines the draw of the scenario.
 
         Raises:
-            ConfigurationError: a seed that is negative or no whole number.
+            ConfigurationError: the seed is negative or not an integer.
         """
         if seed is not None:
             if not isinstance(seed, int | np.integer) or seed < 0:
@@ -84,10 +84,10 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
     def step(
         self, actions: dict[str, int]
     ) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]]:
-        """One decision of every agent; the reward (13) is the same for all.
+        """Make one decision of every agent; the reward (13) is the same for all.
 
         Raises:
-            ConfigurationError: an agent without an action, one that is not there, no whole number, or an index that is no action.
+            ConfigurationError: an agent has no action or is unknown, or an action is not an integer or out of range.
         """
         if not isinstance(actions, Mapping):
             raise ConfigurationError(f"actions must be a dictionary with one per agent, got {type(actions).__name__}")
@@ -112,7 +112,7 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         )
 
     def state(self) -> np.ndarray:
-        """(S,) the team's state."""
+        """The team's state (S,)."""
         return self._state.copy()
 
     def _everybody(self, state: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Where the episodes of learners begin: at the start of the mission, or exploring, anywhere along the route."""
+"""Where training episodes begin: at the start of the mission, or as exploring starts anywhere along the route."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -14,24 +14,24 @@ from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
 
 PLACES_TRIED = 20
-"""Places along the route that are tried for an exploring start."""
+"""Number of places along the route to try for an exploring start."""
 
 
 @dataclass(frozen=True)
 class Starts:
-    """Where episodes begin: this share of them anywhere along the route, in formation or in column, at rest in the slots.
+    """Where episodes begin: the share ``exploring`` anywhere along the route, in formation or in column, moving with the slots.
 
-    An exploring start lasts ``length`` and then ends without being terminal. Where slots of the first formation come within the
-    safe distance of an obstacle, it starts as a column; where those of the column do, too, somewhere else. Where a slot becomes
-    blocked or free is where orders have to change: decisions are rare elsewhere, so that a uniform start spends most of its
-    time where there is nothing to learn.
+    An episode from an exploring start lasts ``length`` and is then truncated, not terminal. Where a slot of the first formation
+    is within the safe distance of an obstacle, the team starts in column; where a column slot is, too, it starts elsewhere.
+    Orders have to change where a slot becomes blocked or free. Elsewhere there is little to learn, so ``focus`` puts starts
+    shortly before such places.
     """
 
     exploring: float = 0.0  # share of episodes in [0, 1]
     length: float = 20.0  # [s]
-    focus: float = 0.0  # share of the exploring starts that begin shortly before a slot of the first formation is blocked or free
-    lead: float = 8.0  # how long before, at the most [s]
-    turning: float = 0.0  # share of the exploring starts that are to begin with the whole team taking one formation, either
+    focus: float = 0.0  # share of exploring starts shortly before a slot of the first formation becomes blocked or free
+    lead: float = 8.0  # longest time before that change [s]
+    turning: float = 0.0  # share of exploring starts in which the whole team should first take one of the formations
 
     def __post_init__(self) -> None:
         for name in ("exploring", "focus", "turning"):
@@ -46,38 +46,38 @@ class Starts:
 class Start(NamedTuple):
     """An exploring start of one team."""
 
-    step: int  # mission steps that count as made
+    step: int  # number of mission steps that count as made
     position: np.ndarray  # (N, 2) [m]
-    command: np.ndarray  # (N,) commands that count as given last
-    turn: int  # command with which the whole team is to begin; -1: none
+    command: np.ndarray  # (N,) commands that count as the last ones
+    turn: int  # command with which the whole team should begin; -1: none
 
 
 class Route:
-    """Draws the exploring starts of one scenario, as ``starts`` says.
+    """Draws the exploring starts of one scenario.
 
     Args:
         scenario: the problem instance.
-        starts: shares of the kinds of starts.
-        interval: mission steps that a decision holds for; starts are at decisions.
-        commands: those that the action set has.
+        starts: shares of the different kinds of starts.
+        interval: mission steps per decision; starts coincide with decisions.
+        commands: the commands in the action set.
     """
 
     def __init__(self, scenario: Scenario, starts: Starts, interval: int, commands: Iterable[int]) -> None:
         self.scenario = scenario
         self.starts = starts
         self.interval = interval
-        self.decisions = scenario.mission_steps // interval  # of a whole mission
+        self.decisions = scenario.mission_steps // interval  # in a whole mission
         parts = [name.split(SEPARATOR) for name in scenario.orders.commands]
         known = sorted(commands, key=lambda c: len(parts[c]))
         self.keeping = [
             [c for c in known if parts[c][-1] == kept] or known for kept in scenario.formation_names
-        ]  # commands that an exploring start in each formation has, the shortest first, as far as the action set has them
+        ]  # per formation, the set's commands that an exploring start in it can have, the shortest first
         self.critical = self._critical()
 
     def draw(self, rng: np.random.Generator, anchors: np.ndarray, motions: np.ndarray) -> Start | None:
-        """A start where one of the formations is clear of obstacles; None if none was found.
+        """Draw a start with the slots of a formation clear of obstacles; None if none is found.
 
-        ``anchors`` (K, 3) [m] and ``motions`` (K, 6) are this episode's obstacles; (0, 6): all at rest.
+        ``anchors`` (K, 3) [m] and ``motions`` (K, 6) describe the episode's obstacles; with (0, 6) all are at rest.
         """
         for _ in range(PLACES_TRIED):
             step = self._decision(rng) * self.interval
@@ -90,7 +90,7 @@ class Route:
         return None
 
     def _decision(self, rng: np.random.Generator) -> int:
-        """The decision with which an exploring start begins."""
+        """Draw the index of the decision at which an exploring start begins."""
         last = self.decisions - 1
         if len(self.critical) and happens(self.starts.focus, rng):
             lead = rng.uniform(0.0, self.starts.lead) / (self.interval * self.scenario.mission_step)
@@ -98,7 +98,7 @@ class Route:
         return int(rng.integers(last))
 
     def _critical(self) -> np.ndarray:
-        """Decisions at which the path has carried a slot of the first formation into the safe distance of an obstacle, or out."""
+        """Decisions by which a slot of the first formation has just come within the safe distance of an obstacle, or left it."""
         decisions = np.arange(self.decisions) * self.interval
         slots = [self._centre(int(step)) + self.scenario.formations[0] for step in decisions]
         anchors, motions = self.scenario.obstacle_array(), motion_array(self.scenario.motions)
@@ -111,10 +111,10 @@ class Route:
         return desired_centroid(self.scenario, step * self.scenario.mission_step)
 
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-        """(N,) bool, which of ``positions`` (N, 2) [m] are within the safe distance of an obstacle."""
+        """(N,) bool: positions (N, 2) [m] within the safe distance of an obstacle."""
         return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
 
 
 def happens(share: float, rng: np.random.Generator) -> bool:
-    """True in this share of all calls; what never happens draws no number, so that it leaves the stream to the rest."""
+    """True with probability ``share``; a share of 0 draws no random number and leaves the stream unchanged."""
     return share > 0 and rng.random() < share

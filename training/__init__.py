@@ -1,1 +1,1 @@
-"""Learners of mission supervisors: configurations, trainers, networks, runs on disk, checkpoints and their export."""
+"""Training of mission supervisors: configurations, trainers, networks, runs on disk, checkpoints and their export."""

@@ -1,4 +1,4 @@
-"""The base of every training run: worlds, a learner's reward, and a state that can be saved and restored bit for bit."""
+"""Base class of trainers for one team: worlds, the learner's reward, and a state that is saved and restored bit for bit."""
 
 from abc import ABC, abstractmethod
 from typing import Any
@@ -18,13 +18,13 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 class BaseTrainer(ABC):
-    """One run. :meth:`advance` makes a decision in every world and learns from it.
+    """One training run; :meth:`advance` makes a decision in every world and learns from it.
 
     Args:
         config: configuration of the run.
 
     Raises:
-        ConfigurationError: a scenario, controller or device that cannot be used.
+        ConfigurationError: the scenario, controller or device cannot be used.
     """
 
     def __init__(self, config: TrainConfig) -> None:
@@ -44,7 +44,7 @@ class BaseTrainer(ABC):
         self.rng = np.random.default_rng(config.seed)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.state = self.batch.reset(config.seed)  # (B, S)
-        self.steps = 0  # mission steps made, over all worlds
+        self.steps = 0  # mission steps simulated so far, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         self.explored = 0.0  # share of the last actions that were not greedy
         single_thread()
@@ -57,34 +57,34 @@ class BaseTrainer(ABC):
     @property
     @abstractmethod
     def updates(self) -> int:
-        """Number of gradient steps made."""
+        """Number of gradient steps taken."""
 
     @property
     @abstractmethod
     def temperature(self) -> float:
-        """Wanted randomness of the actions; it falls from 1."""
+        """Randomness of the actions: 1 at the start, lower later."""
 
     @property
     @abstractmethod
     def network(self) -> TeamNetwork:
-        """The networks whose largest output is the greedy action."""
+        """The networks of the greedy policy, whose largest output marks the greedy action."""
 
     @abstractmethod
     def advance(self) -> DecisionOutcome:
         """Make one decision in every world and learn from it."""
 
     def step(self, actions: np.ndarray) -> DecisionOutcome:
-        """Make the decision ``actions`` (B, N) in every world."""
+        """Make one decision in every world: each agent takes its action in ``actions`` (B, N)."""
         outcome = self.batch.step(actions)
         single_thread()
         return outcome
 
     def judge(self, outcome: DecisionOutcome) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rewards of a decision and its consequences for each agent.
+        """Each agent's reward for a decision, and whether the agent's return ends with it.
 
         Returns:
-            (B, N) float32 rewards to learn from; (B, N) bool, whether the agent's return ends here, by the end of the mission or
-            because the agent was lost at a cost; (B, N) bool, whether it was lost.
+            (B, N) float32 rewards to learn from; (B, N) bool, whether the agent's return ends here, because the mission is over
+            or because the agent was :func:`lost` at a cost; (B, N) bool, whether the agent was lost.
         """
         shaping = self.config.shaping
         gone = lost(outcome, shaping, self.scenario.safe_distance)
@@ -93,7 +93,7 @@ class BaseTrainer(ABC):
         return reward, outcome.terminal[:, None] | pays, gone
 
     def learning_rate(self, share: float) -> float:
-        """Step size when a ``share`` of the budget is spent: linear from the first to the final one."""
+        """Step size once a ``share`` of the budget is spent, linear from the initial to the final one."""
         config = self.config
         return config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * max(0.0, 1.0 - share)
 
@@ -103,7 +103,7 @@ class BaseTrainer(ABC):
             raise ConfigurationError(f"the networks diverged after {self.steps} mission steps; try a lower learning_rate")
 
     def policy(self) -> Policy:
-        """The greedy policy of the present networks."""
+        """The greedy policy of the current :attr:`network`."""
         network = self.network
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)
@@ -112,7 +112,7 @@ class BaseTrainer(ABC):
         return Policy(weights, biases, scale, network.dueling, self.config.switching_margin, risk)
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""
         arrays = {
             **prefixed("world", self.batch.world.snapshot()),
             **{name: getattr(owner, name) for owner, name in self.plain_arrays()},
@@ -127,7 +127,7 @@ class BaseTrainer(ABC):
         return arrays, scalars
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        """Restore a :meth:`snapshot` of a run with the same configuration."""
         self.batch.world.restore(unprefixed("world", arrays))
         for owner, name in self.plain_arrays():
             setattr(owner, name, arrays[name].copy())
@@ -138,39 +138,39 @@ class BaseTrainer(ABC):
         self.steps, self.error = scalars["steps"], scalars["error"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
-        """Arrays that are attributes, as pairs of owner and name."""
+        """The arrays that a snapshot takes as they are: pairs of the owning object and the attribute's name."""
         return [(self, "state"), *((self.batch, name) for name in ("cut", "last"))]
 
 
 def check_device(device: str) -> None:
-    """Refuse a device of networks that this machine does not have.
+    """Check that this machine has the device for the networks.
 
     Raises:
-        ConfigurationError: it is cuda, and torch finds none.
+        ConfigurationError: the device is cuda, and torch finds no GPU.
     """
     if device == "cuda" and not torch.cuda.is_available():
         raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
 
 
 def single_thread() -> None:
-    """Have torch use one thread: the networks are small, so a second one gains nothing, and sums would depend on the number.
+    """Restrict torch to one thread: small networks gain nothing from more, and sums would depend on the number of threads.
 
-    numba's thread pool shares OpenMP with torch and sets its number of threads at every parallel loop, so this must be said again
-    after each of them. Networks that learn aside have a thread, and so a number, of their own.
+    numba's thread pool shares OpenMP with torch and sets the number of threads at every parallel loop, so call this again after
+    each of them. The number is set per thread: networks that learn in a thread of their own are not affected.
     """
     torch.set_num_threads(1)
 
 
 def make_starts(config: TrainConfig) -> Starts:
-    """Where the episodes of a run begin."""
+    """The settings of a run for where episodes begin."""
     return Starts(config.exploring_starts, config.start_length, config.focus, turning=config.turning)
 
 
 def prefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays under ``prefix.name``."""
+    """The arrays, renamed from ``name`` to ``prefix.name``."""
     return {f"{prefix}.{name}": array for name, array in arrays.items()}
 
 
 def unprefixed(prefix: str, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays that are under ``prefix.name``, by name."""
+    """The arrays named ``prefix.name``, renamed to ``name``."""
     return {name.removeprefix(f"{prefix}."): array for name, array in arrays.items() if name.startswith(f"{prefix}.")}

@@ -1,4 +1,4 @@
-"""Hash codes of states: the signs of A (z - mean z), z the code of an auto-encoder or the state itself (Tang et al. 2017)."""
+"""Hash codes of states: the signs of A (z - mean z), where z is an auto-encoder's code or the state (Tang et al. 2017)."""
 
 import numpy as np
 import torch
@@ -7,9 +7,9 @@ from torch import Tensor, nn
 CODE = 16
 """Width of the auto-encoder's code."""
 HIDDEN = 32
-"""Width of its hidden layers."""
+"""Width of the auto-encoder's hidden layers."""
 MINIBATCHES = 500
-"""Gradient steps of its training."""
+"""Gradient steps of the auto-encoder's training."""
 MINIBATCH = 256
 """States per gradient step."""
 
@@ -19,9 +19,9 @@ class StateHash:
 
     Args:
         size: S, the size of a state.
-        bits: bits of a hash code.
-        kind: ``"autoencoder"``, or ``"plain"`` for z = the state.
-        rng: random numbers of the projection A.
+        bits: number of bits of a hash code.
+        kind: ``"autoencoder"``, or ``"plain"`` to take the state itself as z.
+        rng: random generator for the projection A.
     """
 
     def __init__(self, size: int, bits: int, kind: str, rng: np.random.Generator) -> None:
@@ -40,15 +40,15 @@ class StateHash:
 
     @property
     def fitted(self) -> bool:
-        """Whether the hash was fitted, so that codes tell states apart."""
+        """Whether :meth:`fit` was called; before that, all states have the same code."""
         return bool(self.arrays["fitted"][0])
 
     def fit(self, states: np.ndarray, generator: torch.Generator) -> float:
-        """Train the auto-encoder once and for all; returns its last reconstruction error (mean square).
+        """Fit the hash, training the auto-encoder if there is one; returns its last mean squared reconstruction error, else 0.
 
         Args:
             states: (M, S) float32, scaled.
-            generator: random numbers of the initial weights and of the minibatches.
+            generator: random generator for the initial weights and the minibatches.
         """
         error = 0.0
         if self.kind == "autoencoder":

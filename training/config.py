@@ -31,64 +31,64 @@ DEFAULT_PPO = PPO()
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A training run of a mission supervisor.
+    """Configuration of a training run for one team.
 
     Raises:
-        ConfigurationError: a value that cannot be run.
+        ConfigurationError: a value or a combination of values is invalid.
     """
 
     method: str = "marlms"
-    """Method of learning, a name in METHODS."""
+    """Learning method, one of the names in METHODS."""
     preset: str = "fast"
-    """Name of the preset that the values come from."""
+    """Preset that the values are taken from."""
     seed: Annotated[int, NOT_NEGATIVE] = 0
-    """Random seed of the networks, the exploration, the starts and the draws from the replay buffer."""
+    """Random seed of the initial weights, the exploration, the episode starts and the draws from the replay buffer."""
     scenario: str = "paper"
-    """Scenario that is trained on."""
+    """Scenario to train on."""
     controller: str = "sorlc"
     """Controller that tracks the references."""
     budget: Annotated[int, AT_LEAST_ONE] = 2_400_000
-    """Mission steps, over all worlds."""
+    """Length of the run in mission steps, summed over all worlds."""
 
     worlds: Annotated[int, AT_LEAST_ONE] = 128
-    """Worlds stepped together."""
+    """Number of worlds simulated in parallel."""
     state: Literal["extended", "published"] = "extended"
-    """State that the networks see; ``published`` is that of the paper."""
+    """Input of the networks: ``published`` is that of the paper, ``extended`` is relative to slots and obstacles."""
     actions: Literal["commands", "orders", "avoidance"] = "commands"
-    """Action set: commands (the distinct ones), orders (all permutations) or avoidance (formation, with obstacles or not)."""
+    """Action set: commands (one order per distinct command), orders (all permutations) or avoidance (formation with or without
+    obstacle avoidance)."""
     interval: Annotated[int, AT_LEAST_ONE] = 10
-    """Mission steps that a decision holds for."""
+    """Mission steps per decision."""
     exploring_starts: Annotated[float, SHARE] = 0.95
     """Share of episodes that begin anywhere along the route."""
     start_length: Annotated[float, POSITIVE] = 12.0
-    """Length of those episodes [s]."""
+    """Length of the episodes that begin along the route [s]."""
     focus: Annotated[float, SHARE] = 0.7
-    """Share of those episodes that begin shortly before a slot of the formation comes too close to an obstacle, or is free
-    again."""
+    """Share of the episodes along the route that begin shortly before a slot of the formation comes too close to an obstacle or
+    becomes free again."""
     turning: Annotated[float, SHARE] = 0.5
-    """Share of those episodes that begin with the whole team taking one of the formations for 1 to ``hold`` decisions. They show
-    what a joint change, or waiting, leads to. Nobody gains from changing alone, so each agent's best answer to a bad habit of
-    all others can be the same habit."""
+    """Share of the episodes along the route in which the whole team first takes one of the formations for 1 to ``hold``
+    decisions. They show the effect of a joint change, or of waiting. An agent that changes alone gains nothing, so without them
+    a bad joint habit can be every agent's best response to the others."""
     turn_until: Annotated[float, SHARE] = 0.5
-    """Share of the budget after which no episode begins so: from then on, values tell what follows from what the others really
-    do."""
+    """Share of the budget after which no episode begins in this way, so that the values reflect what the others really do."""
 
     hidden: Annotated[tuple[int, ...], _LAYERS] = (64, 64)
     """Widths of the hidden layers."""
     dueling: bool = True
-    """Dueling networks: Q = V + B - mean B."""
+    """Whether the networks are dueling: Q = V + B - mean B."""
     copies: Annotated[int, AT_LEAST_ONE] = 5
-    """Past networks that a target is averaged over; 1 switches averaging off."""
+    """Number of past networks that a target averages; 1 switches averaging off."""
     push_every: Annotated[int, AT_LEAST_ONE] = 10
-    """Updates after which the present network joins the past ones."""
+    """Updates after which the current network joins the past ones."""
     gamma: Annotated[float, _DISCOUNT] = 0.98
     """Discount factor per decision."""
     n_step: Annotated[int, AT_LEAST_ONE] = 1
     """Decisions whose rewards are summed before the bootstrap."""
     learning_rate: Annotated[float, POSITIVE] = 1e-3
-    """Step size of Adam at the start of the budget."""
+    """Initial step size of the optimiser."""
     final_learning_rate: Annotated[float, POSITIVE] = 3e-5
-    """Step size of Adam at the end of the budget; linear in between."""
+    """Step size of the optimiser at the end of the budget; linear in between."""
     batch: Annotated[int, AT_LEAST_ONE] = 256
     """Transitions per update."""
     updates: Annotated[int, AT_LEAST_ONE] = 8
@@ -96,50 +96,50 @@ class TrainConfig:
     capacity: int = 50_000
     """Transitions in the replay buffer."""
     huber: Annotated[float, POSITIVE] = 1.0
-    """TD errors beyond it count linearly in the loss instead of squared; inf is the squared error of (17)."""
+    """TD errors larger than this count linearly in the loss instead of squared; inf gives the squared error of (17)."""
 
     smoothing: Annotated[float, SHARE] = 0.998
-    """Memory of the running mean of the weights, which the greedy policy is made of; 0 takes the present weights."""
+    """Decay factor of the running mean of the weights, which the greedy policy uses; 0 uses the current weights."""
     risk_gamma: Annotated[float, SHARE] = 0.8
     """Discount factor of the learned risks. The risk of an order is the chance, discounted by this per decision, that the agent
-    can no longer stay clear of obstacles by safe_distance + margin. 0 switches risks off; then only costs make the policy
-    careful."""
+    can no longer stay clear of obstacles by safe_distance + margin. 0 switches risks off, so that only costs make the
+    policy careful."""
     risk_limit: Annotated[float, SHARE] = 0.4
-    """Orders of a higher risk are not taken, unless all are risky."""
+    """Orders with a higher risk are not taken, unless all are too risky."""
 
     learner: Literal["lenient", "hysteretic", "plain"] = "lenient"
-    """Treatment of negative TD errors: lenient (some are overlooked), hysteretic (half of each counts) or plain (all count)."""
+    """Treatment of negative TD errors: lenient (some are ignored), hysteretic (half weight) or plain (full weight)."""
     hash: Literal["autoencoder", "plain"] = "autoencoder"
-    """Input of the hash: the codes of an auto-encoder (autoencoder) or the states as they are (plain)."""
+    """Input of the state hash: the codes of an auto-encoder (autoencoder) or the states themselves (plain)."""
     bits: Annotated[int, AT_LEAST_ONE, _BITS] = 16
-    """Bits of a hash code."""
+    """Number of bits of a hash code."""
     cool_by: Annotated[float, POSITIVE] = 0.35
-    """Share of the budget after which the largest temperature is 0.05."""
+    """Share of the budget at which the largest temperature has fallen to 0.05."""
     hold: Annotated[int, AT_LEAST_ONE] = 6
     """An exploring agent keeps its random order for 1 to this many decisions."""
     together: Annotated[float, SHARE] = 0.7
-    """Share of an agent's explorations in which it takes one random order with the whole team."""
+    """Share of an agent's explorations in which the whole team takes the same random order."""
     agreement: Annotated[float, SHARE] = 0.3
-    """Chance that all agents take the order of one member, drawn at random, where somebody wants to change its order and not all
-    want the same. They learn what waiting for each other and following each other is worth."""
+    """Probability that all agents take the order of a random member, where their greedy orders differ and at least one would
+    switch. They learn the value of waiting for each other and of following each other."""
     least_exploration: Annotated[float, SHARE] = 0.01
-    """Lower bound of the exploration."""
+    """Lower bound of the share of random actions."""
     switching_margin: float = 0.1
-    """The greedy policy leaves an order only for one whose value is higher by more than this."""
+    """Difference in value above which the greedy policy switches to another order."""
     shaping: Shaping = SHAPING
     """Reward shaping."""
     ppo: PPO = DEFAULT_PPO
-    """Settings of MAPPO alone."""
+    """Settings that only MAPPO uses."""
 
     evaluate_every: Annotated[int, AT_LEAST_ONE] = 20_000
     """Mission steps between evaluations on the case study."""
     save_every: Annotated[float, NOT_NEGATIVE] = 60.0
-    """Time between saves for --resume [s]."""
+    """Time between two saves of the state for --resume [s]."""
     threads: Annotated[int, AT_LEAST_ONE] = 2
-    """Threads of the simulation. With more than one, networks that learn from a replay buffer do so in a thread of their own
-    meanwhile; the results are the same."""
+    """Threads of the simulation. With more than one, a further thread updates networks that learn from a replay buffer during the
+    simulation; the results are the same."""
     device: Literal["cpu", "cuda"] = "cpu"
-    """Device of the networks: cpu or cuda."""
+    """Device that the networks run on: cpu or cuda."""
 
     def __post_init__(self) -> None:
         check(self)
@@ -166,7 +166,7 @@ class TrainConfig:
 
     @property
     def rows(self) -> int:
-        """Decisions of all worlds that the replay buffer holds."""
+        """Number of decisions of all worlds that the replay buffer holds."""
         return self.capacity // self.worlds
 
 
@@ -207,14 +207,14 @@ PRESETS: dict[str, tuple[TrainConfig, str]] = {
         "the published hyper-parameters: 100 000 episodes of 2000 decisions, published state, reward and orders",
     ),
 }
-"""Configuration and one line of description by name."""
+"""Configuration and one-line description of each preset, by name."""
 
 
 def make_config(preset: str, **changes: Any) -> TrainConfig:
-    """A preset with changes.
+    """A preset with some of its values changed.
 
     Raises:
-        ConfigurationError: unknown preset or a value that cannot be run.
+        ConfigurationError: unknown preset or invalid value.
     """
     if preset not in PRESETS:
         raise unknown("preset", preset, PRESETS)
@@ -226,16 +226,16 @@ Configuration = TypeVar("Configuration")
 
 
 def from_json(data: Mapping[str, Any]) -> TrainConfig:
-    """:func:`config_from_json` of a run for one team."""
+    """:func:`config_from_json` for the configuration of a run for one team."""
     return config_from_json(data, TrainConfig)
 
 
 def config_from_json(data: Mapping[str, Any], kind: type[Configuration]) -> Configuration:
-    """The configuration, of a ``kind``, whose JSON data :func:`marlbc_mj.util.provenance.plain_data` gives; settings that are
-    missing have their defaults.
+    """A configuration of class ``kind`` from its JSON data, as :func:`marlbc_mj.util.provenance.plain_data` writes it; missing
+    settings get their defaults.
 
     Raises:
-        ConfigurationError: an unknown setting or a value that cannot be run.
+        ConfigurationError: unknown setting or invalid value.
     """
     try:
         config: Configuration = convert(_JSON, _without_types(data), kind)
@@ -245,7 +245,7 @@ def config_from_json(data: Mapping[str, Any], kind: type[Configuration]) -> Conf
 
 
 def flat_settings(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON data of a configuration with nested settings under ``outer.inner``, without the types' names."""
+    """The JSON data of a configuration, with nested settings named ``outer.inner`` and without the names of types."""
     flat: dict[str, Any] = {}
     for name, value in _without_types(data).items():
         flat |= {f"{name}.{key}": entry for key, entry in value.items()} if isinstance(value, dict) else {name: value}
@@ -253,5 +253,5 @@ def flat_settings(data: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _without_types(data: Mapping[str, Any]) -> dict[str, Any]:
-    """JSON data of dataclasses without the names of their types."""
+    """JSON data of dataclasses, without the names of their types."""
     return {name: _without_types(value) if isinstance(value, dict) else value for name, value in data.items() if name != "type"}

@@ -8,17 +8,17 @@ from typing import Any
 from marlbc_mj.util.files import writing
 
 EVALUATION = ("return", "violation_time", "clearance_min", "switches")
-"""Beginnings of the names of scalars that belong to an evaluation."""
+"""Prefixes of the names of evaluation scalars."""
 
 
 class TensorBoard:
-    """Writes scalars under ``train/*`` and ``eval/*``; does nothing without TensorBoard.
+    """Writes scalars under ``train/*`` and ``eval/*``; does nothing if TensorBoard is not installed.
 
     Args:
         folder: folder of the event files.
 
     Raises:
-        ConfigurationError: the folder cannot be written; all methods raise it.
+        ConfigurationError: the folder cannot be written; every method can raise it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -34,7 +34,7 @@ class TensorBoard:
         """Write one value per name.
 
         Args:
-            step: mission steps made.
+            step: number of mission steps simulated so far.
             scalars: the values by name.
         """
         if self._writer is None:
@@ -46,7 +46,7 @@ class TensorBoard:
             self._writer.flush()
 
     def close(self) -> None:
-        """Write what is buffered and close the files."""
+        """Flush the buffer and close the files."""
         if self._writer is not None:
             with writing(self._folder):
                 self._writer.close()

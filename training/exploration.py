@@ -1,4 +1,4 @@
-"""Exploration by temperature, T^zeta per agent; random orders may be held for a while and shared by the team."""
+"""Exploration with rate T^zeta per agent; a random order can be held for several decisions and shared by the team."""
 
 import numpy as np
 
@@ -6,20 +6,20 @@ from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.leniency import ZETA
 
 BEGINNING = -1
-"""Stands for the decisions left of a held order where an episode has just begun."""
+"""Value of ``Exploration.left`` where an episode has just begun."""
 
 
 class Exploration:
-    """Replaces a share T^zeta of the greedy actions by random ones. With ``hold=1, together=0`` it does so as published.
+    """Replaces a share T^zeta of the greedy actions by random ones; as published with ``hold=1, together=0``.
 
-    Every agent has random orders of its own, and the team has joint ones, which come first: while an agent takes part in a joint
-    exploration, its own stands still. Each of these is in force for a share of the decisions, see :meth:`_hold`, independently
-    of the others. So an agent's actions are random in exactly the share T^zeta of all decisions, the first of an episode as well
-    as the last, for any ``hold`` and ``together``. :meth:`begin` and agreement add to that share; an agent to which the joint
-    order is not allowed has less.
+    Each agent explores with random orders of its own, and the team with joint ones. Joint orders take precedence: while an agent
+    follows one, its own random order is paused. Each kind is in force for a given share of the decisions, see :meth:`_hold`,
+    independently of the others. So an agent's actions are random in exactly the share T^zeta of all decisions, from the first of
+    an episode to the last, for any ``hold`` and ``together``. :meth:`begin` and agreement raise that share; it is lower for an
+    agent to which a joint order is not allowed.
 
     Args:
-        config: its hold, together, agreement and least_exploration are used.
+        config: configuration of the run; only hold, together, agreement and least_exploration are used.
         agents: N.
         actions: A, number of actions.
     """
@@ -28,10 +28,10 @@ class Exploration:
         self.config = config
         self.actions = actions
         shape = config.worlds, agents + 1  # one column per agent, the team's last
-        self.left = np.full(shape, BEGINNING, dtype=np.int64)  # decisions that a held order still lasts
+        self.left = np.full(shape, BEGINNING, dtype=np.int64)  # decisions left of the held order
         self.held = np.zeros(shape, dtype=np.int64)
         lengths = np.arange(config.hold, 0, -1.0)
-        self.rest = lengths / lengths.sum()  # chance that 1, 2, ... decisions are left of an order under way
+        self.rest = lengths / lengths.sum()  # probabilities of 1, 2, ... decisions left in a held order
 
     def __call__(
         self,
@@ -42,15 +42,15 @@ class Exploration:
         last: np.ndarray | None = None,
         allowed: np.ndarray | None = None,
     ) -> np.ndarray:
-        """(B, N) actions.
+        """The actions (B, N) to take.
 
         Args:
-            greedy: (B, N) the best actions.
+            greedy: (B, N) greedy actions.
             temperature: (B, N) each agent's mean temperature.
-            rng: random numbers of all draws.
-            last: (B, N) actions in force, by which a disagreement is told; without them there is none.
-            allowed: (B, N, A) bool. An agent stays out of what the team does jointly while the order is not allowed for it:
-                otherwise the team's gain from endangering a member would make the order look good to the others.
+            rng: random generator for all draws.
+            last: (B, N) actions in force, needed for ``agreement``; without them there is none.
+            allowed: (B, N, A) bool; all actions by default. An agent does not follow a joint order that is not allowed for it.
+                Otherwise the team's gain from endangering one member would make the order look good to the others.
         """
         greedy = greedy if last is None else self._agree(greedy, last, allowed, rng)
         joint, alone = shares(self._share(temperature), self.config.together)
@@ -63,7 +63,7 @@ class Exploration:
         return np.where(inside, self.held[:, -1:], np.where(busy, self.held[:, :-1], greedy))
 
     def _agree(self, greedy: np.ndarray, last: np.ndarray, allowed: np.ndarray | None, rng: np.random.Generator) -> np.ndarray:
-        """Where an agent wants to change its order and not all want the same, all may take one member's order instead."""
+        """Where greedy actions differ and one would switch, let all agents take one member's with probability ``agreement``."""
         if not self.config.agreement:
             return greedy
         torn = (greedy != greedy[:, :1]).any(axis=1) & (greedy != last).any(axis=1)
@@ -72,21 +72,21 @@ class Exploration:
         return np.where(agree[:, None] & _permits(allowed, order), order[:, None], greedy)
 
     def _share(self, temperature: np.ndarray) -> np.ndarray:
-        """(B, N) shares of random actions, T^ZETA."""
+        """(B, N) shares of random actions: T^ZETA, at least ``least_exploration``."""
         return np.asarray(np.maximum(temperature**ZETA, self.config.least_exploration))
 
     def _hold(self, columns: slice, share: np.ndarray, runs: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Bool: where a held order is in force. Columns that do not run stand still.
+        """Bool: where a held random order is in force at this decision. Paused columns do not change.
 
-        Orders last m = (hold + 1) / 2 decisions on average. One that begins in a free decision with probability
-        s / (s + m (1 - s)) is therefore in force in the share s of all decisions. An episode begins in the middle of that: with
-        probability s an order is under way, with the rest of its length left.
+        An order lasts m = (hold + 1) / 2 decisions on average. If a free decision begins one with probability
+        s / (s + m (1 - s)), random orders are in force in the share s of all decisions. The start of an episode is a point in the
+        middle of this process: with probability s an order is already in force, and the rest of its length remains.
 
         Args:
-            columns: the columns of ``left`` and ``held`` that are meant, the agents' or the team's.
+            columns: columns of ``left`` and ``held`` to use, those of the agents or that of the team.
             share: s of each column.
-            runs: bool, whether a column runs.
-            rng: random numbers of the draws.
+            runs: bool, whether a column runs; otherwise it is paused.
+            rng: random generator for all draws.
         """
         hold, shape = self.config.hold, share.shape
         first = self.left[:, columns] == BEGINNING
@@ -100,34 +100,34 @@ class Exploration:
         return np.asarray(busy)
 
     def begin(self, orders: np.ndarray, rng: np.random.Generator) -> None:
-        """Have whole teams take one order for 1 to ``hold`` decisions.
+        """Make whole teams take one order for 1 to ``hold`` decisions.
 
         Args:
-            orders: (B,) the orders, -1 for teams that go on as they are.
-            rng: random numbers of the lengths.
+            orders: (B,) the orders; -1 leaves a team as it is.
+            rng: random generator for the lengths.
         """
         teams = orders >= 0
         self.held[teams, -1] = orders[teams]
         self.left[teams, -1] = rng.integers(1, self.config.hold + 1, size=int(teams.sum()))
 
     def forget(self, ended: np.ndarray) -> None:
-        """Drop the held orders of worlds whose episode ``ended`` (B,)."""
+        """Drop the held orders of the worlds in which an episode ``ended`` (B,)."""
         self.left[ended] = BEGINNING
 
 
 def _permits(allowed: np.ndarray | None, order: np.ndarray) -> np.ndarray | bool:
-    """(B, N) bool: the agents to which each team's ``order`` (B,) is allowed."""
+    """(B, N) bool: the agents for which their team's ``order`` (B,) is allowed."""
     return True if allowed is None else np.asarray(allowed[np.arange(len(order)), :, order])
 
 
 def shares(share: np.ndarray, together: float) -> tuple[np.ndarray, np.ndarray]:
-    """Shares of joint explorations (B,), and of the agents' own outside of these (B, N), that make up each agent's share.
+    """Share of decisions with joint exploration (B,), and each agent's share of own exploration in the others (B, N).
 
-    j = min(together mean_i s_i, min_i s_i), so that no agent explores more than its share, and s_i = j + (1 - j) alone_i.
+    j = min(together mean_i s_i, min_i s_i), so that no agent exceeds its share s_i, and s_i = j + (1 - j) alone_i.
 
     Args:
-        share: (B, N) s, share of random actions of each agent.
-        together: wanted share of the explorations that are joint.
+        share: (B, N) s, each agent's share of random actions.
+        together: intended share of explorations that are joint.
     """
     joint = np.minimum(together * share.mean(axis=1), share.min(axis=1))
     rest = 1.0 - joint[:, None]

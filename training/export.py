@@ -1,7 +1,7 @@
-"""A trained policy as an ONNX file, for computers that have an ONNX runtime and no Python; needs the ``onnx`` extra.
+"""Export of a trained policy as an ONNX file, for computers with an ONNX runtime but no Python; needs the ``onnx`` extra.
 
-torch writes the graph from the networks that learn, so there is no second definition of a network here. The general policy's
-pooling of what was heard is written twice, in NumPy for the supervisor and in torch here; a test holds them together.
+torch writes the graph from the network class used in training, so networks are defined once only. The general policy's pooling
+of received messages is implemented twice, in NumPy for the supervisor and in torch here; a test checks that they agree.
 """
 
 import json
@@ -35,37 +35,38 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file
 
 OPSET = 18
-"""Version of the operators: ONNX 1.13 (2022) and everything since runs it. torch's exporter writes no older one."""
+"""Version of the ONNX operator set: ONNX 1.13 (2022) and later support it. torch's exporter writes no older one."""
 IR = 8
-"""Version of the file format that goes with it."""
+"""Version of the ONNX file format that belongs to ``OPSET``."""
 
 
 def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> str:
-    """Write a checkpoint's policy as ONNX; returns one line that says what goes in and what comes out.
+    """Write a checkpoint's policy as ONNX; returns one line that describes the inputs and outputs.
 
     The policy of one team: inputs are ``state`` (batch, S) float32, of the kind that the signature names, and ``last`` (batch, N)
-    int64, the actions in force; a row with a negative entry has none. Outputs are ``values`` (batch, N, A) float32 as
-    ``Policy.values`` gives them, minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as
-    :func:`marlbc_mj.policies.greedy.greedy` chooses: indices into the action set, the last action unless the best is better by
-    more than the margin. A network over joint actions has ``values`` (batch, 1, A^N). The metadata are texts: ``signature``
-    (JSON: what the policy is tied to), ``actions`` (JSON: the order that each index stands for), ``margin`` and ``risk``.
+    int64, the actions in force; a negative entry in a row means that there are none. Outputs are ``values`` (batch, N, A) float32
+    as returned by ``Policy.values``, minus infinity for actions that are too risky, and ``orders`` (batch, N) int64 as chosen by
+    :func:`marlbc_mj.policies.greedy.greedy`: indices into the action set, the last action unless the best action's value is
+    higher by more than the margin. A network over joint actions has ``values`` (batch, 1, A^N). The metadata are texts:
+    ``signature`` (JSON: the team, state and actions that the policy was trained for), ``actions`` (JSON: the order that each
+    index stands for), ``margin`` and ``risk``.
 
-    The general policy, for one agent: inputs are ``features`` (batch, F) float32, what the agent has of its own; ``heard``
-    (batch, agents, M) float32, the last vector heard of each agent, its own included: the first M of its F; ``age`` (batch,
-    agents) float32, how old these are in settling times, infinite where nothing was heard; ``last`` (batch,) int64, the action
-    in force, negative for none. Outputs are ``values`` (batch, A) and ``action`` (batch,): 0 formation, 1 column; of a policy
-    that decides about avoidance, too, 2 and 3 are the same with avoidance on top. The metadata are ``layout`` (JSON, what the
-    entries of a vector are), ``interval`` (of decisions, in settling times), ``actions``, ``margin``, ``dwell`` (decisions that
-    an agent keeps a new order for, told by the order's age among its features) and ``deadline``, see
-    :class:`~marlbc_mj.policies.general.GeneralPolicy`.
+    The general policy, for one agent: inputs are ``features`` (batch, F) float32, sensed by the agent itself; ``heard``
+    (batch, agents, M) float32, the last vector received from each agent (the first M of its F features), including the agent's
+    own; ``age`` (batch, agents) float32, the age of these vectors in settling times, infinite where none was received; ``last``
+    (batch,) int64, the action in force, negative for none. Outputs are ``values`` (batch, A) and ``action`` (batch,):
+    0 formation, 1 column; for a policy that also decides about avoidance, 2 and 3 are the same with avoidance on top. The
+    metadata are ``layout`` (JSON: the meaning of a vector's entries), ``interval`` (between decisions, in settling times),
+    ``actions``, ``margin``, ``dwell`` (decisions for which an agent keeps a new order, measured by the order's age among its
+    features) and ``deadline``, see :class:`~marlbc_mj.policies.general.GeneralPolicy`.
 
     Args:
-        checkpoint: the checkpoint's file.
-        out: the ONNX file.
+        checkpoint: file of the checkpoint.
+        out: ONNX file to write.
         overwrite: whether an existing file may be replaced.
 
     Raises:
-        ConfigurationError: no ``onnx`` extra, no checkpoint, or ``out`` is there already.
+        ConfigurationError: the ``onnx`` extra is not installed, there is no valid checkpoint, or ``out`` exists already.
     """
     _need_packages()
     check_target(out, overwrite=overwrite)
@@ -76,7 +77,7 @@ def export_policy(checkpoint: Path, out: Path, *, overwrite: bool = False) -> st
 
 
 def _team_model(checkpoint: Path) -> tuple[Any, str]:
-    """The graph of one team's policy, and what it takes and gives."""
+    """The ONNX model of one team's policy, and a description of its inputs and outputs."""
     policy, description = read_policy(checkpoint)
     try:
         signature, scenario = description["signature"], make_scenario(description["train"]["scenario"])
@@ -98,7 +99,7 @@ def _team_model(checkpoint: Path) -> tuple[Any, str]:
 
 
 def _general_model(checkpoint: Path) -> tuple[Any, str]:
-    """The graph of one agent under the general policy, and what it takes and gives."""
+    """The ONNX model of one agent's general policy, and a description of its inputs and outputs."""
     policy, _ = read_general(checkpoint)
     metadata = {
         "layout": json.dumps(INPUT_LAYOUT),
@@ -115,7 +116,7 @@ def _general_model(checkpoint: Path) -> tuple[Any, str]:
 
 
 def _need_packages() -> None:
-    """Raise ConfigurationError where the optional packages are not installed."""
+    """Raise ConfigurationError if an optional package is not installed."""
     for name in ("onnx", "onnxscript"):
         try:
             import_module(name)
@@ -124,7 +125,7 @@ def _need_packages() -> None:
 
 
 def _as_modules(policy: Policy) -> TeamNetwork:
-    """The networks of a policy in torch."""
+    """The networks of a policy as a torch module."""
     size = NetworkSize(len(policy.weights[0]), len(policy.scale), policy.columns, tuple(b.shape[2] for b in policy.biases[:-1]))
     network = TeamNetwork(size, torch.tensor(policy.scale), dueling=policy.dueling, risk=policy.risk > 0).requires_grad_(False)
     for own, trained in ((network.weights, policy.weights), (network.biases, policy.biases)):
@@ -134,18 +135,18 @@ def _as_modules(policy: Policy) -> TeamNetwork:
 
 
 def _choose(values: Tensor, kept: Tensor, fresh: Tensor, margin: float) -> Tensor:
-    """Actions (...,) for values (..., A), chosen as :func:`~marlbc_mj.policies.greedy.greedy` does; in force are ``kept``."""
+    """Actions (...,) for values (..., A), chosen as by :func:`~marlbc_mj.policies.greedy.greedy`; ``kept`` are in force."""
     best = values.argmax(dim=-1)
     lead = values.gather(-1, best[..., None]) - values.gather(-1, kept[..., None])
     return torch.where(takes_best(lead[..., 0], fresh, margin), best, kept)
 
 
 class TeamPolicy(nn.Module):
-    """``Policy.values`` and ``greedy`` of N agents in torch.
+    """``Policy.values`` and ``greedy`` of N agents as a torch module.
 
     Args:
-        policy: whose networks these are.
-        agents: N; where there is one network for all, its actions are joint ones, in C order.
+        policy: the policy to copy the networks from.
+        agents: N; if there is one network for all agents, its actions are joint actions in C order.
     """
 
     def __init__(self, policy: Policy, agents: int) -> None:
@@ -154,13 +155,13 @@ class TeamPolicy(nn.Module):
         self.network = _as_modules(policy)
         self.margin, self.risk = policy.margin, policy.risk
         self.each = policy.columns if networks == agents else round(policy.columns ** (1 / agents))
-        self.strides: Tensor | None  # of the agents' actions in a joint one
+        self.strides: Tensor | None  # of each agent's action in the index of a joint action
         strides = torch.tensor([self.each ** (agents - 1 - i) for i in range(agents)])
         self.register_buffer("strides", None if networks == agents else strides)
 
     def forward(self, state: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, N, A), or (B, 1, A^N), and chosen actions (B, N), from states (B, S) and last actions (B, N), negative for
-        none.
+        """Values (B, N, A), or (B, 1, A^N), and chosen actions (B, N), from states (B, S) and last actions (B, N), which are
+        negative if there are none.
         """
         values, logits = self.network.heads(state)
         if self.risk:
@@ -175,7 +176,7 @@ class TeamPolicy(nn.Module):
 
 
 class AgentPolicy(nn.Module):
-    """``GeneralPolicy.decide`` of one agent in torch; what it heard is pooled as by
+    """``GeneralPolicy.decide`` of one agent as a torch module; received vectors are pooled as by
     :func:`~marlbc_mj.policies.general_inputs.pool_heard`.
     """
 
@@ -185,8 +186,8 @@ class AgentPolicy(nn.Module):
         self.dwell, self.deadline = policy.dwell, policy.deadline
 
     def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, A) and chosen actions (B,) from features (B, F), vectors heard (B, N, M), their ages (B, N), last actions
-        (B,), negative for none.
+        """Values (B, A) and chosen actions (B,) from features (B, F), received vectors (B, N, M), their ages (B, N) and last
+        actions (B,), which are negative if there are none.
         """
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
         mean = values.mean(dim=0)
@@ -200,7 +201,7 @@ class AgentPolicy(nn.Module):
 
 
 def pool(heard: Tensor, age: Tensor) -> Tensor:
-    """(B, P) of vectors heard (B, N, M) and their ages (B, N)."""
+    """(B, P) pooled inputs from received vectors (B, N, M) and their ages (B, N)."""
     known = torch.isfinite(age)[..., None]
     count = known.sum(dim=1).clamp(min=1)
     counted = torch.cat([(heard[..., :WAYS] < 0.0).to(heard.dtype), heard[..., WAYS:]], dim=-1)
@@ -217,7 +218,7 @@ def pool(heard: Tensor, age: Tensor) -> Tensor:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what torch's exporter says about itself and about packages that it does not need here."""
+    """Suppress the exporter's log messages and warnings, about itself and about packages that are not needed here."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -230,14 +231,14 @@ def _quiet() -> Iterator[None]:
 
 
 def build(policy: Policy, agents: int, metadata: dict[str, str]) -> Any:
-    """The ``onnx.ModelProto`` of a policy of ``agents``, checked; see :func:`export_policy`."""
+    """The checked ``onnx.ModelProto`` of a policy of ``agents`` agents; see :func:`export_policy`."""
     inputs = {"state": torch.zeros(2, len(policy.scale)), "last": torch.zeros(2, agents, dtype=torch.int64)}
     batch = torch.export.Dim("batch")
     return _graph(TeamPolicy(policy, agents), inputs, ["values", "orders"], ({0: batch}, {0: batch}), metadata)
 
 
 def build_general(policy: GeneralPolicy, metadata: dict[str, str]) -> Any:
-    """The ``onnx.ModelProto`` of one agent under a general policy, checked; see :func:`export_policy`."""
+    """The checked ``onnx.ModelProto`` of a general policy for one agent; see :func:`export_policy`."""
     inputs = {
         "features": torch.zeros(2, FEATURES),
         "heard": torch.zeros(2, 3, SENT),
@@ -250,7 +251,7 @@ def build_general(policy: GeneralPolicy, metadata: dict[str, str]) -> Any:
 
 
 def _graph(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], shapes: Any, metadata: dict[str, str]) -> Any:
-    """The checked ``onnx.ModelProto`` of a module for inputs of such shapes."""
+    """The checked ``onnx.ModelProto`` of a module, with ``shapes`` naming the inputs' dynamic axes."""
     onnx: Any = import_module("onnx")
     with _quiet():
         program = torch.onnx.export(
@@ -267,7 +268,7 @@ def _graph(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], sha
     model = program.model_proto
     model.ir_version = IR
     for entry in (model.graph, *model.graph.node, *model.graph.input, *model.graph.output, *model.graph.value_info):
-        entry.ClearField("metadata_props")  # traces of the source, with paths of this computer; newer than IR
+        entry.ClearField("metadata_props")  # source traces with local paths; the field is newer than IR
     onnx.helper.set_model_props(model, metadata)
     onnx.checker.check_model(model, full_check=True)
     return model

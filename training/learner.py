@@ -1,4 +1,4 @@
-"""Independent deep Q-learners of a team: dueling networks, averaged targets, lenient (17) or hysteretic about negative errors."""
+"""Independent deep Q-learning of a team: dueling networks, averaged targets, lenient (17) or hysteretic weights of errors."""
 
 import copy
 from collections.abc import Iterable
@@ -14,27 +14,27 @@ from marlbc_mj.training.networks import NetworkSize, TargetRing, TeamNetwork, as
 from marlbc_mj.training.replay import Batch, Replay
 
 HYSTERESIS = 0.5
-"""Weight of a negative TD error of a hysteretic learner (Omidshafiei et al. 2017)."""
+"""Weight of negative TD errors in hysteretic learning (Omidshafiei et al. 2017)."""
 LARGEST_GRADIENT = 10.0
-"""Norm to which a larger gradient is scaled down: per network where they learn apart, over all parameters where one loss trains
-all."""
+"""Largest norm of a gradient, to which larger ones are scaled down: per network where networks learn independently, over all
+parameters where one loss trains all of them."""
 
 
 class Learner:
-    """The networks of N agents, their targets and their optimiser.
+    """The networks of N agents with their target networks and optimiser.
 
     Args:
         config: configuration of the run.
         agents: N.
         actions: A, number of actions per agent.
         scale: (S,) divisor of a state.
-        generator: random numbers of the initial weights and of the draws x of (17).
-        mask: (N, S) of 0 and 1, the entries of the state that each agent's network sees; all by default.
+        generator: random generator for the initial weights and the draws x of (17).
+        mask: (N, S), 1 for the entries of the state that each agent's network sees, else 0; all entries by default.
     """
 
     joint = False  # whether one loss trains all networks
-    own_state = False  # whether each agent's network sees its own entries of the state only
-    prioritised = False  # whether transitions are drawn by their TD errors
+    own_state = False  # whether each agent's network sees only the agent's own entries of the state
+    prioritised = False  # whether transitions with larger TD errors are drawn more often
 
     def __init__(
         self,
@@ -57,27 +57,27 @@ class Learner:
             generator=generator,
             mask=None if mask is None else torch.from_numpy(mask),
         ).to(config.device)
-        self.smooth = copy.deepcopy(self.network).requires_grad_(False)  # running mean of the weights
+        self.smooth = copy.deepcopy(self.network).requires_grad_(False)  # holds the running mean of the weights
         self.targets = TargetRing(self.network, config.copies)
         self.optimise([*self.network.parameters(), *self.further(agents, scale, generator)])
         self.updates = 0
         self.errors = np.zeros((0, 0), dtype=np.float32)  # (K, M) absolute TD errors of the last update
 
     def shape(self, agents: int, actions: int) -> tuple[int, int]:
-        """Number of networks, and number of values that each gives."""
+        """Number of networks, and number of action values per network."""
         return agents, actions
 
     def further(self, agents: int, scale: np.ndarray, generator: torch.Generator) -> list[nn.Parameter]:
-        """Make what learns beside the network, and return its parameters; arguments as those of the class."""
+        """Create other trained modules, such as a mixer, and return their parameters; arguments as for the class."""
         return []
 
     def optimise(self, parameters: Iterable[nn.Parameter]) -> None:
-        """Train these parameters, with a fresh optimiser."""
+        """Create an optimiser for these parameters; later updates train them."""
         self.parameters = list(parameters)
         self.optimiser = with_moments(self.make_optimiser())
 
     def make_optimiser(self) -> torch.optim.Optimizer:
-        """The optimiser of ``parameters``: Adam."""
+        """The optimiser for ``parameters``: Adam."""
         return torch.optim.Adam(self.parameters, lr=self.config.learning_rate, eps=1e-5, fused=True)
 
     @torch.no_grad()
@@ -108,8 +108,8 @@ class Learner:
         return float(error.abs().mean())
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """The loss, and the TD errors (K, M): the sum over networks of the mean Huber loss of the TD errors, each weighted by
-        :func:`td_weight`.
+        """The loss and the TD errors (K, M). The loss sums over networks the mean Huber loss of the TD errors, each weighted by
+        :func:`td_weight`; with risks, :meth:`risk_loss` is added.
         """
         now, logits = self.network.heads(self.tensor(batch.state))
         ahead, least = self._masked(*self.targets.heads(self.tensor(batch.next_state)))
@@ -136,21 +136,21 @@ class Learner:
         torch._foreach_lerp_(list(self.smooth.parameters()), list(self.network.parameters()), share)
 
     def _masked(self, values: Tensor, risks: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (N, M, A) with -inf for actions that are too risky, and the least risks (N, M), 0 without risks."""
+        """Values (N, M, A) with -inf for actions that are too risky, and the smallest risks (N, M), 0 without risks."""
         if not self.network.risk:
             return values, torch.zeros(values.shape[:-1], device=values.device)
         return mask_risky(values, risks, self.config.risk_limit)
 
     def risk_loss(self, batch: Batch, logits: Tensor, least: Tensor) -> Tensor:
-        """Cross entropy of the chosen actions' risks with their targets: 1 where the agent was lost, else
-        risk_gamma min_b risk(s', b).
+        """Cross entropy between the chosen actions' risks and their targets: 1 where the agent was lost, else
+        risk_gamma min_b risk(s', b), or 0 where its return ends.
 
-        The risk of an action thus becomes the discounted chance that coming too close can no longer be avoided. Bharadhwaj et
-        al. (ICLR 2021) learn a safety critic in this way.
+        The risk of an action thus becomes the discounted probability that coming too close can no longer be avoided. Bharadhwaj
+        et al. (ICLR 2021) learn a safety critic in this way.
 
         Args:
-            batch: M transitions of single decisions.
-            logits: (N, M, A) of the risks in ``batch.state``.
+            batch: M transitions over one decision each.
+            logits: (N, M, A) logits of the risks in ``batch.state``.
             least: (N, M) smallest risks in ``batch.next_state``.
         """
         goes_on = self.tensor(batch.discount.T) > 0
@@ -160,13 +160,13 @@ class Learner:
         return nn.functional.binary_cross_entropy_with_logits(chosen, target, reduction="none").sum(dim=0).mean()
 
     def push(self) -> None:
-        """Add the present networks to those that targets are averaged over."""
+        """Add the current networks to the past ones that targets average, replacing the oldest."""
         self.targets.push()
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(K, M) values of the chosen actions, with gradient, and their targets, without; here one row per agent, K = N.
+        """(K, M) values of the chosen actions, with gradient, and their targets, without gradient; one row per agent here, K = N.
 
-        Target: r + discount max_b Q(s', b), Q averaged over the past networks.
+        Target: r + discount max_b Q(s', b), with Q averaged over the past networks.
 
         Args:
             batch: M transitions.
@@ -182,31 +182,31 @@ class Learner:
         return values.gather(-1, actions[..., None]).squeeze(-1)
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Copies of the networks, the past networks and the optimiser's moments, by name."""
+        """Copies of the networks, their running mean, the past networks and the optimiser's moments, by name."""
         tensors = saved(self.parameters, self.optimiser) | {f"target{k}": t for k, t in enumerate(self.targets.tensors)}
         tensors |= {f"smooth{k}": p for k, p in enumerate(self.smooth.parameters())}
         return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go back to a :meth:`snapshot`."""
+        """Restore a :meth:`snapshot`."""
         restore(arrays, self.parameters, self.optimiser)
         self.targets.restore([torch.from_numpy(arrays[f"target{k}"]) for k in range(len(self.targets.tensors))])
         for k, p in enumerate(self.smooth.parameters()):
             p.copy_(torch.from_numpy(arrays[f"smooth{k}"]))
 
     def tensor(self, array: np.ndarray) -> Tensor:
-        """A float32 tensor of an array, on the device of the networks."""
+        """An array as a float32 tensor on the device of the networks."""
         return as_tensor(array, self.config.device)
 
 
 def snapshot_learning(learner: Learner, replay: Replay) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """What a learner and its replay buffer need to go on bit for bit: arrays, and the rest as JSON data."""
+    """The state that resumes a learner and its replay buffer bit for bit: arrays, and the remaining values as JSON data."""
     arrays = {**prefixed("learner", learner.snapshot()), **prefixed("replay", replay.arrays)}
     return arrays, {"rows": replay.count, "updates": learner.updates, "next_copy": learner.targets.next}
 
 
 def restore_learning(learner: Learner, replay: Replay, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-    """Go back to a :func:`snapshot_learning`, which may stand among other arrays and numbers."""
+    """Restore a :func:`snapshot_learning`; other entries in ``arrays`` and ``scalars`` are ignored."""
     learner.restore(unprefixed("learner", arrays))
     for name, array in replay.arrays.items():
         array[:] = arrays[f"replay.{name}"]
@@ -216,9 +216,9 @@ def restore_learning(learner: Learner, replay: Replay, arrays: dict[str, np.ndar
 
 @torch.no_grad()
 def clip_each(parameters: Iterable[nn.Parameter], largest: float) -> None:
-    """Scale each network's gradient down to the norm ``largest``; parameters (N, ., .) hold network i at index i.
+    """Limit the norm of each network's gradient to ``largest``; network i is at index i of the parameters (N, ., .).
 
-    Networks that learn apart stay apart: a large error of one leaves the steps of the others unchanged.
+    Networks that learn independently stay independent: a large error of one leaves the steps of the others unchanged.
     """
     gradients = [p.grad for p in parameters if p.grad is not None]
     norm = torch.stack([g.square().sum(dim=(1, 2)) for g in gradients]).sum(dim=0).sqrt()  # (N,)
@@ -228,13 +228,13 @@ def clip_each(parameters: Iterable[nn.Parameter], largest: float) -> None:
 
 
 def td_weight(error: Tensor, leniency: Tensor, kind: str, generator: torch.Generator) -> Tensor:
-    """(N, M) weights of TD errors in the loss (17): 1 where the error is positive or x > L, x uniform in (0, 1), else 0.
+    """(N, M) weights of TD errors in the loss (17): 1 where the error is positive or x > L, else 0, x uniform in (0, 1).
 
     Args:
         error: (N, M) TD errors.
-        leniency: (N, M) L.
-        kind: ``lenient`` as above; ``hysteretic`` has ``HYSTERESIS`` for negative errors and needs no L; ``plain`` has 1 for all.
-        generator: random numbers x.
+        leniency: (N, M) leniency L.
+        kind: ``lenient`` as above; ``hysteretic`` (``HYSTERESIS`` for negative errors) and ``plain`` (1 for all) ignore L.
+        generator: random generator for x.
     """
     if kind == "plain":
         return torch.ones_like(error)

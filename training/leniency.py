@@ -1,5 +1,5 @@
 """Leniency (16): temperatures of hashed states, which cool with every visit, and the share of negative TD errors that is
-overlooked while they are warm.
+ignored at a given temperature.
 """
 
 import numpy as np
@@ -9,15 +9,15 @@ from marlbc_mj.core.laws import compiled
 KAPPA = 2.0
 """Leniency moderation: L = 1 - exp(-KAPPA T)."""
 RHO = -0.01
-"""Published exponent of the cooling at the last decision of an episode (16)."""
+"""Published exponent of the cooling factor at the last decision of an episode (16)."""
 DECAY = 0.95
-"""Published decay of that exponent per decision, backwards (16)."""
+"""Published factor of that exponent per decision, from the last decision back to the first (16)."""
 ZETA = 0.999
-"""Published exponent of the exploration T^ZETA."""
+"""Published exponent of the exploration rate T^ZETA."""
 
 
 class Temperatures:
-    """Tables ``T_i[code][action]`` of N agents (Palmer et al. 2018), and the largest temperature nu, which decays.
+    """Tables ``T_i[code][action]`` of N agents (Palmer et al. 2018), and the largest temperature nu, which the trainer lowers.
 
     Args:
         agents: N.
@@ -26,22 +26,22 @@ class Temperatures:
     """
 
     def __init__(self, agents: int, codes: int, actions: int) -> None:
-        self.table = np.full((agents, codes, actions), np.inf, dtype=np.float32)  # inf: not visited, read as nu
+        self.table = np.full((agents, codes, actions), np.inf, dtype=np.float32)  # inf: not visited yet, counts as nu
         self.nu = 1.0
 
     def read(self, codes: np.ndarray) -> np.ndarray:
-        """(B, N, A) temperatures of states with ``codes`` (B,)."""
+        """(B, N, A) temperatures of the states with hash codes ``codes`` (B,)."""
         values = self.table[:, codes].transpose(1, 0, 2)
         return np.where(np.isinf(values), np.float32(self.nu), values)
 
     def cool(self, codes: np.ndarray, actions: np.ndarray, world: int, first: int, last: int) -> None:
-        """Cool what one ended episode visited, backwards: T <- min(exp(RHO DECAY^m) T, nu), m = 0 at its last decision.
+        """Cool the entries that a finished episode visited: T <- min(exp(RHO DECAY^m) T, nu), m decisions before its last.
 
         Args:
             codes: (T, B) ring of hash codes, one row per decision.
             actions: (T, B, N) ring of actions.
-            world: the world that the episode ran in.
-            first: first decision of the episode, counted from the start of the run; its row is this modulo T.
+            world: index of the world that the episode ran in.
+            first: first decision of the episode, counted from the start of the run; its row is ``first`` modulo T.
             last: last decision of the episode, likewise.
         """
         _cool(self.table, self.nu, codes, actions, world, first, last)
@@ -63,5 +63,5 @@ def _cool(table, nu, codes, actions, world, first, last):
 
 
 def leniency(temperature: np.ndarray) -> np.ndarray:
-    """L = 1 - exp(-KAPPA T) (16): the share of negative TD errors that is overlooked."""
+    """L = 1 - exp(-KAPPA T) (16): the share of negative TD errors that is ignored."""
     return -np.expm1(-KAPPA * temperature)

@@ -1,4 +1,4 @@
-"""Multi-agent PPO (Yu et al., NeurIPS 2022): an actor per agent, one critic on the state, trained on fresh rollouts."""
+"""Multi-agent PPO (Yu et al., NeurIPS 2022): one actor per agent and one critic of the state, trained on fresh rollouts."""
 
 from typing import Any
 
@@ -15,22 +15,22 @@ from marlbc_mj.training.networks import NetworkSize, TeamNetwork, as_tensor, res
 LAST_LAYER = 0.01
 """Factor of the initial weights of an actor's last layer, so that all actions are about equally likely."""
 HUBER = 10.0
-"""Normalised value errors beyond it count linearly."""
+"""Normalised value errors larger than this count linearly in the loss instead of squared."""
 RETURNS_MEMORY = 0.99999
-"""Share of the running mean and square of the returns that a rollout leaves; debiased, so at first they are plain means."""
+"""Decay factor per rollout of the running means of returns and squared returns; debiased, so they start as plain means."""
 
 
 class MAPPO(BaseTrainer):
-    """One run of MAPPO. Every ``ppo.rollout`` decisions it learns from the rollout and forgets it.
+    """One run of MAPPO. After every ``ppo.rollout`` decisions it learns from the rollout and discards it.
 
-    Rewards are per agent: the team's less its own costs. So the critic gives one value per agent, whose return may end before the
-    others'.
+    An agent's reward is the team's minus the agent's own costs, and its return can end before those of the others. So the critic
+    has one value per agent.
 
     Args:
         config: configuration of the run.
 
     Raises:
-        ConfigurationError: a scenario, controller or device that cannot be used.
+        ConfigurationError: the scenario, controller or device cannot be used.
     """
 
     def __init__(self, config: TrainConfig) -> None:
@@ -58,27 +58,27 @@ class MAPPO(BaseTrainer):
             "over": np.zeros((rows, worlds, agents), dtype=bool),
             "ended": np.zeros((rows, worlds), dtype=bool),
         }
-        self.row = 0  # rows of the rollout that are filled
-        self.made = 0  # gradient steps
-        self.surprise = 1.0  # mean entropy of the last update's actions, 1 at most
+        self.row = 0  # number of rows of the rollout filled so far
+        self.made = 0  # gradient steps taken
+        self.surprise = 1.0  # mean entropy of the policy at the last update, relative to its maximum
 
     @property
     def updates(self) -> int:
-        """Number of gradient steps made."""
+        """Number of gradient steps taken."""
         return self.made
 
     @property
     def temperature(self) -> float:
-        """Mean entropy of the actors, 1 where all actions are equally likely."""
+        """Mean entropy of the actors, 1 if all actions are equally likely."""
         return self.surprise
 
     @property
     def network(self) -> TeamNetwork:
-        """The actors; their logits stand for action values."""
+        """The actors, with logits in place of action values."""
         return self.actors
 
     def advance(self) -> DecisionOutcome:
-        """Make one sampled decision in every world; at the end of a rollout, learn from it."""
+        """Sample and make one decision in every world; at the end of a rollout, learn from it."""
         config = self.config
         share = self.steps / config.budget
         with torch.no_grad():
@@ -116,7 +116,7 @@ class MAPPO(BaseTrainer):
         return state, action, old, as_tensor(gain.T, device), as_tensor(self.scaling(returns).T, device)
 
     def _learn(self, rate: float) -> None:
-        """``ppo.epochs`` passes over the rollout with the step size ``rate``."""
+        """Make ``ppo.epochs`` passes over the rollout with the step size ``rate``."""
         config, ppo = self.config, self.config.ppo
         for group in self.optimiser.param_groups:
             group["lr"] = rate
@@ -139,7 +139,7 @@ class MAPPO(BaseTrainer):
         self.refuse_nonsense()
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""
         arrays, scalars = super().snapshot()
         tensors = saved(self.parameters, self.optimiser)
         arrays |= {
@@ -150,7 +150,7 @@ class MAPPO(BaseTrainer):
         return arrays, scalars | {"row": self.row, "updates": self.made, "entropy": self.surprise}
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        """Restore a :meth:`snapshot` of a run with the same configuration."""
         super().restore(arrays, scalars)
         restore(unprefixed("learner", arrays), self.parameters, self.optimiser)
         for name, array in self.rows.items():
@@ -160,13 +160,13 @@ class MAPPO(BaseTrainer):
 
 
 class ValueScale:
-    """Running mean and standard deviation of the returns of N agents, by which the critic's targets are normalised."""
+    """Running mean and standard deviation of the returns of N agents, which normalise the critic's targets."""
 
     def __init__(self, agents: int) -> None:
-        self.sums = np.zeros((3, agents))  # weights, returns and squared returns
+        self.sums = np.zeros((3, agents))  # decayed sums of weights, returns and squared returns
 
     def take(self, returns: np.ndarray) -> None:
-        """Include the returns (M, N) of a rollout."""
+        """Update the mean and deviation with the returns (M, N) of a rollout."""
         moments = np.stack([np.ones(returns.shape[1]), returns.mean(axis=0), (returns**2.0).mean(axis=0)])
         self.sums = RETURNS_MEMORY * self.sums + (1.0 - RETURNS_MEMORY) * moments
 
@@ -178,12 +178,12 @@ class ValueScale:
         return mean, np.sqrt(np.maximum(square / weight - mean**2, 1e-2))
 
     def __call__(self, returns: np.ndarray) -> np.ndarray:
-        """Returns (M, N) normalised to mean 0 and deviation 1."""
+        """The returns (M, N), normalised by the running mean and deviation."""
         mean, deviation = self._moments()
         return np.asarray((returns - mean) / deviation)
 
     def undo(self, values: np.ndarray) -> np.ndarray:
-        """Returns (M, N) from normalised values, as the critic gives them."""
+        """Returns (M, N) from normalised values, such as the critic's outputs."""
         mean, deviation = self._moments()
         return np.asarray(values * deviation + mean)
 
@@ -199,16 +199,16 @@ def advantages(
 ) -> np.ndarray:
     """(T, B, N) generalised advantage estimates A = d + gamma trace A', d = r + gamma V(s') - V(s) (Schulman et al., ICLR 2016).
 
-    V(s') is 0 for an agent whose return is over, and no trace crosses the end of an episode.
+    V(s') is 0 where an agent's return ends, and no trace crosses the end of an episode.
 
     Args:
         reward: (T, B, N) r.
         value: (T, B, N) V(s).
-        ahead: (T, B, N) V(s') of the true successors.
+        ahead: (T, B, N) V(s') of the true successors, before any restart.
         over: (T, B, N) bool, whether the agent's return ends here.
         ended: (T, B) bool, whether the episode ends here.
         gamma: discount factor.
-        trace: lambda.
+        trace: lambda of the estimate.
     """
     delta = reward + gamma * np.where(over, 0.0, ahead) - value
     goes_on = ~(over | ended[..., None])
@@ -220,11 +220,11 @@ def advantages(
 
 
 def log_probability(logits: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-    """Softmax policies: log-probabilities (N, M) of the actions, and entropies (N, M).
+    """Log-probabilities (N, M) of actions under softmax policies, and the policies' entropies (N, M).
 
     Args:
-        logits: (N, M, A).
-        action: (N, M).
+        logits: (N, M, A) logits of the policies.
+        action: (N, M) actions taken.
     """
     every = torch.log_softmax(logits, dim=-1)
     return every.gather(-1, action[..., None]).squeeze(-1), -(every.exp() * every).sum(dim=-1)
@@ -234,10 +234,10 @@ def clipped_loss(new: Tensor, old: Tensor, gain: Tensor, clip: float) -> Tensor:
     """(N, M) loss -min(q A, clip(q, 1 - clip, 1 + clip) A) with the ratio q = exp(new - old) (Schulman et al. 2017).
 
     Args:
-        new: (N, M) log-probabilities of the actions under the present policy.
-        old: (N, M) under the policy that acted.
+        new: (N, M) log-probabilities of the actions under the current policy.
+        old: (N, M) log-probabilities under the policy that chose them.
         gain: (N, M) advantages A.
-        clip: largest change of the ratio that pays.
+        clip: change of the ratio beyond which the loss rewards no further change.
     """
     ratio = (new - old).exp()
     gained: Tensor = torch.minimum(ratio * gain, ratio.clamp(1.0 - clip, 1.0 + clip) * gain)

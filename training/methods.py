@@ -1,4 +1,4 @@
-"""Training methods by name: their changes of a preset."""
+"""Training methods by name, each with the settings that it changes in a preset."""
 
 from dataclasses import dataclass, replace
 from typing import Annotated, Any
@@ -9,18 +9,18 @@ from marlbc_mj.util.settings import AT_LEAST_ONE, SHARE, check
 
 @dataclass(frozen=True)
 class PPO:
-    """Settings of MAPPO alone, which has no replay buffer, leniency, target copies or held exploration.
+    """Settings that only MAPPO uses; it has no replay buffer, leniency, target copies or held exploration.
 
     Raises:
-        ConfigurationError: a value that cannot be run.
+        ConfigurationError: a value is invalid.
     """
 
     rollout: Annotated[int, AT_LEAST_ONE] = 32
-    """Decisions of all worlds between two rounds of updates."""
+    """Length of a rollout: decisions of all worlds between two rounds of updates."""
     epochs: Annotated[int, AT_LEAST_ONE] = 10
     """Passes over a rollout."""
     minibatches: Annotated[int, AT_LEAST_ONE] = 4
-    """Gradient steps of a pass."""
+    """Gradient steps per pass."""
     clip: Annotated[float, SHARE] = 0.2
     """Ratios of new to old probabilities are clipped to [1 - clip, 1 + clip]."""
     trace: Annotated[float, SHARE] = 0.95
@@ -33,15 +33,15 @@ class PPO:
 
 
 WITHOUT_RISKS = ("central", "rlms", "mappo")
-"""Methods whose networks have no risk outputs per agent, or do not learn them."""
+"""Methods without learned risks: their networks have no risk output per agent, or do not train it."""
 
 CARE: dict[str, Any] = {
     "risk_gamma": 0.0,
     "gamma": 0.94,
     "shaping": Shaping(centre=10.0, scale=100.0, violation=0.0, margin=0.05, own_violation_cost=2000.0, own_switch_cost=40.0),
 }
-"""Settings of methods without learned risks: an agent's return ends where it comes too close, at a cost that nothing exceeds.
-That bounds the discount factor: the cost must be more than being out of formation for ever, centre * interval / (1 - gamma)."""
+"""Settings for methods without learned risks: an agent that comes too close pays a cost higher than any other, and its return
+ends. That limits gamma, as the cost must exceed that of never being in formation, centre * interval / (1 - gamma)."""
 
 METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "marlms": ({}, "MARLMS: lenient, dueling, averaged deep Q-networks, one per agent"),
@@ -50,7 +50,7 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
     "vdn": ({"learner": "plain"}, "value decomposition: the team's value is the sum of the agents'"),
     "qmix": ({"learner": "plain"}, "the team's value is a monotonic mixture of the agents', with weights from the state"),
     "central": (
-        # the team's return would end with any member's, and nobody would learn to get everybody out again: a punishment instead
+        # a punishment, no end of the return: with any member lost it would end for the team, which never learned to recover
         {
             "learner": "plain",
             "risk_gamma": 0.0,
@@ -85,10 +85,10 @@ METHODS: dict[str, tuple[dict[str, Any], str]] = {
             "learning_rate": 5e-4,
             "final_learning_rate": 5e-5,
             "ppo": PPO(rollout=8),
-            # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
+            # while actions are random, agents switch all the time: a cost would teach them for good never to switch
             "shaping": replace(CARE["shaping"], own_switch_cost=0.0),
         },
         "multi-agent PPO: one actor per agent, one critic on the state, rollouts instead of a replay buffer",
     ),
 }
-"""Changes of a preset and one line of description by method."""
+"""Changes to a preset and one-line description of each method, by name."""

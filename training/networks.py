@@ -1,5 +1,5 @@
-"""Dueling networks of a whole team as one stack of matrices, the past weights that targets are averaged over, and how networks
-and optimisers are saved.
+"""Dueling networks of a whole team as stacked matrices, past weights for averaged targets, and saving of networks and
+optimisers.
 """
 
 import itertools
@@ -16,11 +16,11 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 class NetworkSize(NamedTuple):
-    """How many networks there are, and how large each is."""
+    """Number of networks, and the size of each."""
 
     agents: int  # N networks
     state: int  # S inputs
-    actions: int  # A outputs, before those of dueling and risk
+    actions: int  # A action values; dueling and risk add further outputs
     hidden: tuple[int, ...]  # widths of the hidden layers
 
 
@@ -30,11 +30,11 @@ class TeamNetwork(nn.Module):
     Args:
         size: number and size of the networks, at least one hidden layer (ReLU).
         scale: (S,) divisor of the state.
-        dueling: False makes the last layer give Q itself.
-        risk: whether the last layer also gives the logit of a risk for every action.
-        generator: random numbers of the initial weights.
-        mask: (N, S) of 0 and 1, the entries that each agent's network sees; all by default. The others' weights in the first
-            layer are 0 and stay 0.
+        dueling: whether networks are dueling; if not, the last layer computes Q directly.
+        risk: whether the last layer also computes the logit of a risk for every action.
+        generator: random generator for the initial weights.
+        mask: (N, S), 1 for the entries that each agent's network sees, else 0; all entries by default. Weights of unseen
+            entries in the first layer are 0 and stay 0.
 
     Raises:
         ConfigurationError: no hidden layer.
@@ -73,21 +73,21 @@ class TeamNetwork(nn.Module):
             self.weights[0].data *= self.mask
 
     def forget_unseen(self) -> None:
-        """Remove the masked weights from the gradient; call it between ``backward`` and the step."""
+        """Set the gradient of masked weights to 0; call this between ``backward`` and the optimiser's step."""
         gradient = self.weights[0].grad
         if self.mask is not None and gradient is not None:
             gradient *= self.mask
 
     def forward(self, state: Tensor) -> Tensor:
-        """(N, B, A) action values of states (B, S), or of (N, B, S) where every agent has its own."""
+        """(N, B, A) action values of states (B, S), or (N, B, S) if each agent has its own."""
         return self.heads(state)[0]
 
     def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Action values and logits of the risks, both (N, B, A); networks without risks give no columns of these."""
+        """Action values and risk logits, both (N, B, A); without risks, the logits are (N, B, 0)."""
         return self.split(feed_forward(list(self.weights), list(self.biases), state / self.scale))
 
     def split(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
-        """Action values (..., A) and logits of the risks (..., A) from outputs (..., O) of the last layer."""
+        """Action values (..., A) and risk logits (..., A) from the outputs (..., O) of the last layer."""
         if not self.dueling:
             return outputs[..., : self.actions], outputs[..., self.actions :]
         value, advantage, risk = outputs[..., :1], outputs[..., 1 : 1 + self.actions], outputs[..., 1 + self.actions :]
@@ -95,31 +95,31 @@ class TeamNetwork(nn.Module):
 
 
 def as_tensor(array: np.ndarray, device: str) -> Tensor:
-    """A float32 tensor of an array on the device of the networks."""
+    """An array as a float32 tensor on the given device."""
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32)).to(device)
 
 
 def mask_risky(values: Tensor, risks: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Values (..., A) with -inf for actions that are too risky, and the least risks (...).
+    """Values (..., A) with -inf for actions that are too risky, and the smallest risks (...).
 
     Args:
-        values: (..., A).
-        risks: (..., A) in [0, 1].
-        limit: largest risk that is taken.
+        values: (..., A) action values.
+        risks: (..., A) risks of the actions in [0, 1].
+        limit: largest risk that may be taken.
     """
     least = risks.amin(dim=-1, keepdim=True)
     return torch.where(admissible(risks, least, limit), values, -math.inf), least[..., 0]
 
 
 def side_by_side(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
-    """One layer that computes N layers with the same input.
+    """Combine N layers that have the same input into one.
 
     Args:
-        weight: (N, in, out).
-        bias: (N, 1, out).
+        weight: (N, in, out) weights of the layers.
+        bias: (N, 1, out) biases of the layers.
 
     Returns:
-        Its weight (in, N out) and bias (N out,).
+        Weight (in, N out) and bias (N out,) of the combined layer.
     """
     networks, inputs, width = weight.shape
     return weight.permute(1, 0, 2).reshape(inputs, networks * width), bias.reshape(-1)
@@ -129,10 +129,10 @@ def feed_forward(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: 
     """(N, B, O) outputs of N networks of two or more layers, with ReLU in between.
 
     Args:
-        weights: (N, in, out) of each layer.
-        biases: (N, 1, out) of each layer.
-        x: (B, in) inputs of all networks, or (N, B, in) of each.
-        first: the first layer :func:`side_by_side`, where the caller has it; saves time for inputs (B, in).
+        weights: (N, in, out) weights of each layer.
+        biases: (N, 1, out) biases of each layer.
+        x: (B, in) input of all networks, or (N, B, in) with one per network.
+        first: the combined first layer from :func:`side_by_side`, if the caller has it; it saves time for inputs (B, in).
     """
     if x.ndim == 3:
         y = torch.baddbmm(biases[0], x, weights[0]).relu_()
@@ -145,11 +145,11 @@ def feed_forward(weights: list[Tensor], biases: list[Tensor], x: Tensor, first: 
 
 
 class TargetRing:
-    """The last ``copies`` weights of a network; values and risks are means over them (Anschel et al. 2017).
+    """Ring of the last ``copies`` weights of a network, over which values and risks are averaged (Anschel et al. 2017).
 
     Args:
-        network: whose weights are copied.
-        copies: number of copies; all are the present weights at first.
+        network: the network whose weights are copied.
+        copies: number of copies; at first all hold the current weights.
     """
 
     def __init__(self, network: TeamNetwork, copies: int) -> None:
@@ -157,15 +157,15 @@ class TargetRing:
         self.copies = copies
         self.agents = network.weights[0].shape[0]
         self.tensors = [p.detach().repeat(copies, 1, 1) for p in self._parameters()]  # (copies N, ., .)
-        self.next = 0  # the copy that is replaced next
-        self.first_layer: tuple[Tensor, Tensor] | None = None  # the copies' side by side; None after they changed
+        self.next = 0  # index of the copy to replace next
+        self.first_layer: tuple[Tensor, Tensor] | None = None  # combined first layer of all copies; None after a change
 
     def _parameters(self) -> Iterator[Tensor]:
         yield from self.network.weights
         yield from self.network.biases
 
     def push(self) -> None:
-        """Replace the oldest copy by the network's present weights."""
+        """Replace the oldest copy by the network's current weights."""
         rows = slice(self.next * self.agents, (self.next + 1) * self.agents)
         for copy, parameter in zip(self.tensors, self._parameters(), strict=True):
             copy[rows] = parameter.detach()
@@ -173,17 +173,17 @@ class TargetRing:
         self.first_layer = None
 
     def restore(self, tensors: Sequence[Tensor]) -> None:
-        """Take over the ``tensors`` of another ring; ``next`` is not among them."""
+        """Copy the ``tensors`` of another ring; set ``next`` separately."""
         for copy, tensor in zip(self.tensors, tensors, strict=True):
             copy.copy_(tensor)
         self.first_layer = None
 
     @torch.no_grad()
     def heads(self, state: Tensor) -> tuple[Tensor, Tensor]:
-        """Averaged action values and averaged risks in [0, 1] (no columns without them), both (N, B, A).
+        """Averaged action values and averaged risks in [0, 1], both (N, B, A); without risks, these are (N, B, 0).
 
         Args:
-            state: (B, S), or (N, B, S) where every agent has its own.
+            state: (B, S), or (N, B, S) if each agent has its own.
         """
         layers = len(self.network.weights)
         if state.ndim == 3:
@@ -197,10 +197,10 @@ class TargetRing:
 
 
 def with_moments(optimiser: torch.optim.Optimizer) -> torch.optim.Optimizer:
-    """An optimiser before its first step whose moments exist already, so that it can always be saved whole."""
+    """The optimiser with its moments allocated before the first step, so that its saved state is always complete."""
     for parameter in (p for group in optimiser.param_groups for p in group["params"]):
         parameter.grad = torch.zeros_like(parameter)
-    optimiser.step()  # by nothing
+    optimiser.step()  # gradients are 0: no parameter changes
     for moments in optimiser.state.values():
         moments["step"].zero_()
     optimiser.zero_grad()
@@ -208,7 +208,7 @@ def with_moments(optimiser: torch.optim.Optimizer) -> torch.optim.Optimizer:
 
 
 def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """Parameters and the optimiser's moments by name, not copied; the names say ``adam`` for every optimiser."""
+    """Parameters and the optimiser's moments by name, not copied; names of moments begin with ``adam`` for any optimiser."""
     tensors = {f"network{k}": p.detach() for k, p in enumerate(parameters)}
     for k, p in enumerate(parameters):
         tensors |= {f"adam{k}.{name}": value for name, value in optimiser.state[p].items()}
@@ -216,7 +216,7 @@ def saved(parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) 
 
 
 def restore(arrays: Mapping[str, np.ndarray], parameters: Sequence[nn.Parameter], optimiser: torch.optim.Optimizer) -> None:
-    """Set parameters and moments to what :func:`saved` gave, in place."""
+    """Set parameters and moments in place to the values that :func:`saved` returned."""
     for k, p in enumerate(parameters):
         p.data.copy_(torch.from_numpy(arrays[f"network{k}"]))
         prefix = f"adam{k}."

@@ -5,24 +5,24 @@ import numpy as np
 from marlbc_mj.training.replay import Batch, Replay
 
 ALPHA = 0.6
-"""Priorities are |TD error|^ALPHA."""
+"""Exponent of the priorities (|TD error| + LEAST_ERROR)^ALPHA."""
 BETA = 0.4
-"""Exponent of the importance weights at the start of the budget; 1 at the end, linear in between."""
+"""Exponent of the importance weights at the start of the budget; it rises linearly to 1 at the end."""
 LEAST_ERROR = 1e-3
-"""Added to every |TD error|, so that no transition is lost for good."""
+"""Added to every |TD error|, so that every transition can still be drawn."""
 
 
 class PrioritisedReplay(Replay):
-    """A ring of rows with one priority per agent, because agents that learn alone have errors of their own.
+    """A ring buffer with one priority per agent and transition, because each independent learner has its own TD errors.
 
-    A new transition gets the largest priority that the agent has in the buffer, 1 in an empty one. ``arrays["priority"]``
-    (rows, B, N) holds the priorities |TD error|^ALPHA.
+    A new transition gets the agent's largest priority in the buffer, or 1 if the buffer is empty. ``arrays["priority"]``
+    (rows, B, N) holds the priorities (|TD error| + LEAST_ERROR)^ALPHA.
 
     Args:
-        rows: decisions kept.
+        rows: number of decisions kept.
         worlds: B.
         agents: N.
-        state: S, size of a state.
+        state: S, the size of a state.
     """
 
     def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
@@ -30,22 +30,22 @@ class PrioritisedReplay(Replay):
         self.arrays["priority"] = np.zeros((rows, worlds, agents))
 
     def store(self, **row: np.ndarray) -> None:
-        """Write one row; keywords are the names of ``arrays``, except ``priority``."""
+        """Write one row; the keywords are the names of ``arrays``, except ``priority``."""
         priority = self.arrays["priority"]
         largest = priority.max(axis=(0, 1)) if self.count else np.ones(priority.shape[2])
         super().store(priority=np.broadcast_to(largest, priority.shape[1:]), **row)
 
     def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
-        """``size`` transitions for each agent, one from each of ``size`` strata of equal probability.
+        """Draw ``size`` transitions for each agent, one from each of ``size`` strata of equal probability.
 
-        P(j) = p_j / sum p, weights (n P(j))^-beta over the largest of the n transitions' weights.
+        P(j) = p_j / sum p. Importance weights are (n P(j))^-beta, divided by the largest of the n transitions' weights.
 
         Args:
             size: M, transitions per agent.
-            steps: decisions whose rewards are summed.
+            steps: number of decisions whose rewards are summed.
             gamma: discount factor per decision.
-            rng: random numbers of the draws.
-            share: share of the budget that is spent; beta rises with it from ``BETA`` to 1.
+            rng: random generator for the draws.
+            share: share of the budget spent so far; beta rises with it from ``BETA`` to 1.
         """
         priority = self.arrays["priority"]
         rows, worlds, agents = priority.shape
@@ -58,12 +58,12 @@ class PrioritisedReplay(Replay):
         place = np.stack([np.searchsorted(reach[:, i], points[:, i], side="right") for i in range(agents)], axis=-1)
         beta = BETA + (1.0 - BETA) * min(share, 1.0)
         least = priority[allowed].min(axis=(0, 1))
-        weight = (np.take_along_axis(chance, place, axis=0) / least) ** -beta  # n and the sum cancel
+        weight = (np.take_along_axis(chance, place, axis=0) / least) ** -beta  # n and sum p cancel
         return self._own(self.gather((place // worlds).ravel(), (place % worlds).ravel(), steps, gamma), weight, place)
 
     @staticmethod
     def _own(batch: Batch, weight: np.ndarray, place: np.ndarray) -> Batch:
-        """Each agent's part of its own transitions, from a batch of M N that holds every agent's draws one after the other."""
+        """The batch with each agent's part of its own transitions; in the given batch of M N, the agents' draws alternate."""
         size, agents = place.shape
         own = np.arange(agents)
 
@@ -85,7 +85,7 @@ class PrioritisedReplay(Replay):
         )
 
     def learnt(self, batch: Batch, errors: np.ndarray) -> None:
-        """Set the priorities of the drawn transitions by their absolute TD errors (N, M)."""
+        """Set the priorities of the drawn transitions from their absolute TD errors (N, M)."""
         priority = self.arrays["priority"]
         flat = priority.reshape(-1, priority.shape[2])  # a view
         assert batch.place is not None

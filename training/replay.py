@@ -1,4 +1,4 @@
-"""Replay buffer of the decisions of B worlds in their order, from which n-step transitions are drawn."""
+"""Replay buffer that stores the decisions of B worlds in order of time and draws n-step transitions."""
 
 from typing import NamedTuple
 
@@ -6,36 +6,36 @@ import numpy as np
 
 
 class Batch(NamedTuple):
-    """M transitions over up to n decisions; from a prioritised replay, M for each agent."""
+    """M transitions over up to n decisions each; from a prioritised replay, M for each agent."""
 
-    state: np.ndarray  # (M, S), or (N, M, S) where each agent has its own
+    state: np.ndarray  # (M, S), or (N, M, S) if each agent has its own
     action: np.ndarray  # (M, N)
     reward: np.ndarray  # (M, N) discounted sum of up to n rewards
-    discount: np.ndarray  # (M, N) discount of the bootstrap: gamma^n, 0 where the mission ended for the agent
-    next_state: np.ndarray  # (M, S) or (N, M, S) to bootstrap from
-    leniency: np.ndarray  # (M, N) L of (16)
+    discount: np.ndarray  # (M, N) discount of the bootstrap: gamma^n, or 0 where the agent's return ended
+    next_state: np.ndarray  # (M, S) or (N, M, S) state to bootstrap from
+    leniency: np.ndarray  # (M, N) leniency L of (16)
     weight: np.ndarray | None = None  # (M, N) importance weights of the TD errors; 1 by default
-    place: np.ndarray | None = None  # (M, N) where the transitions begin in the buffer: row times B plus world
-    lost: np.ndarray | None = None  # (M, N) bool, the agent came too close in the first of the decisions
-    team: np.ndarray | None = None  # (M,) number of the team that each transition belongs to, where whole teams are drawn
+    place: np.ndarray | None = None  # (M, N) first decision of each transition in the buffer: row times B plus world
+    lost: np.ndarray | None = None  # (M, N) bool, whether the agent came too close in the first decision
+    team: np.ndarray | None = None  # (M,) index of the team that each transition belongs to, if whole teams are drawn
 
 
 class Replay:
-    """A ring of rows; a row is one decision of all B worlds. All arrays are public: they are what a resumed run needs.
+    """A ring buffer in which a row is one decision of all B worlds. All arrays are public, as a resumed run needs them.
 
     Args:
-        rows: decisions kept.
+        rows: number of decisions kept.
         worlds: B.
         agents: N.
-        state: S, size of a state.
+        state: S, the size of a state.
     """
 
     def __init__(self, rows: int, worlds: int, agents: int, state: int) -> None:
         self.rows = rows
-        self.count = 0  # rows ever written
+        self.count = 0  # rows written since the start of the run
         self.arrays: dict[str, np.ndarray] = {
             "state": np.zeros((rows, worlds, state), dtype=np.float32),
-            "final": np.zeros((rows, worlds, state), dtype=np.float32),  # the true successor
+            "final": np.zeros((rows, worlds, state), dtype=np.float32),  # the true successor, before any restart
             "action": np.zeros((rows, worlds, agents), dtype=np.int64),
             "reward": np.zeros((rows, worlds, agents), dtype=np.float32),
             "leniency": np.zeros((rows, worlds, agents), dtype=np.float32),
@@ -46,7 +46,7 @@ class Replay:
         }
 
     def store(self, **row: np.ndarray) -> None:
-        """Write one row; keywords are the names of ``arrays``."""
+        """Write one row; the keywords are the names of ``arrays``."""
         for name, array in self.arrays.items():
             array[self.count % self.rows] = row[name]
         self.count += 1
@@ -55,37 +55,37 @@ class Replay:
         """Draw ``size`` transitions uniformly.
 
         Args:
-            size: M.
-            steps: decisions whose rewards are summed; fewer where an episode ended.
+            size: M, the number of transitions.
+            steps: number of decisions whose rewards are summed; fewer where an episode ended.
             gamma: discount factor per decision.
-            rng: random numbers of the draws.
-            share: share of the budget that is spent; for prioritised replays only.
+            rng: random generator for the draws.
+            share: share of the budget spent so far; only prioritised replays use it.
         """
         first = self.draw_rows(size, steps, rng)
         world = rng.integers(self.arrays["ended"].shape[1], size=size)
         return self.gather(first, world, steps, gamma)
 
     def draw_rows(self, size: int, steps: int, rng: np.random.Generator) -> np.ndarray:
-        """(M,) rows, counted from the start of the run, that a transition over ``steps`` decisions may begin with."""
+        """Draw (M,) rows, counted from the start of the run, at which transitions over ``steps`` decisions can begin."""
         return rng.integers(max(0, self.count - self.rows), self.count - steps + 1, size=size)
 
     def learnt(self, batch: Batch, errors: np.ndarray) -> None:
-        """Take note of the absolute TD errors (K, M) of an update with ``batch``; only a prioritised replay uses them."""
+        """Receive the absolute TD errors (K, M) of an update with ``batch``; only a prioritised replay uses them."""
 
     def gather(self, first: np.ndarray, world: np.ndarray, steps: int, gamma: float) -> Batch:
-        """The transitions that begin at given decisions.
+        """The transitions that begin at the given decisions.
 
         Args:
-            first: (M,) rows, counted from the start of the run.
-            world: (M,) worlds.
-            steps: decisions whose rewards are summed; fewer where an episode ended.
+            first: (M,) rows of the first decisions, counted from the start of the run.
+            world: (M,) indices of their worlds.
+            steps: number of decisions whose rewards are summed; fewer where an episode ended.
             gamma: discount factor per decision.
         """
         a, size = self.arrays, len(first)
         row = first % self.rows
         reward = np.zeros((size, a["reward"].shape[2]), dtype=np.float32)
         discount = np.ones_like(reward)
-        running = np.ones(reward.shape, dtype=bool)  # the agent's mission still counts
+        running = np.ones(reward.shape, dtype=bool)  # the agent's return has not ended
         alive = np.ones(size, dtype=bool)  # the episode has not ended
         last = row
         for k in range(steps):

@@ -1,4 +1,4 @@
-"""The file that an interrupted training run goes on from. It imports nothing heavy: the command line looks for the file first."""
+"""The file that an interrupted training run resumes from. Imports are light, as the command line checks for the file first."""
 
 from pathlib import Path
 
@@ -8,10 +8,10 @@ RESUME = "resume.safetensors"
 
 
 def saved_run(out: Path) -> Path:
-    """The file of the run that was saved in a folder.
+    """The file in which the run in a folder was saved.
 
     Raises:
-        ConfigurationError: there is none.
+        ConfigurationError: there is no such file.
     """
     path = out / RESUME
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""A training run on disk: evaluations, curves, best and last checkpoints, and the state that ``--resume`` continues from."""
+"""Training runs on disk: evaluations, curves, best and last checkpoints, and the state that ``--resume`` continues from."""
 
 import csv
 import shutil
@@ -35,22 +35,22 @@ COUNTED = ("wall_s", "mission_steps")
 """First columns of both tables."""
 CHECKPOINT, TENSORBOARD = "checkpoint", "tensorboard"
 MEMORY_SETTINGS = "these settings (worlds, hidden, copies, capacity, batch)"
-"""What a run's memory depends on, for messages."""
+"""Settings that determine the memory of a run, as worded in messages."""
 TrainingScores = dict[str, float]
 """A line of eval.csv or progress.csv."""
 TrainingProgress = Callable[[BaseTrainer, TrainingScores], None]
-"""What a run calls after every decision, with its last evaluation."""
+"""Callback after every decision, with the trainer and its last evaluation."""
 
 
 @dataclass(frozen=True)
 class Interrupted:
-    """A run that a signal asked to stop and that has saved itself."""
+    """Result of a run that saved itself and stopped on a signal."""
 
     signal: int  # number of the signal
 
 
 class Stopper:
-    """Signal handler that takes note of SIGINT or SIGTERM; the run then saves itself after the present decision."""
+    """Signal handler that records SIGINT or SIGTERM; the run then saves itself after the current decision."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -61,7 +61,7 @@ class Stopper:
 
 @contextmanager
 def stopper() -> Iterator[Stopper]:
-    """A block inside which SIGINT and SIGTERM are noted instead of obeyed."""
+    """Record SIGINT and SIGTERM inside the block instead of stopping the process."""
     stop = Stopper()
     before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
@@ -78,18 +78,18 @@ class SavedRun(Protocol):
     config: Any
 
     def save(self) -> None:
-        """Write the state that the run can be resumed from."""
+        """Write the state from which the run can be resumed."""
 
 
 def decide_and_save(run: SavedRun, decide: Callable[[], None]) -> Interrupted | None:
-    """Decide until the budget is spent or a signal arrives; the run is saved at intervals and at the end.
+    """Make decisions until the budget is spent or a signal arrives; save the run at intervals and at the end.
 
     Args:
         run: the training run.
-        decide: makes one decision in every world, and what follows from it.
+        decide: makes one decision in every world and learns from it.
 
     Returns:
-        What interrupted the run, if anything did.
+        The signal that interrupted the run; None if the budget is spent.
     """
     saved = monotonic()
     with stopper() as stop:
@@ -106,10 +106,10 @@ def decide_and_save(run: SavedRun, decide: Callable[[], None]) -> Interrupted | 
 
 
 def make_trainer(config: TrainConfig) -> BaseTrainer:
-    """The trainer of the configuration's method.
+    """The trainer for the configuration's method.
 
     Raises:
-        ConfigurationError: a method, scenario, controller or device that cannot be used.
+        ConfigurationError: the method, scenario, controller or device cannot be used.
     """
     return MAPPO(config) if config.method == "mappo" else Trainer(config)
 
@@ -117,16 +117,16 @@ def make_trainer(config: TrainConfig) -> BaseTrainer:
 def train(
     config: TrainConfig, out: Path, *, overwrite: bool = False, progress: TrainingProgress | None = None
 ) -> Interrupted | list[TrainingScores]:
-    """Train from scratch; returns the evaluations, or what interrupted the run.
+    """Train from scratch; returns the evaluations, or the interruption.
 
     Args:
         config: configuration of the run.
         out: folder of the run.
-        overwrite: whether ``out`` may hold something.
+        overwrite: whether ``out`` may contain files.
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
+        ConfigurationError: a setting is invalid, ``out`` is not empty, or another process is training there.
         SimulationError: a world diverged.
     """
     with training_in(out, overwrite=overwrite):
@@ -137,20 +137,20 @@ def train(
 
 @contextmanager
 def training_in(out: Path, *, overwrite: bool) -> Iterator[None]:
-    """A block that trains in a folder, as the only process that does; a lack of memory is one line."""
+    """Lock a folder for training in the block, and turn a lack of memory into a ConfigurationError of one line."""
     with alone_in(out, overwrite=overwrite), enough_memory(MEMORY_SETTINGS):
         yield
 
 
 def begin_folder(out: Path, origin: Mapping[str, Any], config: Any) -> None:
-    """Make a folder that of a new run: without what another one left there, and with the configuration of this one."""
+    """Prepare a folder for a new run: remove the files of a previous run, and write the configuration of the new one."""
     with writing(out):
         remove_run(out)
     write_json(out / CONFIG_FILE, {**origin, "train": config})
 
 
 def remove_run(out: Path) -> None:
-    """Remove what a run left in its folder, beginning with what :func:`resume` would take for a new run's."""
+    """Remove a run's files from its folder, first those that :func:`resume` could mistake for a new run's."""
     for name in (RESUME, CONFIG_FILE, *TABLES):
         (out / name).unlink(missing_ok=True)
     for name in (CHECKPOINT, TENSORBOARD):
@@ -160,15 +160,15 @@ def remove_run(out: Path) -> None:
 
 
 def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupted | list[TrainingScores]:
-    """Continue a run where it was last saved, bit for bit; returns the evaluations, or what interrupted the run.
+    """Continue a run from its last save, bit for bit; returns the evaluations, or the interruption.
 
     Args:
         out: folder of the run.
         progress: called after every decision.
 
     Raises:
-        ConfigurationError: ``out`` holds no run, or another process is at it; or its saved state is damaged, of other versions
-            of the code, or of another configuration than the one beside it.
+        ConfigurationError: ``out`` holds no run, or another process uses it; or the saved state is damaged, was written by
+            other versions of the code, or differs from the configuration file beside it.
         SimulationError: a world diverged.
     """
     path = saved_run(out)
@@ -177,7 +177,7 @@ def resume(out: Path, *, progress: TrainingProgress | None = None) -> Interrupte
 
 
 def _restored(path: Path) -> "TrainingRun":
-    """The run that was saved in a file, in the file's folder, without what a killed process left there."""
+    """Load the run saved in a file, and remove from its folder the leftovers of a killed process."""
     out = path.parent
     arrays, description = read_arrays(path)
     check_origin(path, description)
@@ -192,7 +192,7 @@ def _restored(path: Path) -> "TrainingRun":
 
 
 def resumable(out: Path) -> bool:
-    """Whether ``out`` holds a whole saved run of this version of the code, so that :func:`resume` continues it."""
+    """Whether ``out`` holds a complete saved run of this version of the code, which :func:`resume` can continue."""
     try:
         check_origin(out / RESUME, read_arrays(out / RESUME)[1])
     except ConfigurationError:
@@ -201,10 +201,10 @@ def resumable(out: Path) -> bool:
 
 
 class TrainingRun:
-    """A trainer with its folder: evaluates, logs and saves at set intervals.
+    """A trainer and its output folder; evaluates, logs and saves at fixed intervals.
 
     Args:
-        trainer: what learns.
+        trainer: the trainer to run.
         out: folder of the run.
     """
 
@@ -215,11 +215,11 @@ class TrainingRun:
         self.origin = provenance()
         self.evaluations: list[TrainingScores] = []
         self.curve: list[TrainingScores] = []
-        self.wall = 0.0  # time of training so far, in all processes [s]
+        self.wall = 0.0  # training time so far, over all resumed processes [s]
         self.world = World(trainer.scenario, make_controller(self.config.controller), record=True)
 
     def go(self, progress: TrainingProgress | None = None) -> Interrupted | list[TrainingScores]:
-        """Train to the end of the budget, or until a signal arrives."""
+        """Train until the budget is spent or a signal arrives; the run then saves itself."""
         trainer, began = self.trainer, monotonic() - self.wall
         board = TensorBoard(self.out / TENSORBOARD)
 
@@ -239,7 +239,7 @@ class TrainingRun:
         return self.evaluations
 
     def evaluate(self) -> None:
-        """Fly one deterministic episode with the greedy policy; write the tables, the last checkpoint and perhaps the best."""
+        """Fly one deterministic episode with the greedy policy; write the tables, the last checkpoint, and perhaps the best."""
         trainer = self.trainer
         policy = trainer.policy()
         row = {"wall_s": self.wall, "mission_steps": float(trainer.steps), **episode_scores(self.measure(policy))}
@@ -266,7 +266,7 @@ class TrainingRun:
         }
 
     def measure(self, policy: Policy) -> Metrics:
-        """Metrics of one episode of the policy on the scenario, seed 0."""
+        """Metrics of one episode of the policy on the scenario, with seed 0."""
         return measure(run_episode(self.world, Learned(policy, self.signature(), self.out)))
 
     def signature(self) -> dict[str, Any]:
@@ -279,7 +279,7 @@ class TrainingRun:
         return {**self.origin, "signature": self.signature(), "train": self.config, "evaluation": row}
 
     def write_rows(self) -> None:
-        """Write eval.csv and progress.csv anew."""
+        """Rewrite eval.csv and progress.csv."""
         for name, rows in zip(TABLES, (self.evaluations, self.curve), strict=True):
             write_table(self.out / name, rows)
 
@@ -298,7 +298,7 @@ class TrainingRun:
 
 
 def episode_scores(metrics: Metrics) -> TrainingScores:
-    """The columns of eval.csv after wall_s and mission_steps: violation and clearance are those of the worst agent."""
+    """The columns of eval.csv after wall_s and mission_steps; violation and clearance are the worst agent's."""
     agents = metrics["agents"]
     return {
         "return": metrics["team"]["return"],
@@ -309,13 +309,13 @@ def episode_scores(metrics: Metrics) -> TrainingScores:
 
 
 def rank(row: TrainingScores) -> tuple[float, float]:
-    """Sort key of evaluations, best last: by violation of the worst agent first, then by the return minus 100 per switch."""
+    """Sort key of evaluations, best last: the worst agent's violation first, then the return minus 100 per switch."""
     switches = sum(value for name, value in row.items() if name.startswith("switches_"))
     return -row["violation_time"], row["return"] - 100.0 * switches
 
 
 def write_table(path: Path, rows: Sequence[TrainingScores]) -> None:
-    """Write rows as CSV, with one column per key of the first."""
+    """Write rows as CSV, with one column per key of the first row."""
     with staged_file(path, overwrite=True) as staging, staging.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [])
         writer.writeheader()

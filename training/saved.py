@@ -1,4 +1,4 @@
-"""Checks of a saved run before it continues: same version of the code, whole, and with the contents of a new run."""
+"""Checks before a saved run is resumed: it was written by the same versions, is complete, and has the contents of a new run."""
 
 import json
 import math
@@ -13,7 +13,7 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.provenance import UNKNOWN, plain_data, provenance
 
 SAME = ("marlbc-mj", "torch", "numpy", "numba", "mujoco")
-"""Packages of which a run needs the same versions to continue bit for bit; it needs the same revision, too, if one is known."""
+"""Packages that must have the same versions for a run to continue bit for bit; the revision, if known, must match too."""
 SAVED_KINDS: dict[str, type | tuple[type, ...]] = {
     "versions": dict,
     "git_revision": str,
@@ -23,30 +23,30 @@ SAVED_KINDS: dict[str, type | tuple[type, ...]] = {
     "curve": list,
     "wall_s": (int, float),
 }
-"""Types of the entries in the description of a saved run for one team."""
+"""Required entries in the description of a saved run for one team, with their types."""
 CONFIG_FILE = "config.json"
 
 Snapshot = tuple[dict[str, np.ndarray], dict[str, Any]]
-"""Arrays, and the rest as JSON data."""
+"""State of a trainer: arrays, and the remaining values as JSON data."""
 
 
 class Restorable(Protocol):
     """A trainer whose state can be saved and restored bit for bit."""
 
     def snapshot(self) -> Snapshot:
-        """Everything that the run needs to go on."""
+        """The state that resumes the run."""
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        """Restore a :meth:`snapshot` of a run with the same configuration."""
 
 
 def check_origin(path: Path, description: Mapping[str, Any], kinds: Mapping[str, Any] = SAVED_KINDS) -> None:
-    """Raise ConfigurationError if a description is not a saved run's, or of other versions or another revision of the code.
+    """Raise ConfigurationError unless a description is of a run saved by the same versions and revision of the code.
 
     Args:
         path: file of the saved run.
-        description: what it says.
-        kinds: types of the entries that it must have.
+        description: description in the file's header.
+        kinds: required entries of the description, with their types.
     """
     for name, kind in kinds.items():
         if not isinstance(description.get(name), kind):
@@ -68,11 +68,11 @@ def saved_config(path: Path, train: dict[str, Any], kind: type[Configuration]) -
 
     Args:
         path: file of the saved run.
-        train: JSON data of the configuration in it.
-        kind: its class.
+        train: JSON data of the configuration in the file.
+        kind: class of the configuration.
 
     Raises:
-        ConfigurationError: it has other settings than runs of this version, or other values than ``config.json`` beside it.
+        ConfigurationError: its settings are not those of this version, or its values differ from ``config.json`` beside it.
     """
     config, found = config_from_json(train, kind), flat_settings(train)
     odd = sorted(found.keys() ^ flat_settings(plain_data(config)).keys())
@@ -91,15 +91,15 @@ def saved_config(path: Path, train: dict[str, Any], kind: type[Configuration]) -
 
 
 def saved_rows(path: Path, rows: list[Any], columns: Iterable[str]) -> list[dict[str, float]]:
-    """The lines of a run's table, from JSON data: at least one, all with the same columns.
+    """The rows of a saved run's table from JSON data: at least one, all with the same columns.
 
     Args:
         path: file of the saved run.
-        rows: what it says.
-        columns: some that every line must have.
+        rows: rows of the table in the file.
+        columns: columns that every row must have; others are allowed.
 
     Raises:
-        ConfigurationError: the data are not such lines.
+        ConfigurationError: the data are not a table of this kind.
     """
     try:
         found = [{str(name): float(value) for name, value in row.items()} for row in rows]
@@ -112,21 +112,21 @@ def saved_rows(path: Path, rows: list[Any], columns: Iterable[str]) -> list[dict
 
 
 def restore_trainer(path: Path, trainer: Restorable, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-    """Put a new ``trainer`` in the state of a saved snapshot.
+    """Restore a saved snapshot into a new ``trainer``.
 
     Raises:
-        ConfigurationError: the snapshot is not of such a run.
+        ConfigurationError: the snapshot does not fit the trainer.
     """
     check_snapshot(path, (arrays, scalars), trainer.snapshot())
     try:
         trainer.restore(arrays, scalars)
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random stream's own checks
+    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as error:  # a random generator's own checks
         raise ConfigurationError(f"{path} does not fit the run that it was saved from: {error}") from error
 
 
 def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
-    """Raise ConfigurationError, naming the first difference, if a saved snapshot does not have the contents of a ``new`` run's:
-    arrays of the same names, shapes and types, and numbers of the same names.
+    """Raise ConfigurationError, naming the first difference, unless a saved snapshot has the structure of a ``new`` run's: the
+    same names, shapes and types of arrays, and the same names of other values.
     """
     (arrays, scalars), (like, numbers) = found, new
     fault = ""
@@ -144,8 +144,8 @@ def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
 
 
 def _difference(found: Any, like: Any, where: str) -> str:
-    """Description of the first difference in kind between two pieces of JSON data; empty if there is none. Whole numbers are
-    counts, so none may be negative.
+    """Describe the first difference in structure between two pieces of JSON data; empty if there is none. Integers are counts,
+    so a negative one is also a difference.
     """
     if isinstance(like, dict):
         if not isinstance(found, dict) or found.keys() != like.keys():

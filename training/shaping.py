@@ -1,4 +1,4 @@
-"""The reward that a learner sees: the published terms, weighted, and an agent's own costs."""
+"""The reward for learning: the weighted published terms, and each agent's own costs."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
@@ -13,40 +13,40 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Shaping:
-    """Weights of the reward that a learner sees. The defaults leave the published reward (13) as it is.
+    """Weights of the reward for learning. The defaults give the published reward (13).
 
-    Evaluation never uses them: returns are those of (13).
+    Evaluations do not use them: their returns are those of (13).
 
     Raises:
-        ConfigurationError: a value that cannot be run.
+        ConfigurationError: a value is invalid.
     """
 
     centre: float = 0.0
-    """Subtracted for every mission step. At 10, the reward of being in formation, the value of an undisturbed mission is 0
-    instead of 10 / (1 - gamma), and differences between orders are no longer small against it."""
+    """Amount subtracted from the reward of every mission step. At 10, the reward for being in formation, an undisturbed mission
+    has the value 0 instead of 10 / (1 - gamma). Differences between orders are then no longer small relative to the value."""
     scale: Annotated[float, POSITIVE] = 1.0
     """Divisor of all rewards."""
     violation: float = 1.0
     """Weight of the published punishment of the whole team, -10 per mission step."""
     margin: float = 0.0
-    """An agent closer to an obstacle than safe_distance + margin counts as lost [m]."""
+    """Margin on the safe distance: an agent closer to an obstacle than safe_distance + margin counts as lost [m]."""
     own_violation_cost: float = 0.0
-    """Cost of a decision in which an agent is lost, paid once and by that agent alone; its return ends there. The published
-    reward makes it worthwhile to graze an obstacle (avoiding it costs 760, grazing it 20 per mission step). A punishment that
-    adds up over time makes the values of lost states so low that no network tells good ones apart."""
+    """Cost of a decision in which an agent is lost. Only that agent pays it, once, and its return ends there. Under the published
+    reward it pays to graze an obstacle (avoiding it costs 760, grazing it 20 per mission step). A punishment that accumulates
+    makes the values of lost states so low that a network cannot tell good states apart."""
     own_switch_cost: float = 0.0
-    """Cost of a switch, paid by the agent that switches: who switched is known, so the team need not guess."""
+    """Cost of a switch, paid only by the agent that switches, so that the team need not infer which agent switched."""
     haste_cost: float = 0.0
-    """Additional cost of a switch from an order that was in force for less than ``dwell``."""
+    """Additional cost of switching away from an order that was in force for less than ``dwell``."""
     dwell: float = 4.0
-    """Time that an order should be in force [s]."""
+    """Time for which an order should stay in force [s]."""
 
     def __post_init__(self) -> None:
         check(self, "shaping.")
 
 
 def shaped_reward(outcome: "DecisionOutcome", shaping: Shaping) -> np.ndarray:
-    """(B, N) float32 rewards of a decision: (formation + violation - centre - own costs) / scale; see :func:`lost`.
+    """(B, N) float32 rewards of a decision: (formation + violation + switching - centre - own costs of switches) / scale.
 
     Args:
         outcome: the published terms of the decision.

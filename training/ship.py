@@ -1,4 +1,4 @@
-"""Making a training run's best checkpoint one that comes with the package, with a model card."""
+"""Copying the best checkpoint of a training run into the package, with a model card."""
 
 import csv
 import shutil
@@ -17,7 +17,7 @@ from marlbc_mj.util.files import check_target, staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
 CHOICE = {"commands": "one of the commands", "orders": "one of all orders", "avoidance": "formation with or without avoidance"}
-"""Description of a choice from each action set."""
+"""Wording in the model card for a choice from each action set."""
 _SAFETY = ("violation_time_worst", "clearance_min_worst")
 
 
@@ -31,7 +31,7 @@ def ship(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False
         overwrite: whether a checkpoint of that name may be replaced.
 
     Raises:
-        ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
+        ConfigurationError: there is no such run, its checkpoint is damaged, or a file may not be replaced.
     """
     return put_in_package(run, name, folder, overwrite=overwrite, read=read_policy, write_card=card)
 
@@ -45,7 +45,7 @@ def put_in_package(
     read: Callable[[Path], tuple[Any, dict[str, Any]]],
     write_card: Callable[[str, dict[str, Any], list[dict[str, str]]], str],
 ) -> Path:
-    """:func:`ship` for any kind of policy: ``read`` gives a checkpoint's description, ``write_card`` the text of the card."""
+    """:func:`ship` for any kind of policy: ``read`` returns a checkpoint's policy and description, ``write_card`` the text."""
     source = run / "checkpoint" / "best.safetensors"
     _, description = read(source)
     try:
@@ -64,12 +64,12 @@ def put_in_package(
 
 
 def card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
-    """The model card in Markdown: what the checkpoint is, how it was made, how it does on the case study, its learning curve.
+    """The model card in Markdown: the checkpoint's purpose, its training, its scores on the case study and its learning curve.
 
     Args:
         name: name of the shipped checkpoint.
         description: description in the checkpoint's header.
-        rows: lines of the run's eval.csv.
+        rows: rows of the run's eval.csv.
     """
     train, versions, evaluation = description["train"], description["versions"], description["evaluation"]
     command = f"marlbc train {train['method']} --preset {train['preset']} --seed {train['seed']} --budget {train['budget']}"
@@ -103,18 +103,18 @@ def _cells(row: dict[str, str]) -> tuple[str, ...]:
 
 
 def _settings(train: dict[str, object]) -> list[str]:
-    """``--set`` and the settings that differ from the method's preset; empty if none does."""
+    """``--set`` and the settings that differ from the method's preset; empty if none differ."""
     preset = make_config(str(train["preset"]), **METHODS[str(train["method"])][0])
     return changed_settings(train, preset, said={"method", "preset", "seed", "budget", "threads"})
 
 
 def changed_settings(train: dict[str, Any], preset: Any, said: set[str]) -> list[str]:
-    """``--set`` and the settings of a run that differ from those of a preset; empty if none does.
+    """``--set`` and the settings of a run that differ from those of a preset; empty if none differ.
 
     Args:
         train: JSON data of the run's configuration.
-        preset: configuration that it is compared with.
-        said: settings that the command names otherwise.
+        preset: configuration to compare with.
+        said: settings that the command gives in other options.
     """
     usual = flat_settings(plain_data(preset))
     changed = [

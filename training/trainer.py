@@ -1,4 +1,4 @@
-"""Training of a learner with a replay buffer: worlds, learner, replay and temperatures in one loop."""
+"""Training with a replay buffer: worlds, learner, replay and temperatures in one loop."""
 
 import math
 from collections.abc import Iterator
@@ -23,22 +23,22 @@ from marlbc_mj.training.replay import Replay
 from marlbc_mj.training.rivals import learner_class, own_entries
 
 WARM_UP = 5_000
-"""Transitions that are stored before the first update of the networks, and before states are hashed."""
+"""Transitions stored before the networks' first update and before states are hashed."""
 LATE_TEMPERATURE = 0.05
-"""The largest temperature after the share ``cool_by`` of the budget."""
+"""Largest temperature once the share ``cool_by`` of the budget is spent."""
 
 
 class Trainer(BaseTrainer):
-    """One run of a method with a replay buffer. :meth:`advance` makes a decision in every world and updates the networks.
+    """One run of a method with a replay buffer; :meth:`advance` makes a decision in every world and updates the networks.
 
-    The updates draw from what was stored before the decision, so that the networks can learn while the worlds move. With one
-    thread, the worlds move after the updates, which gives the same numbers.
+    The updates draw from transitions stored before the decision, so that the networks can learn while the worlds are simulated.
+    With one thread, the updates come before the simulation, with the same results.
 
     Args:
         config: configuration of the run.
 
     Raises:
-        ConfigurationError: a method, scenario, controller or device that cannot be used.
+        ConfigurationError: the method, scenario, controller or device cannot be used.
     """
 
     def __init__(self, config: TrainConfig) -> None:
@@ -57,7 +57,7 @@ class Trainer(BaseTrainer):
 
     @property
     def updates(self) -> int:
-        """Number of gradient steps made."""
+        """Number of gradient steps taken."""
         return self.learner.updates
 
     @property
@@ -67,11 +67,11 @@ class Trainer(BaseTrainer):
 
     @property
     def network(self) -> TeamNetwork:
-        """The networks whose largest output is the greedy action."""
+        """The networks of the greedy policy, with the running mean of the weights."""
         return self.learner.smooth
 
     def advance(self) -> DecisionOutcome:
-        """Make one decision in every world, and ``updates`` gradient steps."""
+        """Make one decision in every world and the configured number of gradient steps."""
         config, replay = self.config, self.replay
         share = self.steps / config.budget
         self.temperatures.nu = max(math.exp(math.log(LATE_TEMPERATURE) * share / config.cool_by), 1e-6)
@@ -101,7 +101,7 @@ class Trainer(BaseTrainer):
         return outcome
 
     def _choose(self, warmth: np.ndarray) -> np.ndarray:
-        """(B, N) actions by the temperatures ``warmth`` (B, N, A): greedy ones, some replaced by the exploration."""
+        """(B, N) actions: greedy ones, some replaced by exploration according to the temperatures ``warmth`` (B, N, A)."""
         values, last = self.learner.values(self.state), self.batch.last
         best = greedy(values, last, self.batch.fresh, self.config.switching_margin)
         allowed = values > -np.inf if self.config.risk_gamma else None
@@ -110,17 +110,17 @@ class Trainer(BaseTrainer):
         return actions
 
     def _seen_enough(self) -> bool:
-        """Whether the buffer holds states of the whole mission.
+        """Whether the buffer holds states from the whole mission.
 
-        Where episodes begin anywhere, it does after WARM_UP transitions; else after a whole mission, or as much of one as there
-        is room for.
+        If episodes begin anywhere along the route, WARM_UP transitions suffice. Otherwise a whole mission is also needed, or a
+        full buffer if that is shorter.
         """
         mission = 0 if self.config.exploring_starts else self.batch.decisions
         rows = self.replay.count
         return rows * self.config.worlds >= WARM_UP and rows >= min(mission, self.replay.rows)
 
     def _fit_hash(self) -> None:
-        """Fit the hash to the buffer's states. Episodes count as begun now, so that decisions without a code cool nothing."""
+        """Fit the hash to the buffer's states. Episodes count from now on, as earlier decisions have no code and cool nothing."""
         self.first[:] = self.replay.count
         states = self.replay.arrays["state"][: self.replay.count].reshape(-1, self.batch.read.size)
         self.hash.fit((states / self.batch.read.scale).astype(np.float32), self.generator)
@@ -137,7 +137,7 @@ class Trainer(BaseTrainer):
 
     @contextmanager
     def _learning(self, share: float) -> Iterator[None]:
-        """If there is enough to learn from, learn while the block runs, or before it with one thread."""
+        """If the buffer holds enough, learn while the block runs; with one thread, learn before it."""
         replay, config = self.replay, self.config
         if replay.count * config.worlds < WARM_UP or replay.count <= config.n_step:
             yield
@@ -152,7 +152,7 @@ class Trainer(BaseTrainer):
                 self._await(learnt)
 
     def _await(self, learnt: Future[None]) -> None:
-        """Wait until the networks have learned; a method of its own so that a profile shows the waiting."""
+        """Wait for the networks' updates; a separate method, so that a profile shows the waiting time."""
         learnt.result()
 
     def _learn(self, share: float) -> None:
@@ -164,19 +164,19 @@ class Trainer(BaseTrainer):
         self.refuse_nonsense()
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""
         arrays, scalars = super().snapshot()
         arrays |= {**prefixed("hash", self.hash.arrays), "table": self.temperatures.table}
         learnt, counts = snapshot_learning(self.learner, self.replay)
         return arrays | learnt, scalars | counts
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        """Restore a :meth:`snapshot` of a run with the same configuration."""
         super().restore(arrays, scalars)
         restore_learning(self.learner, self.replay, arrays, scalars)
         self.hash.arrays = {name: array.copy() for name, array in unprefixed("hash", arrays).items()}
         self.temperatures.table[:] = arrays["table"]
 
     def plain_arrays(self) -> list[tuple[Any, str]]:
-        """Arrays that are attributes, as pairs of owner and name."""
+        """The arrays that a snapshot takes as they are: pairs of the owning object and the attribute's name."""
         return [*super().plain_arrays(), (self, "first"), *((self.exploration, name) for name in ("left", "held"))]

@@ -37,28 +37,28 @@ if TYPE_CHECKING:
 class BenchCommand:
     """Run supervisors and controllers on one scenario and write tables, figures, logs, a video and a page.
 
-    By default scripted runs with every controller, and every supervisor with sorlc but those that are to be named: mpcms-mujoco,
-    oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca, cbf-qp and marlms-general.
+    By default scripted runs with every controller, and every supervisor with sorlc except those that run only if named:
+    mpcms-mujoco, oracle-schedule, fixed, set-based-rule, lookahead, lookahead-distributed, rollout, orca, cbf-qp, marlms-general.
     """
 
     scenario: Positional[ScenarioName] = "paper"
-    """Scenario."""
+    """Scenario to run."""
     supervisors: SomeSupervisors = None
-    """Supervisors to run, each with every one of --controllers (scripted, if only those are named)."""
+    """Supervisors to run, each with all --controllers; scripted, if only controllers are named."""
     controllers: SomeControllers = None
-    """Controllers to run each supervisor with (sorlc, if only supervisors are named)."""
+    """Controllers to run with each supervisor; sorlc, if only supervisors are named."""
     out: Path = Path("out/paper")
     """Folder of the results."""
     seed: int = 0
-    """Draw of the scenario; every seed is the same where nothing is perturbed."""
+    """Seed of the scenario's random draw; if nothing is perturbed, all seeds give the same episode."""
     seeds: SomeCount = None
-    """Number of draws around the scenario, from --seed on: tables with intervals instead of logs and videos."""
+    """Run this many random draws of the scenario, from --seed on; writes tables with intervals instead of logs and videos."""
     drag_range: SomeRange = None
-    """With --seeds, a draw from this range multiplies the disturbance: 0 2 by default, 5 5 for five times throughout."""
+    """With --seeds, the range of a random factor on the disturbance; 5 5 fixes it at 5. For the case study 0 2 by default."""
     workers: int = 1
-    """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs; use 1 to measure decision times."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     video: Literal["first", "all", "none"] = "first"
     """Which methods get a video."""
     figures: bool = True
@@ -68,12 +68,12 @@ class BenchCommand:
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
+    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Run the matrix, then say where the results are and what they are."""
+        """Run all methods, then print the results and where they are."""
         if self.seeds is None:
             self._run_once()
         else:
@@ -81,7 +81,7 @@ class BenchCommand:
         self.output.say(f"{self.out / 'index.html'} shows it all")
 
     def _run_once(self) -> None:
-        """One episode of every method; the page grows and a line is printed as each ends."""
+        """Run one episode of every method; as each ends, print a line and add it to the page."""
         from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_bench
         from marlbc_mj.util.provenance import versions
@@ -95,7 +95,7 @@ class BenchCommand:
             print(f"marlbc: {problem}", file=sys.stderr)
 
     def _run_draws(self) -> None:
-        """Every method on the same draws."""
+        """Run every method on the same draws."""
         from marlbc_mj.studies.draws import run_bench_seeds
 
         with self.output.progress() as told:
@@ -103,16 +103,16 @@ class BenchCommand:
         self.output.report("", seed_document(results))
 
     def config(self) -> "BenchConfig":
-        """The options under the names that the benchmark gives them."""
+        """The configuration of the benchmark, made from the options."""
         from marlbc_mj.studies.bench import BenchConfig
 
         return BenchConfig(**{each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)})
 
     def scenario_drawn(self) -> "Scenario":
-        """The scenario with the options' changes, and with the range of factors of its disturbance over draws.
+        """The scenario with the changes of the options, including --drag-range.
 
         Raises:
-            ConfigurationError: a range without draws.
+            ConfigurationError: --drag-range without --seeds.
         """
         from marlbc_mj.studies.draws import with_drag_range
 
@@ -125,7 +125,7 @@ class BenchCommand:
 
 @dataclass
 class _Counted:
-    """Says one line per method that has ended."""
+    """Prints one line per method that has ended."""
 
     total: int
     line: Callable[[str], None]
@@ -137,7 +137,7 @@ class _Counted:
 
 
 def seed_document(results: "SeedResults") -> dict[str, Any]:
-    """What summary.json says of many draws."""
+    """The content of summary.json for many draws."""
     from marlbc_mj.report.seed_files import seed_summary
     from marlbc_mj.results.seed_statistics import analyse
     from marlbc_mj.util.provenance import versions
@@ -150,24 +150,24 @@ class RunCommand:
     """Run one episode of one method and log it."""
 
     scenario: Positional[ScenarioName] = "paper"
-    """Scenario."""
+    """Scenario to run."""
     supervisor: SupervisorName = "scripted"
     """Mission supervisor."""
     controller: ControllerName = "sorlc"
-    """Controller."""
+    """Controller that tracks the references."""
     out: Path = Path("out/run")
     """Folder of the log, the metrics and the configuration."""
     seed: int = 0
-    """Draw of the scenario."""
+    """Seed of the scenario's random draw."""
     overwrite: bool = False
     """Replace what is in the output folder."""
     shield: bool = False
-    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
+    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """One episode, its log and its metrics."""
+        """Run the episode, write its log and metrics, and print the result."""
         from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_single
         from marlbc_mj.util.provenance import versions
@@ -192,32 +192,32 @@ class RunCommand:
 
 @dataclass(frozen=True)
 class EvaluateCommand:
-    """Run supervisors on held-out layouts of a scenario family: success, violation and collision rates with intervals.
+    """Run supervisors on held-out layouts of a scenario family and report success, violation and collision rates with intervals.
 
-    By default every supervisor without learning. Scripted schedules and the oracle's belong to scenarios whose geometry is the
-    same for every seed; elsewhere they are reported as failed, with the reason.
+    By default all supervisors run that `marlbc bench` runs, except the learned ones. The schedules of scripted and oracle need a
+    scenario with the same geometry for every seed; elsewhere these two are reported as failed, with the reason.
     """
 
     scenario: Positional[ScenarioName] = "field"
-    """Scenario that draws layouts."""
+    """Scenario with random layouts."""
     supervisors: SomeSupervisors = None
     """Supervisors to run."""
     controller: ControllerName = "sorlc"
-    """Controller they run with."""
+    """Controller that all supervisors run with."""
     seeds: int = 200
     """Number of held-out layouts."""
     seed: int = 0
-    """First seed."""
+    """Seed of the first layout."""
     workers: int = 1
-    """Processes that share the jobs, or tasks of a SLURM array; decision times are best measured with one."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs; use 1 to measure decision times."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     out: Path = Path("out/evaluation")
     """Folder of the results."""
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
+    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
@@ -245,33 +245,33 @@ class EvaluateCommand:
 
 @dataclass(frozen=True)
 class SafetyCommand:
-    """Run supervisors on several missions, under both compositions, without a shield and with one: one table of outcomes.
+    """Run supervisors on several missions, under both compositions, without a shield and with one, and write tables of outcomes.
 
-    Missions are held-out layouts of families, or draws around the case study with its drag multiplied by 0, 2 or 5:
+    Missions are held-out layouts of families, or random draws of the case study with its drag multiplied by 0, 2 or 5:
     paper-drag-0, paper-drag-2 and paper-drag-5.
     """
 
     missions: Positional[MissionNames] = ("field", "forest", "gates", "corridor", "traffic")
-    """Scenarios that draw layouts, or draws around the case study."""
+    """Scenarios with random layouts, or random draws of the case study."""
     teams: TeamNames = ()
-    """Teams that fly the families with the room that they need, as FORMATION-AGENTS; with -lines behind that, they come to their
-    column along the lines of its slots. By default each family has its own team."""
+    """Teams to fly instead of each family's own, as FORMATION-AGENTS, for example wedge-16; large teams get more room. With
+    -lines appended, agents join the column along the lines of its slots."""
     supervisors: SomeSupervisors = None
-    """Supervisors to run; by default every one that knows no map beforehand, and scripted."""
+    """Supervisors to run; by default all but oracle, oracle-schedule, mpcms-mujoco and rlms."""
     compositions: Compositions = ("null-space", "set-based")
     """How orders become references."""
     shields: tuple[Literal["no", "yes"], ...] = ("no", "yes")
     """Whether agents have a shield."""
     layouts: int = 1000
-    """Layouts of every supervisor on every mission."""
+    """Layouts per supervisor and mission."""
     searched: int = 100
-    """Layouts of mpcms and rollout, which take seconds each."""
+    """Layouts per mission for mpcms and rollout, which take seconds per layout."""
     seed: int = 80_000
-    """First seed of the layouts."""
+    """Seed of the first layout."""
     controller: ControllerName = "sorlc"
-    """Controller that all run with."""
+    """Controller that all supervisors run with."""
     workers: int = 1
-    """Processes that share the layouts."""
+    """Number of processes that share the layouts."""
     out: Path = Path("out/safety")
     """Folder of the tables."""
     overwrite: bool = False

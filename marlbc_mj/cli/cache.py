@@ -1,4 +1,4 @@
-"""The advice that a command gives where compiled code cannot be cached."""
+"""Advice to the user if compiled code cannot be cached."""
 
 import sys
 
@@ -6,7 +6,7 @@ from marlbc_mj.util.progress import note
 
 
 def suggest_cache() -> None:
-    """Say where compiled code could be kept, if this command has compiled some that it could not keep."""
-    compiling = sys.modules.get("marlbc_mj.core.compiling")  # not imported for this: most commands compile nothing
+    """Suggest a folder for compiled code if this command has compiled some that it could not keep."""
+    compiling = sys.modules.get("marlbc_mj.core.compiling")  # not imported here: most commands compile nothing
     if compiling is not None and compiling.compiled_in_vain():
         note("compiled code cannot be kept here and is compiled by every command; set NUMBA_CACHE_DIR to a folder to write into")

@@ -1,6 +1,6 @@
-"""Types of what is chosen by name: listed in the help, and checked before anything heavy is imported.
+"""Types of arguments that are chosen by name: the help lists the names, and they are checked before anything heavy is imported.
 
-A word that looks like a file or like Python is left to the command, once the file is there.
+Of a word that names a file or an object in a Python file, only the existence of the file is checked here.
 """
 
 import json
@@ -17,11 +17,11 @@ from tyro.constructors import PrimitiveConstructorSpec
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 NAMES_FILE = "names.json"
-"""Beside this file: what can be selected, as the registries have it; see names.py."""
+"""File next to this one that lists everything that can be selected, made from the registries; see names.py."""
 
 
 class WrongWord(Exception):
-    """A word that means nothing here. No ValueError: tyro has words of its own for those."""
+    """An invalid word. It is no ValueError, for which tyro has messages of its own."""
 
     def __init__(self, error: ConfigurationError) -> None:
         super().__init__(str(error))
@@ -29,12 +29,12 @@ class WrongWord(Exception):
 
 
 class Kind(NamedTuple):
-    """Something that is chosen by name."""
+    """A kind of things that are chosen by name, for example scenarios."""
 
     word: str  # for messages
-    lists: tuple[str, ...]  # keys of the names that there are
+    lists: tuple[str, ...]  # keys of :func:`selectable`, whose names are valid
     forms: tuple[str, ...] = ()  # what may be given instead of a name
-    registry: str = ""  # module and attribute of the names, which a program may have added to before it called the command line
+    registry: str = ""  # MODULE:ATTRIBUTE of the registry, to which a program that calls the command line may have added names
 
 
 _SCENARIO = Kind("scenario", ("scenarios",), ("FILE.toml", "FILE.py:NAME"), "marlbc_mj.scenarios:SCENARIOS")
@@ -72,25 +72,25 @@ ROBOTS_SETTING = "robots"
 
 @cache
 def selectable() -> dict[str, dict[str, str]]:
-    """Descriptions by kind and name, of everything that can be selected."""
+    """Descriptions of everything that can be selected, by kind and name."""
     found: dict[str, dict[str, str]] = json.loads((files("marlbc_mj.cli") / NAMES_FILE).read_text(encoding="utf-8"))
     return found
 
 
 def names_of(kind: Kind) -> list[str]:
-    """Names that can be given."""
+    """All valid names of a kind."""
     if not kind.lists:
         return [each.replace(" ", "-").lower() for each in selectable()]
     module, _, attribute = kind.registry.partition(":")
-    added = getattr(sys.modules.get(module), attribute, ()) if kind.registry else ()  # not imported for this
+    added = getattr(sys.modules.get(module), attribute, ()) if kind.registry else ()  # used only if it has been imported already
     return list(dict.fromkeys([*(name for each in kind.lists for name in selectable()[each]), *added]))
 
 
 def check_word(kind: Kind, word: str) -> str:
-    """The word, if it may mean something.
+    """Return the word if it is valid.
 
     Raises:
-        ConfigurationError: it is no name, or of a file that is not there.
+        ConfigurationError: an unknown name, or a file that does not exist.
     """
     names = names_of(kind)
     if word in names or (kind.forms and looks_like_file(word)):
@@ -101,10 +101,10 @@ def check_word(kind: Kind, word: str) -> str:
 
 
 def check_setting(kind: Kind, text: str) -> str:
-    """``NAME=VALUE``, if there is such a setting.
+    """Return ``NAME=VALUE`` if there is such a setting.
 
     Raises:
-        ConfigurationError: there is none, or no value, or a robot that there is not.
+        ConfigurationError: an unknown setting, a missing value, or an unknown robot.
     """
     name, equals, value = text.partition("=")
     if not equals:
@@ -117,10 +117,10 @@ def check_setting(kind: Kind, text: str) -> str:
 
 
 def check_team(word: str) -> str:
-    """``FORMATION-AGENTS``, or that and ``-lines``, if there is such a formation. Missions read the rest.
+    """Return ``FORMATION-AGENTS`` or ``FORMATION-AGENTS-lines`` if there is such a formation. Missions check the number.
 
     Raises:
-        ConfigurationError: another form, or an unknown formation.
+        ConfigurationError: a word of another form, or an unknown formation.
     """
     formation, _, agents = word.removesuffix("-lines").partition("-")
     if not agents.isdecimal():
@@ -130,12 +130,12 @@ def check_team(word: str) -> str:
 
 
 def looks_like_file(word: str) -> bool:
-    """Whether a word can only be meant as a path or as something in a file."""
+    """Whether a word can only be a path or an object in a file."""
     return any(mark in word for mark in "/.:\\")
 
 
 def file_of(word: str) -> Path | None:
-    """The file that a word names; None where this module cannot tell."""
+    """The file that a word names; None if this module cannot tell."""
     file, colon, _ = word.partition(":")
     if colon and not file.endswith(".py"):
         return None
@@ -143,7 +143,7 @@ def file_of(word: str) -> Path | None:
 
 
 def check_there(file: Path | None, word: str) -> None:
-    """Raise ConfigurationError if a file is not there."""
+    """Raise ConfigurationError if a file does not exist."""
     try:
         there = file is None or file.exists()
     except (OSError, ValueError) as error:  # a name that is too long, or holds a null character
@@ -171,7 +171,7 @@ def _setting(kind: Kind) -> PrimitiveConstructorSpec[Any]:
 
 
 def _shown(kind: Kind, metavar: str | None = None) -> Any:
-    """The names in the help of an option, behind its default."""
+    """Show the valid names in the help of an option, after its default."""
 
     def hint(default: str) -> str:
         known = "" if default in ("None", "") else f"default: {default}; "
@@ -186,7 +186,7 @@ def _existing(text: str) -> Path:
 
 
 def _folder_of(file: str, lacks: str = "") -> PrimitiveConstructorSpec[Any]:
-    """A folder that holds a file; ``lacks`` says what a folder without it does not hold."""
+    """A folder that contains ``file``; ``lacks`` names what is missing from a folder without it, for the message."""
 
     def check(text: str) -> Path:
         try:
@@ -199,7 +199,7 @@ def _folder_of(file: str, lacks: str = "") -> PrimitiveConstructorSpec[Any]:
 
 
 def _unset(metavar: str) -> Any:
-    """Marks an option that has no value unless it is given; the help says nothing of a default."""
+    """Mark an option without a default value, so that its help shows no default."""
     return arg(metavar=metavar, help_behavior_hint="")
 
 

@@ -1,4 +1,4 @@
-"""How a command ends: exit statuses, signals, and output that nobody reads to its end."""
+"""How a command ends: exit statuses, signals, and pipes that the reader closes early."""
 
 import multiprocessing
 import os
@@ -15,11 +15,11 @@ from marlbc_mj.util.files import NO_SPACE
 from marlbc_mj.util.text import one_line
 
 INTERRUPTED, TERMINATED, PIPE_CLOSED = 130, 143, 141
-"""128 and the number of the signal, as shells have it."""
+"""Exit statuses: 128 plus the number of the signal, as in shells."""
 
 
 class Terminated(BaseException):
-    """SIGTERM was received; what is half written is removed on the way out, as after Ctrl-C."""
+    """SIGTERM was received. Incomplete output is removed while the exception propagates, as after Ctrl-C."""
 
 
 class CtrlC(KeyboardInterrupt):
@@ -27,19 +27,19 @@ class CtrlC(KeyboardInterrupt):
 
 
 _STOPS: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated, signal.SIGINT: CtrlC}
-_AGAIN = 0.25  # after which what was dropped is raised again [s]
+_AGAIN = 0.25  # time after which a dropped exception is raised again [s]
 
 
 @contextmanager
 def in_one_line(prog: str) -> Iterator[None]:
-    """Run a command; whatever stops it is said in one line.
+    """Run a command, and report whatever stops it in one line.
 
     Exits with 2 for a wrong setting, 3 for a failed run, a full disk or a lack of memory, 130 after Ctrl-C, 143 after
-    SIGTERM, and with 141, quietly, if the reader of its output has gone.
+    SIGTERM, and 141, without a message, if the reader of its output has closed the pipe.
     """
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="replace")  # a terminal that has no box-drawing characters, or names that are no text
+            stream.reconfigure(errors="replace")  # a terminal without box-drawing characters, or names that are not valid text
     try:
         with _stoppable():
             try:
@@ -64,12 +64,12 @@ def in_one_line(prog: str) -> Iterator[None]:
 
 
 def _line(prog: str, said: str, error: BaseException) -> str:
-    """What stopped the program and the notes that the error carries, of results that are kept for example, in one line."""
+    """One line with the reason for the stop and the notes of the error, for example on results that are kept."""
     return f"{prog}: {one_line('; '.join([said, *getattr(error, '__notes__', ())]))}"
 
 
 def _end(said: str, status: int) -> None:
-    """Exit, after one line on standard error; what standard output does not take is dropped."""
+    """Exit after one line on standard error; output that standard output does not accept is dropped."""
     try:
         sys.stdout.flush()
     except OSError:
@@ -78,24 +78,24 @@ def _end(said: str, status: int) -> None:
     if said:
         with suppress(OSError):
             print(said, file=sys.stderr, flush=True)
-    exec("")  # Python forgets a Ctrl-C that came while a text was executed, and ends with the status below instead of by a signal
+    exec("")  # clears Python's record of an unhandled Ctrl-C, with which it would end by a signal instead of the status
     sys.exit(status)
 
 
 class _Stop:
-    """Ends a command on a signal by an exception, which is raised again until it gets through.
+    """Ends a command on a signal by an exception, which is raised again until it propagates.
 
-    Python drops what a signal handler raises while C code calls back into Python: the compiler of numba does so whenever it has
-    made code, and a signal that came while it was at work is handled there.
+    Python drops an exception that a signal handler raises while C code calls back into Python. numba's compiler calls back after
+    every compilation, and a signal that arrives during compilation is handled there.
     """
 
     def __init__(self) -> None:
-        self.insists = hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM) == signal.SIG_DFL  # nobody else's alarm
+        self.insists = hasattr(signal, "setitimer") and signal.getsignal(signal.SIGALRM) == signal.SIG_DFL  # nobody else uses it
         self._kind: type[BaseException] | None = None
         self._error: weakref.ref[BaseException] | None = None
 
     def on_signal(self, number: int, frame: Any) -> None:
-        """Pass SIGTERM on to worker processes, and raise; a second SIGTERM does not stop the removal of what is half written."""
+        """Pass SIGTERM on to worker processes, and raise; a second SIGTERM does not stop the removal of incomplete output."""
         if number == signal.SIGTERM:
             if self._on_its_way():
                 return
@@ -107,12 +107,12 @@ class _Stop:
         self._throw()
 
     def on_alarm(self, number: int, frame: Any) -> None:
-        """Raise again what has been dropped."""
+        """Raise the exception again if it has been dropped."""
         if self._kind is not None and not self._on_its_way():
             self._throw()
 
     def _on_its_way(self) -> bool:
-        """Whether the exception still exists: whoever drops it holds no reference to it."""
+        """Whether the exception still exists. Once it is dropped, no references to it remain."""
         return self._error is not None and self._error() is not None
 
     def _throw(self) -> None:
@@ -122,12 +122,12 @@ class _Stop:
         try:
             raise error
         finally:
-            del error  # else this frame would keep it
+            del error  # otherwise this frame would keep the exception alive
 
 
 @contextmanager
 def _stoppable() -> Iterator[None]:
-    """Turn SIGTERM into :class:`Terminated` and Ctrl-C into :class:`CtrlC` during the block, whatever is at work."""
+    """Turn SIGTERM into :class:`Terminated` and Ctrl-C into :class:`CtrlC` during the block, also while numba compiles."""
     stop, ours = _Stop(), (signal.SIG_DFL, signal.default_int_handler)
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield

@@ -1,4 +1,4 @@
-"""``marlbc export``: a trained policy for another computer, or a log for other programs."""
+"""``marlbc export``: export a trained policy for another computer, or a log for other programs."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,22 +13,22 @@ LOG_SUFFIX = ".mcap"
 
 @dataclass(frozen=True)
 class ExportCommand:
-    """Write a checkpoint's policy as ONNX (extra onnx), or a log in another format.
+    """Write a checkpoint's policy as ONNX (needs the extra onnx), or a log in another format.
 
-    The general policy becomes the graph of one agent: what it sensed and heard goes in, its action comes out. Formats of a log:
-    a table (.csv, .jsonl, or .parquet with the extra parquet), arrays (.npz), or for Rerun (.rrd).
+    The general policy becomes the graph of one agent, with what it senses and hears as inputs and its action as output. Formats
+    of a log: a table (.csv, .jsonl, or .parquet with the extra parquet), arrays (.npz), or a Rerun recording (.rrd).
     """
 
     source: Positional[ExistingPath]
-    """Checkpoint, checkpoint/best.safetensors of a run for example, or an MCAP log."""
+    """MCAP log, or checkpoint, for example checkpoint/best.safetensors of a run."""
     out: Positional[Path]
-    """File to write: policy.onnx, or episode.csv; of a log, its ending chooses the format."""
+    """File to write, for example policy.onnx or episode.csv; for a log, the suffix selects the format."""
     overwrite: bool = False
     """Replace an existing file."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
-        """Export, and say what goes in and what comes out."""
+        """Export, and print the file or the inputs and outputs of the policy."""
         if self.source.suffix == LOG_SUFFIX:
             from marlbc_mj.recording.exports import export_log
 

@@ -18,29 +18,29 @@ DEFAULT_OUT = Path("runs/study")
 
 @dataclass(frozen=True)
 class StudyCommand:
-    """Compare learners: MARLMS, its ablations and rivals, each on several seeds; the same command goes on where it stopped."""
+    """Compare learners (MARLMS, its ablations and baselines) on several seeds each; the same command resumes a stopped study."""
 
     variants: VariantNames = ()
     """Variants to train; all of them by default."""
     seeds: int = 5
     """Runs per variant, with seeds from 0 on."""
     budget: SomeCount = None
-    """Mission steps per run; by default those of the preset `fast`."""
+    """Mission steps per run; by default the budget of the preset `fast`."""
     workers: int = 2
-    """Processes that share the runs, one thread each."""
+    """Number of processes that share the runs, with one thread each."""
     out: SomePath = None
-    """Folder of runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
+    """Folder for runs, study.csv, curves.csv, study.md, study.tex, and the figure as PDF and PNG; runs/study by default."""
     source: StudySource = None
-    """Only make table and figure again, from study.csv and curves.csv in this folder, there or in --out."""
+    """Only make table and figure again from study.csv and curves.csv in this folder; written there or into --out."""
     set: TrainingSettings = ()
-    """Any setting of all runs, as for `marlbc train`."""
+    """Settings for all runs, as in `marlbc train`."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Train what is missing, then write and print the comparison; a stopped study compares what there is.
+        """Train the unfinished runs, then write and print the comparison; a stopped study compares the results so far.
 
         Raises:
-            SimulationError: a run failed; the comparison says so, too.
+            SimulationError: a run failed; the comparison shows that, too.
         """
         from marlbc_mj.studies.learners.records import read_study
         from marlbc_mj.studies.learners.trainings import LearnerStudy, compare_learners, failed_runs, train_learners
@@ -66,22 +66,22 @@ class StudyCommand:
 
 @dataclass(frozen=True)
 class ArmsCommand:
-    """Ablations of marlms-general: one setting changed at a time, trained on several seeds, flown on held-out layouts."""
+    """Run ablations of marlms-general: change one setting at a time, train on several seeds, and fly on held-out layouts."""
 
     arms: ArmNames = ()
-    """Arms to train; all of them by default."""
+    """Arms (ablations) to train; all of them by default."""
     seeds: int = 5
-    """Trainings of each, with seeds from 1 on."""
+    """Training runs per arm, with seeds from 1 on."""
     budget: int = 400_000
-    """Mission steps of a training."""
+    """Mission steps per training run."""
     layouts: int = 40
-    """Held-out layouts of every mission."""
+    """Number of held-out layouts per mission."""
     seed: int = 70_000
     """Seed of the first layout."""
     workers: int = 1
-    """Processes that share the trainings, or tasks of a SLURM array."""
+    """Number of processes, or of tasks in a SLURM array, that share the training runs."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where they run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     out: Path = Path("out/arms")
     """Folder for arms.csv, arms.md, and the figure as PDF and PNG."""
     overwrite: bool = False
@@ -89,7 +89,7 @@ class ArmsCommand:
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Train and fly what is missing, then write and print the comparison."""
+        """Train and fly all arms that have not finished, then write and print the comparison."""
         from marlbc_mj.studies.learners.arms import ArmStudy
         from marlbc_mj.studies.runner import counting, run_study
 

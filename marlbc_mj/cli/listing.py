@@ -13,11 +13,11 @@ class ListCommand:
     """List everything that can be selected, one line each."""
 
     kind: Positional[SomeKind] = None
-    """What to list; everything but settings by default."""
+    """Kind of things to list; by default all kinds but settings."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Print every registry, or one."""
+        """Print all kinds, or the given one."""
         chosen = {kind: entries for kind, entries in selectable().items() if self._shows(kind)}
         self.output.report("\n".join(line for kind, entries in chosen.items() for line in _section(kind, entries)), chosen)
 

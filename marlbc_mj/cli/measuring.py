@@ -1,4 +1,4 @@
-"""Commands about speed, about where numbers come from, and about the best known return."""
+"""Commands that measure speed, the effect of single choices, and the distance from the best known return."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,12 +22,12 @@ from marlbc_mj.cli.scenario_options import ScenarioOptions
 
 @dataclass(frozen=True)
 class PerfCommand:
-    """Measure this machine: bare mj_step, the closed loop, the Python loop, batches, an episode, a log."""
+    """Measure the speed of this machine: bare mj_step, closed loop, Python loop, batches, an episode, a log, training."""
 
     out: SomePath = None
     """JSON file for the measurements."""
     rounds: int = 9
-    """Rounds, each running every variant once; medians are reported."""
+    """Number of rounds, each of which runs every variant once; results are medians."""
     overwrite: bool = False
     """Replace an existing file."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
@@ -48,12 +48,12 @@ class PerfCommand:
 
 @dataclass(frozen=True)
 class ScaleCommand:
-    """Measure what a mission step costs per agent, and the memory of a world, for teams from 4 to 256 agents."""
+    """Measure the time of a mission step per agent and the memory of a world, for teams of 4 to 256 agents."""
 
     out: SomePath = None
     """Folder for scale.md, scale.json and figures/scale.{pdf,png}."""
     rounds: int = 7
-    """Rounds, each running every size once; medians are reported."""
+    """Number of rounds, each of which runs every size once; results are medians."""
     overwrite: bool = False
     """Replace what is in the output folder."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
@@ -70,16 +70,16 @@ class ScaleCommand:
 
 @dataclass(frozen=True)
 class AblationCommand:
-    """Measure what SORLC's basis, its gains and compensator, the reference mode, the avoidance and the substep are worth."""
+    """Measure the effect of SORLC's basis, gains and compensator, of the reference mode, of the avoidance and of the substep."""
 
     study: QuestionNames = ()
     """Studies to run; all of them by default."""
     out: SomePath = None
     """Folder for ablation.md, ablation.csv and index.html."""
     workers: int = 1
-    """Processes that share the jobs, or tasks of a SLURM array."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     overwrite: bool = False
     """Replace what is in the output folder."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
@@ -100,31 +100,31 @@ class AblationCommand:
 
 @dataclass(frozen=True)
 class CommunicationCommand:
-    """Measure what range, delay, loss and a silent agent cost a distributed supervisor, on held-out layouts.
+    """Measure how range, delay, loss of messages and a silent agent affect a distributed supervisor on held-out layouts.
 
-    Ranges are full, 2 and 1.2 distances between neighbors, delays 0, 0.1 and 0.3 s, losses 0, 20 and 50 %.
+    Ranges are unlimited, 2 and 1.2 times the distance between neighbors, delays 0, 0.1 and 0.3 s, losses 0, 20 and 50 %.
     """
 
     missions: Positional[ScenarioNames] = ("gates", "corridor")
-    """Scenarios that draw layouts."""
+    """Scenarios with random layouts."""
     supervisor: SupervisorName = "lookahead-distributed"
-    """Supervisor that is distributed."""
+    """Distributed supervisor to measure."""
     controller: ControllerName = "sorlc"
-    """Controller it runs with."""
+    """Controller that the supervisor runs with."""
     seeds: int = 40
     """Number of held-out layouts."""
     seed: int = 65000
-    """First seed."""
+    """Seed of the first layout."""
     workers: int = 1
-    """Processes that share the cases."""
+    """Number of processes that share the cases."""
     agreement: bool = False
-    """Measure only how long agents take to agree, by flooding and by consensus; nothing is written."""
+    """Only measure how long agents take to agree by flooding and by consensus; writes no files."""
     out: Path = Path("out/communication")
     """Folder for communication.csv and config.json."""
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield: forces are changed as little as possible, so that they can always stop in time."""
+    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
@@ -152,7 +152,7 @@ class CommunicationCommand:
 
 @dataclass(frozen=True)
 class CalibrateCommand:
-    """Find the velocity gains that give Table 6's published maxima, and compare them with the shipped ones."""
+    """Find the velocity gains that reproduce the largest forces published in Table 6, and compare them with the shipped gains."""
 
     controllers: CalibratedNames = ("finite-time", "fixed-time")
     """Controllers to calibrate."""
@@ -170,24 +170,24 @@ class CalibrateCommand:
 
 @dataclass(frozen=True)
 class OracleCommand:
-    """Search the best safe switch times on the simulator, for the oracle supervisor; takes minutes."""
+    """Search for the best safe switch times in simulation, for the supervisor oracle; takes minutes."""
 
     scenario: ScenarioName = "paper"
-    """Scenario."""
+    """Scenario to search on."""
     controller: ControllerName = "sorlc"
     """Controller that tracks the references."""
     seed: int = 0
     """Random seed of the schedule search."""
     budget: int = 4096
-    """Episodes that may be simulated."""
+    """Most episodes that the search simulates."""
     threads: int = 2
-    """Threads that share the worlds."""
+    """Number of threads for the simulation."""
     out: SomePath = None
-    """Cache to add the schedule to; the one that comes with the package by default."""
+    """File of schedules to which the result is added; by default the one shipped with the package."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Search, save, and say what was found."""
+        """Search, save the schedule, and print its return."""
         _check_writable(self.out, overwrite=True)
         from marlbc_mj.scenarios import make_scenario
         from marlbc_mj.supervisors.oracle import save_schedule, search
@@ -209,22 +209,22 @@ class OracleCommand:
 
 @dataclass(frozen=True)
 class RegretCommand:
-    """Compare supervisors with the best schedule that a search finds for each of some held-out layouts; half a minute each."""
+    """Compare supervisors with the best schedule that a search finds for each held-out layout; takes half a minute per layout."""
 
     missions: Positional[ScenarioNames] = ("field", "forest", "gates", "corridor")
-    """Scenarios that draw layouts of obstacles at rest; flown under the set-based composition."""
+    """Scenarios with random layouts of obstacles at rest; flown under the set-based composition."""
     supervisors: SupervisorNames = ("marlms-general", "rollout", "lookahead", "fixed")
-    """Supervisors to compare. The search begins with the best that one of them flew."""
+    """Supervisors to compare; the search starts from the best of their flights."""
     layouts: int = 50
-    """Layouts of every mission."""
+    """Layouts per mission."""
     seed: int = 90_000
     """Seed of the first layout."""
     budget: int = 512
-    """Episodes that the search may simulate on each layout."""
+    """Most episodes that the search simulates per layout."""
     controller: ControllerName = "sorlc"
     """Controller that tracks the references."""
     workers: int = 1
-    """Processes that share the layouts."""
+    """Number of processes that share the layouts."""
     out: Path = Path("out/regret")
     """Folder for regret.csv, regret.md and config.json."""
     overwrite: bool = False
@@ -245,7 +245,7 @@ class RegretCommand:
 
 
 def _check_writable(out: Path | None, *, overwrite: bool) -> None:
-    """Refuse a file that cannot be written, before what measures or searches is loaded."""
+    """Refuse a file that cannot be written, before the modules that measure or search are loaded."""
     from marlbc_mj.util.files import check_writable
 
     if out is not None:

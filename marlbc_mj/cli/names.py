@@ -1,7 +1,7 @@
 """The file of names that the command line reads, made from the registries.
 
-``python -m marlbc_mj.cli.names`` writes it anew, after a registry has changed; a test compares both. Reading the file takes a
-millisecond, and the registries take seconds: they import every law.
+After a change of a registry, ``python -m marlbc_mj.cli.names`` rewrites it; a test compares both. Reading the file takes a
+millisecond. Loading the registries takes seconds, since they import every law.
 """
 
 import json
@@ -19,7 +19,7 @@ _DEVICES = ("of the processor", "of an NVIDIA graphics card")
 
 
 def registered() -> dict[str, dict[str, str]]:
-    """What :func:`~marlbc_mj.cli.choices.selectable` reads, from the registries themselves."""
+    """The content of the file that :func:`~marlbc_mj.cli.choices.selectable` reads, collected from the registries."""
     from marlbc_mj.controllers import CONTROLLERS
     from marlbc_mj.controllers.sorlc import BASES
     from marlbc_mj.core.disturbances import DISTURBANCES
@@ -53,7 +53,7 @@ def registered() -> dict[str, dict[str, str]]:
 
 
 def _lines(registry: dict[str, Any]) -> dict[str, str]:
-    """Descriptions of a registry whose values are pairs."""
+    """Descriptions by name, of a registry whose values are pairs of an object and its description."""
     return {name: line for name, (_, line) in registry.items()}
 
 
@@ -96,7 +96,7 @@ def _settings() -> dict[str, dict[str, str]]:
 
 
 def _defaults(settings: Any, prefix: str = "") -> dict[str, str]:
-    """Values of the fields of a dataclass and of those in it, by dotted name."""
+    """Values of the fields of a dataclass and of nested dataclasses, by dotted name."""
     from marlbc_mj.util.settings import annotations
 
     found: dict[str, str] = {}

@@ -13,10 +13,10 @@ from marlbc_mj.util.progress import Progress, silent
 
 @dataclass(frozen=True)
 class OutputOptions:
-    """What the command says."""
+    """What the command prints."""
 
     quiet: bool = False
-    """Say nothing but errors."""
+    """Print nothing but errors."""
 
     @property
     def talks(self) -> bool:
@@ -24,7 +24,7 @@ class OutputOptions:
         return not self.quiet
 
     def say(self, *lines: object) -> None:
-        """Lines for people, on standard output."""
+        """Print lines for people on standard output."""
         if self.talks:
             for line in lines:
                 print(line)
@@ -49,7 +49,7 @@ class OutputOptions:
 
 @dataclass(frozen=True)
 class ReportOptions(OutputOptions):
-    """What the command says."""
+    """What the command prints."""
 
     json: bool = False
     """Print one JSON document on standard output, and nothing else there."""
@@ -60,11 +60,11 @@ class ReportOptions(OutputOptions):
         return not (self.quiet or self.json)
 
     def report(self, text: str | Callable[[], None], document: Any) -> None:
-        """What came out: for people, or as JSON, in which numbers that are not finite are null.
+        """Print the result as text for people, or as JSON, in which numbers that are not finite are null.
 
         Args:
-            text: printed if there is any, or what prints it.
-            document: dataclasses, named tuples, arrays, mappings, lists, texts and numbers.
+            text: the text to print, empty for none, or a function that prints it.
+            document: the result as dataclasses, named tuples, arrays, mappings, lists, texts and numbers.
         """
         if self.json:
             json.dump(_plain(document), sys.stdout, indent=2, ensure_ascii=False, allow_nan=False)
@@ -76,7 +76,7 @@ class ReportOptions(OutputOptions):
 
 
 def _plain(value: Any) -> Any:
-    """JSON data: what has named parts becomes an object, numbers that are not finite become null."""
+    """JSON data: dataclasses and named tuples become objects, numbers that are not finite become null."""
     from marlbc_mj.util.provenance import plain_data
 
     return plain_data(_named(value), not_finite=lambda _: None)

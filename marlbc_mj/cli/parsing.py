@@ -1,6 +1,6 @@
-"""From arguments to a command: tyro parses, and what it refuses is said in one line.
+"""Turns arguments into a command: tyro parses them, and its errors are reported in one line.
 
-Words that choose a command are looked up here, so that only the parser of that command is made.
+Words that select a command are looked up here, so that tyro makes only the parser of that command.
 """
 
 import sys
@@ -19,20 +19,20 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import nearest_word, one_line
 
 LEAST = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1, "--agents": 2}
-"""Smallest numbers of options that mean the same in every command."""
+"""Smallest values of options that have the same meaning in every command."""
 ABOVE_ZERO = ("--duration", "--substep")
-"""Options that take times above zero in every command."""
+"""Options whose value, a time, must be above zero in every command."""
 
 
 class Refusal(NamedTuple):
-    """What is wrong with the arguments, and the command whose help tells more."""
+    """The error in the arguments, and the command whose help explains more."""
 
     said: str
     command: str
 
 
 class Chosen(NamedTuple):
-    """A command, or a union of them, and what is left of the arguments."""
+    """A command or a union of commands, and the remaining arguments."""
 
     kind: Any
     prog: str
@@ -40,19 +40,19 @@ class Chosen(NamedTuple):
 
 
 def parse(commands: Any, arguments: Sequence[str] | None, *, prog: str, description: str) -> Any:
-    """The command that the arguments spell; exits with 2 after one line about arguments that spell none.
+    """Make the command that the arguments describe; for invalid arguments, print one line and exit with 2.
 
-    tyro tells its hook what is wrong. The hook is not part of tyro's stable interface: without it, or for an event of a new kind,
-    tyro's own box is shown, with the same exit status.
+    tyro reports errors to a hook, which is not part of its stable interface. Without the hook, or for a new kind of event, tyro
+    shows its own error box and exits with the same status.
 
     Args:
         commands: union of dataclasses, each annotated with its subcommand.
-        arguments: of the command line; None: those of this process.
+        arguments: arguments of the command line; None: those of this process.
         prog: name of the program.
         description: first line of the help.
 
     Raises:
-        ConfigurationError: a word that means nothing here.
+        ConfigurationError: an invalid word.
     """
     chosen = choose_command(commands, sys.argv[1:] if arguments is None else list(arguments), prog)
     refusal = _refused_word(chosen)
@@ -79,7 +79,7 @@ def _of_tyro(chosen: Chosen, description: str | None) -> Any:
 
 
 def choose_command(commands: Any, given: list[str], prog: str) -> Chosen:
-    """The command that the first words name."""
+    """The command that the first words select."""
     chosen = Chosen(commands, prog, given)
     while chosen.rest and (known := subcommands_of(chosen.kind)) and chosen.rest[0] in known:
         word, *rest = chosen.rest
@@ -88,10 +88,10 @@ def choose_command(commands: Any, given: list[str], prog: str) -> Chosen:
 
 
 def check_words(chosen: Chosen) -> None:
-    """Check what the first words and options choose by name. tyro does so, too, but loads half a second of other packages first.
+    """Check names and numbers in the arguments. tyro does so, too, but takes half a second to load other packages first.
 
     Raises:
-        WrongWord: a word that means nothing here.
+        WrongWord: an invalid word.
     """
     if not is_dataclass(chosen.kind):
         return
@@ -114,7 +114,7 @@ def check_words(chosen: Chosen) -> None:
 
 
 def check_least(option: str, word: str) -> None:
-    """Raise WrongWord for a number below what the option takes in every command. What it is for checks it, too, once loaded."""
+    """Raise WrongWord for a number below the minimum of an option. The code that uses it checks it, too, once it is loaded."""
     if option in ABOVE_ZERO and (number := _number(word)) is not None and number <= 0.0:
         raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} must be positive and finite, got {number}"))
     least = LEAST.get(option)
@@ -125,7 +125,7 @@ def check_least(option: str, word: str) -> None:
 
 
 def _number(word: str) -> float | None:
-    """A word as a number; None if it is none."""
+    """A word as a number; None if it is not a number."""
     try:
         return float(word)
     except ValueError:
@@ -133,7 +133,7 @@ def _number(word: str) -> float | None:
 
 
 def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:
-    """What a word becomes a value by, where a field says so itself. Files are left to tyro, which counts words first."""
+    """The constructor in a field's annotation that converts words, if any. Paths are left to tyro, which counts words first."""
     for part in () if Path in get_args(hint) else get_args(hint):
         found = part if isinstance(part, PrimitiveConstructorSpec) else _constructor_of(part)
         if found is not None:
@@ -142,12 +142,12 @@ def _constructor_of(hint: Any) -> PrimitiveConstructorSpec[Any] | None:
 
 
 def _is_tuple(hint: Any) -> bool:
-    """Whether a field takes several words."""
+    """Whether a field accepts several words."""
     return get_origin(hint) is tuple or any(map(_is_tuple, get_args(hint)))
 
 
 def _refused_word(chosen: Chosen) -> Refusal | None:
-    """What is wrong where a command is still to be named; None where nothing is, or where tyro is to say it."""
+    """The error if a subcommand is missing or unknown; None if there is no error, or if tyro reports it."""
     known = subcommands_of(chosen.kind)
     if not known or (chosen.rest and chosen.rest[0].startswith("-")):
         return None
@@ -165,7 +165,7 @@ def _exit(prog: str, refusal: Refusal) -> None:
 
 
 def _refusal(event: Any, kind: Any) -> Refusal | None:
-    """The event in words; None for a kind of event that is not known here."""
+    """The error that an event of tyro describes; None for an unknown kind of event."""
     match type(event).__name__:
         case "MissingSubcommand":
             said = f"Expected one of {{{', '.join(event.subcommand_spec.parser_from_name)}}}"
@@ -191,12 +191,12 @@ def _refusal(event: Any, kind: Any) -> Refusal | None:
 
 
 def _name(argument: Any) -> str:
-    """``--seed`` of an option, ``out`` of a positional argument."""
+    """The name to show: ``--seed`` for an option, ``out`` for a positional argument."""
     return str(argument.display_name()).rpartition(".")[2]
 
 
 def _suggestion(tokens: Sequence[str], kind: Any) -> str:
-    """Options of the command that are spelled like unknown ones."""
+    """Text that suggests options with a spelling similar to that of unknown ones."""
     known = list(dict.fromkeys(options_of(kind)))
     like = [nearest_word(token.partition("=")[0], known) for token in tokens if token.startswith("--")]
     found = list(dict.fromkeys(name for name in like if name is not None))
@@ -204,7 +204,7 @@ def _suggestion(tokens: Sequence[str], kind: Any) -> str:
 
 
 def subcommands_of(kind: Any) -> dict[str, Any]:
-    """Dataclasses by subcommand, of a union or of the field of a dataclass that is one; empty for a command without."""
+    """Dataclasses by subcommand, of a union or of a dataclass with an ``action``; empty for a command without subcommands."""
     if is_dataclass(kind):
         hints = get_type_hints(kind, include_extras=True)
         return subcommands_of(get_args(hints["action"])[0]) if "action" in hints else {}
@@ -213,12 +213,12 @@ def subcommands_of(kind: Any) -> dict[str, Any]:
 
 
 def options_of(kind: Any) -> Iterator[str]:
-    """Spelling of every option of a command or a union of commands, once or more often."""
+    """Spelling of every option of a command or a union of commands, with repetitions."""
     return (name for name, _ in _named_options(kind))
 
 
 def _named_options(kind: Any) -> Iterator[tuple[str, Any]]:
-    """Spelling and hint of every option of a command or a union of commands, once or more often."""
+    """Spelling and type hint of every option of a command or a union of commands, with repetitions."""
     for command in subcommands_of(kind).values():
         yield from _named_options(command)
     if not is_dataclass(kind):

@@ -1,4 +1,4 @@
-"""``marlbc video``, ``view`` and ``log``: what is made from an MCAP log."""
+"""``marlbc video``, ``view`` and ``log``: render, play, inspect and convert MCAP logs."""
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -18,13 +18,13 @@ class VideoCommand:
     log: Positional[ExistingPath]
     """MCAP log."""
     out: SomePath = None
-    """Video file, whose ending chooses the format; the log's name with .mp4 by default."""
+    """Video file, whose suffix selects the format; by default the name of the log with .mp4."""
     speed: float = 4.0
     """Mission seconds per video second."""
     fps: int = 30
     """Frames per second."""
     camera: str = "track"
-    """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one of the model."""
+    """Camera: track or close (behind the team), agent1, wide (from the side), at:X,Y,R (a spot), top, or one in the model."""
     start: SomeNumber = None
     """First mission time shown [s]."""
     end: SomeNumber = None
@@ -38,7 +38,7 @@ class VideoCommand:
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
-        """Render, with progress; the backend is named once there is a first frame."""
+        """Render with a progress bar; print the name of the backend after the first frame."""
         from marlbc_mj.recording.gl import choose_gl
         from marlbc_mj.recording.reader import read_log
         from marlbc_mj.recording.video import VideoStyle, parse_size, render_video
@@ -64,7 +64,7 @@ class ViewCommand:
     log: Positional[ExistingPath]
     """MCAP log."""
     speed: float = 4.0
-    """Mission seconds per second."""
+    """Mission seconds per second of playback."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
@@ -77,16 +77,16 @@ class ViewCommand:
 
 @dataclass(frozen=True)
 class LogInfoCommand:
-    """Say what a log holds, as JSON."""
+    """Print the contents of a log as JSON."""
 
     log: Positional[ExistingPath]
     """MCAP log."""
     metrics: bool = False
-    """Its metrics, computed again from every substep, instead."""
+    """Print the metrics instead, computed again from every substep."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Metadata, topics, attachments; or metrics."""
+        """Print metadata, topics and attachments, or metrics."""
         import json
 
         from marlbc_mj.recording.reader import log_info, read_log
@@ -98,18 +98,18 @@ class LogInfoCommand:
 
 @dataclass(frozen=True)
 class LogRecoverCommand:
-    """Salvage a log that was torn: all whole chunks of it."""
+    """Recover all undamaged parts of an incomplete or damaged log."""
 
     log: Positional[ExistingPath]
-    """The torn file, *.mcap.partial for example."""
+    """Incomplete or damaged file, for example *.mcap.partial."""
     out: Positional[Path]
-    """Where the salvaged log goes."""
+    """File for the recovered log."""
     overwrite: bool = False
     """Replace an existing file."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
-        """Recover and count."""
+        """Recover, and print the number of messages."""
         from marlbc_mj.recording.mcap_file import recover_log
 
         saved = recover_log(self.log, self.out, overwrite=self.overwrite)
@@ -123,7 +123,7 @@ class LogExportCommand:
     log: Positional[ExistingPath]
     """MCAP log."""
     out: Positional[Path]
-    """File to write; its ending chooses the format."""
+    """File to write; its suffix selects the format."""
     overwrite: bool = False
     """Replace an existing file."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
@@ -138,7 +138,7 @@ class LogExportCommand:
 
 @dataclass(frozen=True)
 class LogCommand:
-    """Inspect, salvage or convert MCAP logs."""
+    """Inspect, recover or convert MCAP logs."""
 
     action: OmitSubcommandPrefixes[
         Annotated[LogInfoCommand, subcommand("info")]

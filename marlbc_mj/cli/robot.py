@@ -13,10 +13,10 @@ from marlbc_mj.cli.output import ReportOptions
 
 @dataclass(frozen=True)
 class RobotCheckCommand:
-    """Go through the checklist of a robot; exit status 1 if something fails."""
+    """Check whether a robot meets the requirements of a mission; the exit status is 1 if a check fails."""
 
     file: Positional[RobotName]
-    """A robot's MJCF, Python file, or name."""
+    """Robot: its name, MJCF file or Python file."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
@@ -34,32 +34,28 @@ class RobotCheckCommand:
 
 @dataclass(frozen=True)
 class RobotGateCommand:
-    """Fly the gate mission, scaled to each robot, under scripted, FSAMS with hysteresis and MPCMS: a table, stills and clips."""
+    """Fly the gate mission, scaled to each robot, under several supervisors; writes a table, stills and clips."""
 
     robots: RobotNames = ()
-    """Robots; all but the point mass by default."""
+    """Robots to fly; by default all but the point mass."""
     supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms")
-    """Supervisors; the first one's episodes are shown."""
+    """Supervisors to run; stills and clips show the episodes of the first one."""
     controller: GateControllerName = "pd"
     """Controller, with the robot's gains."""
     out: Path = Path("out/robots")
-    """Folder of gate.md, gate.json, PNG and MP4."""
+    """Folder for gate.md, gate.json, PNG and MP4 files."""
     clips: bool = True
-    """Draw stills and clips."""
+    """Render stills and clips."""
     workers: int = 1
-    """Processes that share the jobs, or tasks of a SLURM array."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     overwrite: bool = False
     """Replace what is in the output folder."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Fly, write, and print the table.
-
-        Raises:
-            SimulationError: a robot is not where its mission is; the table says so, too.
-        """
+        """Fly, write the results and print the table; exit with status 3 if an episode failed, which the table shows, too."""
         from marlbc_mj.studies.robot_gate import SHOWN, run_gates
 
         with self.output.progress() as told:

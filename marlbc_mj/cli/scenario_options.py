@@ -1,4 +1,4 @@
-"""Changes to a scenario that commands share."""
+"""Options that change a scenario, shared by several commands."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -32,33 +32,33 @@ class ScenarioOptions:
     composition: SomeComposition = None
     """How an order becomes a reference: avoidance as an equality task (null-space) or as an inequality (set-based)."""
     two_sided: bool = False
-    """Obstacle avoidance as the published equality task, which also attracts (erratum 6)."""
+    """Use the published obstacle avoidance, an equality task, which also attracts agents (erratum 6)."""
     disturbance: SomeDisturbance = None
-    """Unknown dynamics."""
+    """Unknown force on the agents, such as drag or wind."""
     drag_scale: SomeNumber = None
-    """Multiplies the disturbance."""
+    """Factor on the disturbance."""
     force_limit: SomeNumber = None
-    """Actuator limit per axis [N]; laws without limit (see `marlbc list`) ignore it."""
+    """Actuator limit per axis [N]; controllers without a limit (see `marlbc list`) ignore it."""
     duration: SomeNumber = None
-    """Mission time [s]."""
+    """Duration of the mission [s]."""
     robot: SomeRobot = None
-    """Robot of every agent; the scenario takes its mass, force and limits."""
+    """Robot of every agent; its mass and limits replace those of the scenario."""
     agents: SomeCount = None
-    """Size of the team, 2 to 256, for scenarios that are made for any."""
+    """Number of agents, 2 to 256, for scenarios that allow any number."""
     formation: SomeFormation = None
-    """Formation of the team, for the same scenarios."""
+    """Formation of the team, for scenarios that allow any number of agents."""
     room: bool = False
-    """Give a team the room that it needs: from 12 agents on a longer way, a column of several files and wider openings."""
+    """Make room for the team: teams of 12 or more agents get a longer path, a column of several files and wider openings."""
     along_lines: bool = False
-    """Agents come to their slots in the column along the slots' lines, not straight: first across the path, then along it."""
+    """Agents join the column first across the path to the line of their slot, then along it, instead of straight."""
     split: SomeSplit = None
-    """Layout split to draw from, for scenarios that draw layouts; train, unless a command says otherwise."""
+    """Split from which random layouts are drawn; train, unless the command uses held-out layouts."""
     set: ScenarioSettings = ()
-    """Settings of communication and imperfections, and each agent's robot where they differ: communication.range=8
+    """Settings of communication and imperfections, and the robots of a mixed team, for example: communication.range=8
     robots=disc,disc,omni,crazyflie."""
 
     allow_code: bool = False
-    """Run the Python file that a scenario file names as its robot."""
+    """Allow a scenario file to run the Python file of its robot."""
 
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
@@ -83,16 +83,16 @@ class ScenarioOptions:
         return with_settings(scenario, settings)
 
     def _split_settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """The settings without that of the robots, and the names that it gives: their scale is the scenario's from the start."""
+        """The settings without ``robots``, and the names in ``robots``: the scenario is scaled to the robots when it is made."""
         given = [setting for setting in self.set if setting.partition("=")[0] == ROBOTS_SETTING]
         names = given[-1].partition("=")[2].split(",") if given else []
         return tuple(setting for setting in self.set if setting not in given), tuple(names)
 
     def _robot_changes(self, name: str, robots: tuple[str, ...]) -> dict[str, Any]:
-        """Fields that another robot, or one of each agent's, changes, without those that other options set.
+        """Fields that --robot or the robots of all agents change, without those that other options set.
 
         Raises:
-            ConfigurationError: both are given, or a robot that cannot be made.
+            ConfigurationError: both are given, or a robot cannot be made.
         """
         from marlbc_mj.robots import make_fleet
 

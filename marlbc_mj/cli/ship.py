@@ -10,20 +10,20 @@ from marlbc_mj.cli.output import OutputOptions
 
 @dataclass(frozen=True)
 class ShipCommand:
-    """Copy the best checkpoint of a run to the shipped ones and write its model card. For developers of the package."""
+    """Copy the best checkpoint of a run into the package and write its model card; for developers of the package."""
 
     run_folder: Positional[TrainedRun]
     """Folder of the training run."""
     name: Positional[str]
-    """Name that the supervisor gets: marlms, rlms, marlms-general."""
+    """Name of the shipped supervisor: marlms, rlms or marlms-general."""
     mean_with: tuple[TrainedRun, ...] = ()
-    """More runs of the general policy: shipped are the mean action values of the last networks of all."""
+    """More runs of the general policy; the shipped policy then uses the mean action values of the last networks of all runs."""
     overwrite: bool = False
     """Replace an existing checkpoint."""
     output: OmitArgPrefixes[OutputOptions] = field(default_factory=OutputOptions)
 
     def run(self) -> None:
-        """Copy, write the card, say where."""
+        """Copy, write the card, and print the path of the checkpoint."""
         from marlbc_mj.policies.general import is_general
         from marlbc_mj.training.general.shipping import ship_general, ship_mean
         from marlbc_mj.training.ship import ship

@@ -28,37 +28,37 @@ class SuiteCommand:
     """Fly supervisors and controllers on a fixed set of missions, and write a leaderboard.
 
     Tracks: paper, families, teams, robots and control. Every supervisor flies under the compositions that it is meant for;
-    control compares controllers under one schedule. The whole suite takes days of one core: begin with --quick.
+    the track control compares controllers under one schedule. The whole suite takes days on one core: start with --quick.
     """
 
     track: TrackNames = ()
-    """Tracks to fly; all by default, paper, families and control with --quick."""
+    """Tracks to fly; by default all, or with --quick paper, families and control."""
     missions: SuiteMissionNames = ()
-    """Missions of these tracks to fly; all by default."""
+    """Missions of these tracks to fly; by default all."""
     supervisors: SomeSupervisors = None
-    """Supervisors to fly; all but mpcms-mujoco by default, and no search with --quick."""
+    """Supervisors to fly; by default all but mpcms-mujoco, and with --quick also without mpcms and rollout."""
     controllers: SomeControllers = None
-    """Controllers of the track control; all by default."""
+    """Controllers to fly on the track control; by default all."""
     compositions: SomeCompositions = None
     """Compositions for every supervisor; by default those that each is meant for."""
     shield: bool = False
     """Fly every method with a shield as well."""
     quick: bool = False
-    """The first 50 layouts of every mission, without supervisors that search."""
+    """Fly only the first 50 layouts of every mission, without supervisors that search."""
     layouts: SomeCount = None
-    """The first so many layouts of every mission."""
+    """Fly only this many layouts of every mission, the first ones."""
     source: SuiteSource = None
-    """Folder of results of the suite whose rows stand beside those that are flown."""
+    """Folder of earlier suite results to show next to the new ones."""
     page: bool = False
-    """Fly nothing: write the page of the results in --from."""
+    """Fly nothing; only write the page for the results in --from."""
     clips: bool = False
     """Render the worst and the median layout of every method."""
     workers: int = 1
-    """Processes that share the work; decision times are best measured with one."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs; use 1 to measure decision times."""
     engine: Literal["local", "ray", "slurm"] = "local"
-    """Where jobs run: processes of this machine, Ray (the cluster in RAY_ADDRESS, else this machine), or an array of SLURM."""
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     out: Path = Path("out/suite")
-    """Folder of suite.json, a CSV file per track, leaderboard.html and leaderboard.tex."""
+    """Folder for suite.json, a CSV file per track, leaderboard.html and leaderboard.tex."""
     overwrite: bool = False
     """Replace the results in the output folder."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
@@ -86,10 +86,10 @@ class SuiteCommand:
         self.output.say(f"{self.out / LEADERBOARD_PAGE} shows it all")
 
     def study(self) -> "SuiteStudy":
-        """What is to be flown.
+        """The suite study that the options describe.
 
         Raises:
-            ConfigurationError: options that do not go together, unknown names, or results that cannot stand beside these.
+            ConfigurationError: incompatible options, unknown names, or earlier results that cannot be compared with these.
         """
         from marlbc_mj.studies.suite.definition import QUICK, QUICK_TRACKS, check_frozen, choose_missions
         from marlbc_mj.studies.suite.entries import Choice
@@ -104,5 +104,5 @@ class SuiteCommand:
         check_frozen(list(dict.fromkeys(mission.track for mission in missions)))
         choice = Choice(self.supervisors, self.controllers, self.compositions, self.shield, self.quick)
         if self.source is not None:
-            read_suite(self.source)  # what cannot stand beside these rows is refused before anything is flown
+            read_suite(self.source)  # refuses results that cannot be compared before anything is flown
         return SuiteStudy(tuple(missions), choice, self.source, self.clips)

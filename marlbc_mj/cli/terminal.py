@@ -1,4 +1,4 @@
-"""What the command line shows on the terminal, progress bars and results, and the choice of a renderer before anything else."""
+"""Terminal output of the command line, progress bars and results, and the check of the renderer before anything else."""
 
 import os
 import sys
@@ -12,15 +12,15 @@ from marlbc_mj.util.method_names import display_key
 from marlbc_mj.util.progress import Progress, note
 from marlbc_mj.util.text import one_line
 
-SELDOM = 60.0  # where there is no terminal [s]
+SELDOM = 60.0  # time between progress lines if there is no terminal [s]
 LEAST_WIDTH = 112  # least width of the table of results [characters]
 
 
 def prepare_gl(strict: bool) -> None:
-    """Make sure, before MuJoCo is imported, that a MUJOCO_GL that does not work stops only the commands that render.
+    """Make sure, before MuJoCo is imported, that an unusable MUJOCO_GL stops only commands that render.
 
     Args:
-        strict: the command renders, so that it must stop.
+        strict: whether the command renders, so that it must stop.
 
     Raises:
         ConfigurationError: ``strict``, and no renderer works.
@@ -36,7 +36,7 @@ def prepare_gl(strict: bool) -> None:
             raise
         if not switched_off():
             note(f"{error}; going on without it")
-        os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with another, MuJoCo itself could not be imported
+        os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with the unusable value, MuJoCo could not be imported
 
 
 class Told(NamedTuple):
@@ -44,15 +44,15 @@ class Told(NamedTuple):
 
     progress: Progress
     line: Callable[[str], None]
-    """Says one line, above the bars where there are any."""
+    """Prints one line, above the bars if there are any."""
 
 
 @contextmanager
 def progress_bars(*, ends: bool = True) -> Iterator[Told]:
-    """A bar per stage, with rate and time left, on a terminal; elsewhere lines.
+    """Show a bar per stage, with rate and time left; without a terminal, print lines instead.
 
     Args:
-        ends: whether a line says that a stage has ended, where there is no terminal.
+        ends: whether to print a line at the end of a stage if there is no terminal.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -76,7 +76,7 @@ def progress_bars(*, ends: bool = True) -> Iterator[Told]:
             if what not in tasks:
                 tasks[what] = bars.add_task(
                     display_key(what), total=total, completed=int(done), rate=""
-                )  # what was done before has no rate
+                )  # earlier work does not count for the rate
             task = bars.tasks[tasks[what]]
             rate = f"{task.finished_speed or task.speed or 0.0:.3g} /s"
             bars.update(tasks[what], completed=done, total=total, rate=rate)
@@ -85,11 +85,11 @@ def progress_bars(*, ends: bool = True) -> Iterator[Told]:
 
 
 def seldom(every: float = SELDOM, *, ends: bool = True) -> Progress:
-    """A line when a stage has ended, and on the stage that is told of, with its rate and the time left, now and then.
+    """Progress callback that prints a line when a stage ends and, now and then, one with the rate and the time left of a stage.
 
     Args:
-        every: least time between two lines on stages that have not ended [s].
-        ends: whether ends are told.
+        every: least time between two lines on running stages [s].
+        ends: whether to print a line when a stage ends.
     """
     began: dict[str, tuple[float, float]] = {}
     ended: set[str] = set()
@@ -117,7 +117,7 @@ def seldom(every: float = SELDOM, *, ends: bool = True) -> Progress:
 
 
 def progress_lines(before: str = "") -> Progress:
-    """A line for everything that is told, also where there is no terminal."""
+    """Progress callback that prints a line per call, also if there is no terminal; ``before`` is its prefix."""
 
     def tell(what: str, done: float, total: float) -> None:
         print(f"{before}{what}", file=sys.stderr, flush=True)
@@ -126,7 +126,7 @@ def progress_lines(before: str = "") -> Progress:
 
 
 def result_line(result: Any, ended: int, total: int) -> str:
-    """One method of ``total`` that has ended (:class:`~marlbc_mj.results.summary.Result`), in one line."""
+    """One line on a result (:class:`~marlbc_mj.results.summary.Result`), the ``ended``-th of ``total``."""
     from marlbc_mj.report.formats import score_cell
     from marlbc_mj.results.scores import switches_text
 
@@ -138,7 +138,7 @@ def result_line(result: Any, ended: int, total: int) -> str:
 
 
 def print_results(results: list[Any]) -> None:
-    """Supervisors, then controllers (:class:`~marlbc_mj.results.summary.Result`), one line each, and why a method failed."""
+    """Print results (:class:`~marlbc_mj.results.summary.Result`) in tables of supervisors and controllers, then the failures."""
     from marlbc_mj.report.method_groups import method_groups
 
     for group in method_groups(results, lambda result: (result.supervisor, result.controller)):
@@ -149,7 +149,7 @@ def print_results(results: list[Any]) -> None:
 
 
 def _print_group(group: Any) -> None:
-    """A table of methods that differ in one part (:class:`~marlbc_mj.report.method_groups.MethodGroup`)."""
+    """Print a table of methods that differ in one part (:class:`~marlbc_mj.report.method_groups.MethodGroup`)."""
     from rich.console import Console
     from rich.table import Column, Table
     from rich.text import Text
@@ -161,7 +161,7 @@ def _print_group(group: Any) -> None:
     columns = [score_column(name) for name in shown]
     heads = [f"{column.group}\n{column.second}" for column in columns]
     heads.insert(1, "switches\neach agent")
-    first_head = Text(f"{group.kind}\n{group.words}")  # Text: [m] is no markup
+    first_head = Text(f"{group.kind}\n{group.words}")  # Text, since a string with [m] would be read as markup
     table = Table(*(Column(head, no_wrap=True) for head in (first_head, *map(Text, heads))))
     for name, result in group.rows:
         if result.metrics is None:
@@ -175,7 +175,7 @@ def _print_group(group: Any) -> None:
 
 @contextmanager
 def training_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
-    """Progress of a training run: mission steps, rate, time left and the last evaluation; elsewhere a line per evaluation."""
+    """Show a training run: a line per evaluation and, on a terminal, a bar with rate, time left and the last evaluation."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
@@ -211,7 +211,7 @@ def no_display(trainer: Any, row: dict[str, float]) -> None:
 
 @contextmanager
 def general_display() -> Iterator[Callable[[Any, dict[str, float]], None]]:
-    """A line per evaluation of a run of the general policy: success rate and median return of each family."""
+    """Print a line per evaluation of a run of the general policy: success rate and median return of each family."""
     seen = -1.0
 
     def update(trainer: Any, row: dict[str, float]) -> None:

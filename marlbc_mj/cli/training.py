@@ -1,4 +1,4 @@
-"""``marlbc train``: train a mission supervisor, or resume a training."""
+"""``marlbc train``: train a mission supervisor, or resume a training run."""
 
 import sys
 from dataclasses import dataclass, field, fields
@@ -20,32 +20,32 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TrainCommand:
-    """Learn a mission supervisor from scratch, with checkpoints, curves and evaluations on the case study."""
+    """Train a mission supervisor from scratch, with checkpoints, learning curves and evaluations."""
 
     method: Positional[MethodName] = "marlms"
     """Training method."""
     preset: PresetName = "fast"
-    """Hyper-parameters; those of paper are published."""
+    """Preset of hyper-parameters; paper has the published ones."""
     seed: int = 0
     """Random seed of networks, exploration and starts."""
     out: SomePath = None
     """Folder of the run; runs/METHOD-PRESET-SEED by default."""
     resume: SomePath = None
-    """Folder of an interrupted run, which continues bit for bit with its own settings."""
+    """Folder of an interrupted run to resume with its own settings; results equal those of an uninterrupted run."""
     budget: SomeCount = None
-    """Mission steps, over all worlds."""
+    """Number of mission steps to train for, over all worlds."""
     threads: SomeCount = None
-    """Threads of simulation and networks."""
+    """Number of threads for simulation and networks."""
     device: SomeDevice = None
-    """Device of the networks."""
+    """Device for the networks."""
     set: TrainingSettings = ()
-    """Any other setting of the preset: gamma=0.98 copies=1 shaping.margin=0.1."""
+    """Any other settings, for example: gamma=0.98 copies=1 shaping.margin=0.1."""
     overwrite: bool = False
     """Write into a folder that is not empty."""
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Train with a progress display; an interrupted run says how to continue it."""
+        """Train with a progress display; if interrupted, print how to resume the run."""
         if self.resume is not None:
             self.refuse_others()
             saved_run(self.resume)
@@ -76,7 +76,7 @@ class TrainCommand:
         self.output.say(f"{folder / 'checkpoint'} holds the best and the last policy")
 
     def run_general(self) -> None:
-        """Train the policy for every team; an interrupted run says how to continue it."""
+        """Train the general policy; if interrupted, print how to resume the run."""
         from marlbc_mj.cli.terminal import general_display
         from marlbc_mj.training.general.run import judged_rank, resume_general, train_general
         from marlbc_mj.training.run import Interrupted
@@ -110,15 +110,15 @@ class TrainCommand:
         return with_settings(GeneralConfig(seed=self.seed, **self.given()), self.set)
 
     def given(self) -> dict[str, Any]:
-        """Settings that have an option of their own, where it was given."""
+        """The settings with an option of their own, if that option was given."""
         options = {"budget": self.budget, "threads": self.threads, "device": self.device}
         return {name: value for name, value in options.items() if value is not None}
 
     def refuse_others(self) -> None:
-        """A resumed run has its own settings.
+        """Refuse other options with --resume, since a resumed run has its own settings.
 
         Raises:
-            ConfigurationError: anything else was given with --resume.
+            ConfigurationError: another option was given with --resume.
         """
         settings = [f for f in fields(self) if f.name not in ("resume", "output")]
         given = [f.name for f in settings if getattr(self, f.name) != f.default]
@@ -141,6 +141,6 @@ class TrainCommand:
 
 
 def say_how_to_go_on(folder: Path, ended: "Interrupted") -> NoReturn:
-    """Leave with the status of the signal that interrupted a run."""
+    """Print how to resume an interrupted run, and exit with the status of the signal."""
     print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
     sys.exit(128 + ended.signal)

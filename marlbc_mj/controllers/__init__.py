@@ -31,7 +31,7 @@ CONTROLLERS: dict[str, tuple[Callable[[], Controller], str]] = {
     "sorlc-off": (partial(SORLC, basis="off"), "SORLC without networks: saturated PD and compensator (30)"),
     "pd": (PD, "saturated PD with gains 100 and 100"),
 }
-"""Factory and one line of description by name."""
+"""Factory and one-line description of each controller, by name."""
 
 for _name, (_law, _line) in _UNLIMITED.items():
     CONTROLLERS[_name] = (_law, _line)
@@ -43,10 +43,10 @@ CONTROLLER_PARTS = ("law", "limited", "linear_gains", "params", "initial_state")
 
 
 def require_controller(found: object, name: str = "controller") -> Controller:
-    """The object itself.
+    """Return ``found`` if it is a controller.
 
     Raises:
-        ConfigurationError: it lacks a part of a controller, or its law cannot be called.
+        ConfigurationError: it is a class, lacks an attribute of a controller, or has a law that cannot be called.
     """
     if isinstance(found, type):
         raise ConfigurationError(f"{name} is the class {found.__name__}; make one of it: {found.__name__}()")
@@ -60,10 +60,10 @@ def require_controller(found: object, name: str = "controller") -> Controller:
 
 
 def make_controller(name: str) -> Controller:
-    """A controller with its default gains, by name, or ``file.py:Name`` of a user's Python file.
+    """Make a controller with its default gains from its name, or from ``file.py:Name`` for a user's Python file.
 
     Raises:
-        ConfigurationError: unknown name, or a file that gives no controller.
+        ConfigurationError: unknown name, or the file does not define a controller of this name.
     """
     if names_attribute(name):
         return require_controller(made(name, Controller), name)

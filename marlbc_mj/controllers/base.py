@@ -1,4 +1,4 @@
-"""The interface of controllers, and the checks that all of them share."""
+"""The interface of controllers, and the checks that they share."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -13,9 +13,9 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 class Controller(Protocol):
     """A force law with its gains. Implementations are frozen dataclasses; the law itself holds no state.
 
-    ``limited`` says whether the actuator keeps the scenario's force limit: an unlimited law is the paper's reading of its
-    rivals, and gets actuators without a range. A law with decaying states of its own may offer ``decay_rates``, in 1/s, which
-    are then checked against the substep too.
+    ``limited`` states whether the actuators enforce the scenario's force limit. The paper reads its baselines as unlimited
+    laws; their actuators have no range. A law with decaying internal states may define ``decay_rates`` [1/s], which are then
+    also checked against the substep.
     """
 
     @property
@@ -28,11 +28,11 @@ class Controller(Protocol):
         ...
 
     def params(self, agent: int, limit: float) -> laws.Numbers:
-        """The law's gains by name; ``limit`` [N] is the actuator's, infinite when unlimited. See :func:`laws.gains_of`."""
+        """The law's gains by name; ``limit`` [N] is the force limit, infinite if there is none. See :func:`laws.gains_of`."""
         ...
 
     def initial_state(self, agent: int) -> laws.Numbers:
-        """The law's state at t = 0 by name, weights for example; what is left out starts at 0."""
+        """Initial values of the law's state by name, for example weights; omitted entries start at 0."""
         ...
 
 
@@ -48,17 +48,17 @@ def require_gains(owner: object, names: Sequence[str], allow_zero: bool = False)
 def largest_stable_substep(position_gain: float, velocity_gain: float) -> float:
     """Largest h [s] for which v += h(-k_p e - k_v v), p += h v is stable: 2 h k_v + h^2 k_p < 4 (Jury's test).
 
-    For the paper's 100 and 100 it is 19.8 ms, so a control law held over a mission step of 50 ms would diverge.
+    For the paper's gains of 100 and 100 it is 19.8 ms, so a control law held for a mission step of 50 ms would diverge.
     """
-    inverse = 0.25 * (velocity_gain + np.sqrt(velocity_gain**2 + 4.0 * position_gain))  # the root that does not cancel
+    inverse = 0.25 * (velocity_gain + np.sqrt(velocity_gain**2 + 4.0 * position_gain))  # form without cancellation
     return float(1.0 / inverse) if inverse > 0.0 else np.inf
 
 
 def model_weight(model: str) -> float:
-    """1 for a law that is given the true f, 0 for one that is given nothing.
+    """Weight of the drag in a law: 1 if the law receives the true f (``exact``), 0 if it receives none (``none``).
 
     Raises:
-        ConfigurationError: another word.
+        ConfigurationError: unknown ``model``.
     """
     weights = {"exact": 1.0, "none": 0.0}
     if model not in weights:

@@ -1,9 +1,9 @@
-"""Finite-time and fixed-time rivals (Huang et al. 2019; Zhou et al. 2022), reconstructed: sums of powers of the errors.
+"""Finite-time and fixed-time baselines (Huang et al. 2019; Zhou et al. 2022), reconstructed as sums of powers of the errors.
 
-sig(x)^a = sign(x) |x|^a and phi_a(x) = sign(x) min(|x|, 1)^a, axis by axis. Their velocity gains are calibrated: at a switch
-between FM and FR v_r jumps by Lambda |dy| = 48 or 96 m/s, and Table 6's maxima are 8 times (finite-time) and 20 times
-(fixed-time) that, but for one agent's under fixed-time; ``marlbc calibrate`` repeats it. Totals are not fitted, and no
-convergence theorem is claimed. f^ is the true f by default, which is generous to them.
+sig(x)^a = sign(x) |x|^a and phi_a(x) = sign(x) min(|x|, 1)^a, per axis. The velocity gains are calibrated: at a switch between
+FM and FR, v_r jumps by Lambda |dy| = 48 or 96 m/s, and the maxima in Table 6 are 8 times (finite-time) and 20 times
+(fixed-time) this jump, except for one agent under fixed-time. ``marlbc calibrate`` repeats the calibration. The published
+totals are not fitted, and no convergence theorem is claimed. By default f^ is the true f, which favors these baselines.
 """
 
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from marlbc_mj.controllers.base import model_weight, require_gains
 from marlbc_mj.core import laws
 
 _GAINS = (
-    "model_weight",  # of f^
+    "model_weight",  # weight of f^
     "velocity_gain",  # a
     "position_gain",  # b
     "position_power",  # q, below 1
@@ -42,7 +42,7 @@ def phi(x, power):
 
 @laws.controller(gains=_GAINS)
 def homogeneous(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """u = -f^ - a e_v - b sig(e_p)^q - phi_s(e_v) - c sig(e_p)^r - d sig(e_v)^t, then the limit; no state."""
+    """u = -f^ - a e_v - b sig(e_p)^q - phi_s(e_v) - c sig(e_p)^r - d sig(e_v)^t, clipped to the limit; stateless."""
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
         wish = -gains.model_weight * drag[axis] - gains.velocity_gain * e_v
@@ -57,7 +57,7 @@ def homogeneous(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class _Homogeneous:
-    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    model: Literal["exact", "none"] = "exact"  # f^: the true drag f, or zero
     limited: bool = False
     law = staticmethod(homogeneous)
 
@@ -67,7 +67,7 @@ class _Homogeneous:
 
     @property
     def linear_gains(self) -> None:
-        """Unbounded near zero: powers below 1 have no largest gain."""
+        """None: the gain of a power below 1 is unbounded near zero."""
         return
 
     def initial_state(self, agent: int) -> laws.Numbers:

@@ -1,4 +1,4 @@
-"""Saturated PD: SORLC without its networks; the baseline of every comparison."""
+"""Saturated PD: SORLC without networks and compensator; the baseline of every comparison."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from marlbc_mj.core import laws
 
 @dataclass(frozen=True)
 class PD:
-    """Proportional-derivative law with the gains of Table 2: state feedback that is told nothing of the drag."""
+    """Proportional-derivative law with the gains of Table 2: state feedback without a drag model."""
 
     position_gain: float = 100.0  # k_p [1/s^2]
     velocity_gain: float = 100.0  # k_v [1/s]

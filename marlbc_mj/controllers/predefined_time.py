@@ -2,13 +2,14 @@
 and J. D. Sanchez-Torres et al., IMA Journal of Mathematical Control and Information 35, i1-i29, 2018.
 
 x' = -Phi(x; m, T), Phi = exp(|x|^m) sig(x)^(1 - m) / (m T), 0 < m <= 1, reaches zero within T from anywhere: its settling time
-T (1 - exp(-|x(0)|^m)) is bounded by T. For a second-order system two are nested: the velocity error is to follow
+T (1 - exp(-|x(0)|^m)) is bounded by T. For a second-order system two such terms are nested: the velocity error should follow
 -Phi(e_p; m, T_p), so sigma = e_v + Phi(e_p; m, T_p), and u = -f^ - Phi(sigma; m, T_s).
 
-Three departures keep it finite at the 96 m/s by which v_r jumps when an order switches, where exp(|x|^m) would not be: errors
-are measured in units of ``position_scale`` and ``velocity_scale``; the exponent stops at ``exponent_limit``; and below
-``layer`` (in those units) Phi goes on linearly, since sig(x)^(1 - m) has no largest gain near zero. The derivative of the inner
-term, singular at zero, is left out. So the bound T is the source's only between the two limits, and no theorem is claimed here.
+Three departures from the source keep force and gain bounded. When an order switches, v_r jumps by up to 96 m/s, and exp(|x|^m)
+would become huge: so errors are measured in units of ``position_scale`` and ``velocity_scale``, and the exponent is limited to
+``exponent_limit``. Near zero the gain of sig(x)^(1 - m) is unbounded: so Phi is linear below ``layer`` (in the same units). The
+derivative of the inner term, which is singular at zero, is omitted. The source's bound T therefore applies only between the
+layer and the exponent limit, and no theorem is claimed here.
 """
 
 from dataclasses import dataclass
@@ -23,7 +24,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 @laws.allocation_free
 def predefined(x, power, time, exponent_limit, layer):
-    """Phi(x) = exp(min(|x|^m, limit)) sig(x)^(1 - m) / (m T), linear through zero for |x| below the layer."""
+    """Phi(x) = exp(min(|x|^m, limit)) sig(x)^(1 - m) / (m T), but linear for |x| below the layer."""
     size = abs(x) if abs(x) > layer else layer
     exponent = size**power
     if exponent > exponent_limit:
@@ -45,7 +46,7 @@ def predefined(x, power, time, exponent_limit, layer):
     )
 )
 def predefined_time(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """u = -w f - b Phi(sigma / b; m, T_s), sigma = e_v + a Phi(e_p / a; m, T_p), then the limit; no state."""
+    """u = -w f - b Phi(sigma / b; m, T_s), sigma = e_v + a Phi(e_p / a; m, T_p), clipped to the limit; stateless."""
     power, top, layer = gains.power, gains.exponent_limit, gains.layer
     a, b = gains.position_scale, gains.velocity_scale
     for axis in range(2):
@@ -62,11 +63,11 @@ class PredefinedTime:
     position_time: float = 2.0  # T_p [s]
     velocity_time: float = 0.5  # T_s [s]
     power: float = 0.3  # m of both terms
-    position_scale: float = 12.0  # a [m]: the longest way between two slots
+    position_scale: float = 12.0  # a [m]: the greatest distance between two slots
     velocity_scale: float = 96.0  # b [m/s]: the largest jump of v_r
     exponent_limit: float = 1.5  # beyond it Phi grows as sig(x)^(1 - m)
     layer: float = 1e-3  # relative error below which Phi is linear
-    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    model: Literal["exact", "none"] = "exact"  # f^: the true drag f, or zero
     limited: bool = False
     law = staticmethod(predefined_time)
 
@@ -79,12 +80,12 @@ class PredefinedTime:
 
     @property
     def linear_gains(self) -> tuple[float, float]:
-        """Slopes of the outer term and of both, nested, in the linear layer, where they are largest."""
+        """Upper bounds: slope of the nested terms for the position, slope of the outer term for the velocity."""
         outer, inner = self._slope(self.velocity_time), self._slope(self.position_time)
         return outer * inner, outer
 
     def _slope(self, time: float) -> float:
-        """Largest of Phi(x) / x: exp(x^m) / (m T x^m) falls until x^m = 1, and the exponent's limit bounds what follows."""
+        """Maximum of Phi(x) / x: exp(x^m) / (m T x^m) falls until x^m = 1, then rises until the exponent limit."""
         at = self.layer**self.power
         end = max(self.exponent_limit, at)
         return float(max(np.exp(min(at, end)) / at, np.exp(end) / end) / (self.power * time))

@@ -1,8 +1,8 @@
 """RLC, the single-agent reinforcement learning controller that SORLC is compared with (Zhang et al. 2022), reconstructed.
 
-u = -xi_p e_p - f^ - omega_a^T Psi_V / 2 - c e_v: SORLC's law without compensator and limit, and with next to no damping.
-The cited law has no velocity error at all, which leaves the loop undamped; c = 2.35 is what reproduces the published 3.4 s
-that its velocity error takes to converge. No convergence theorem is claimed.
+u = -xi_p e_p - f^ - omega_a^T Psi_V / 2 - c e_v: SORLC's law without compensator and limit, and with almost no damping.
+The cited law has no velocity error term, which leaves the loop undamped; c = 2.35 reproduces the published 3.4 s in which the
+velocity error converges. No convergence theorem is claimed.
 """
 
 from dataclasses import dataclass, field
@@ -14,9 +14,9 @@ from marlbc_mj.core import laws
 
 @dataclass(frozen=True)
 class RLC:
-    """Identifier, actor and critic as in SORLC with the basis ``published``.
+    """RLC with the identifier, actor and critic of SORLC with the basis ``published``.
 
-    Source: ``position_gain`` and the networks from Table 2; ``damping`` fitted to the published time of convergence.
+    Source: ``position_gain`` and the networks from Table 2; ``damping`` is fitted to the published convergence time.
     """
 
     position_gain: float = 100.0  # xi_p [1/s^2]

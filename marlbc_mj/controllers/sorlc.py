@@ -1,8 +1,8 @@
 """SORLC, the second-order reinforcement learning controller: equations (30) and (36)-(41), errata 1, 2, 13 and 14.
 
 Identifier, critic and actor are linear in 12 Gaussians whose centres lie on the diagonal, c_k = (c_k, ..., c_k). Then
-|z - c_k|^2 = |z|^2 - 2 c_k sum(z) + n c_k^2, and neighbours differ by a factor that is itself geometric in k: two
-exponentials give all twelve values, equal to the textbook form to 1e-13.
+|z - c_k|^2 = |z|^2 - 2 c_k sum(z) + n c_k^2, and the ratio of neighbouring values is itself geometric in k. So two
+exponentials give all twelve values, which agree with the textbook form to 1e-13.
 """
 
 from dataclasses import dataclass
@@ -25,34 +25,34 @@ GAINS = laws.Names.of(
         "critic_rate",  # gamma_c [1/s]
         "actor_rate",  # gamma_a [1/s]
         "control_weight",  # beta_V
-        "tau_sign",  # of tau in (40)
+        "tau_sign",  # sign of tau in (40)
         "limit",  # [N]
         "learns",  # 0: no networks
-        "relative",  # 1: the basis gets errors over the scales below instead of p and v
+        "relative",  # 1: the basis receives errors divided by the scales below instead of p and v
         "position_scale",  # [m]
         "velocity_scale",  # [m/s]
         "tau_scale",  # [N]
         "first_centre",
         "centre_distance",
         "precision",  # 1 / width^2
-        "chi_factor",  # of diagonal_gaussians for the 4 numbers of chi
-        "tau_factor",  # and for the 2 of tau
+        "chi_factor",  # ``factor`` of diagonal_gaussians for the 4 components of chi
+        "tau_factor",  # the same for the 2 components of tau
     )
 )
 STATE = laws.Names.of(
     {
-        "w_f": (2, NEURONS),  # omega_f [N] of each axis, but for ``scale``
+        "w_f": (2, NEURONS),  # omega_f / scale [N], per axis
         "w_a": (2, NEURONS),  # omega_a [N]
         "w_c": (2, NEURONS),  # omega_c [N]
         "psi_f": NEURONS,  # Psi_f(chi) of this substep
         "psi_v": NEURONS,  # Psi_V(chi, tau)
-        "scale": (),  # omega_f = scale * w_f: a leak of all weights at once is one multiplication
-        "tau": 2,  # compensator [N] of each axis
+        "scale": (),  # omega_f = scale * w_f, so that leaking all weights takes one multiplication
+        "tau": 2,  # compensator [N], per axis
     }
 )
 
 BASES = ("published", "scaled", "off")
-NEGLIGIBLE = 45.0  # exp(-45) = 3e-20 is taken as zero
+NEGLIGIBLE = 45.0  # exp(-45) = 3e-20 counts as zero
 
 
 class Weights(NamedTuple):
@@ -66,14 +66,14 @@ class Weights(NamedTuple):
 
 @laws.controller(gains=GAINS, state=STATE)
 def sorlc(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """One substep of SORLC: force (40) from the current weights, then weights and tau by explicit Euler."""
+    """One substep of SORLC: force (40) from the current weights, then explicit Euler updates of weights and tau."""
     learning = gains.learns != 0.0 and fill_basis(gains, state, p, v, p_r, v_r)
     xi_p, xi_v, xi_tau = gains.position_error_gain, gains.velocity_error_gain, gains.compensator_gain
     gamma_f, gamma_c, gamma_a = gains.identifier_rate, gains.critic_rate, gains.actor_rate
     half, sign = 0.5 / gains.control_weight, gains.tau_sign
     leak = 1.0 - h * gamma_f * gains.identifier_leak
     if gains.learns != 0.0 and not learning:
-        state.scale *= leak  # (37) with Psi_f = 0 only leaks
+        state.scale *= leak  # with Psi_f = 0, only the leak of (37) is left
     elif state.scale != 1.0:
         unscale(state)
     psi_f, psi_v, tau = state.psi_f, state.psi_v, state.tau
@@ -106,7 +106,7 @@ def dot(weights, psi):
 
 @laws.inlined
 def unscale(state):
-    """Multiply the stored identifier weights by their scale, so that they are omega_f themselves."""
+    """Multiply the stored identifier weights by their scale, so that they equal omega_f."""
     for axis in range(2):
         for k in range(NEURONS):
             state.w_f[axis, k] *= state.scale
@@ -115,7 +115,7 @@ def unscale(state):
 
 @laws.inlined
 def fill_basis(gains, state, p, v, p_r, v_r):
-    """Fill Psi_f(chi) and Psi_V(chi, tau) in the state; False, and nothing filled, where both vanish."""
+    """Write Psi_f(chi) and Psi_V(chi, tau) into the state; if both vanish, write nothing and return False."""
     if gains.relative != 0.0:
         z0, z1 = (p[0] - p_r[0]) / gains.position_scale, (p[1] - p_r[1]) / gains.position_scale
         z2, z3 = (v[0] - v_r[0]) / gains.velocity_scale, (v[1] - v_r[1]) / gains.velocity_scale
@@ -126,7 +126,7 @@ def fill_basis(gains, state, p, v, p_r, v_r):
         return False
     t0, t1 = state.tau[0] / gains.tau_scale, state.tau[1] / gains.tau_scale
     tau_felt = diagonal_gaussians(gains, t0 * t0 + t1 * t1, t0 + t1, 2.0, gains.tau_factor, state.psi_v)
-    for k in range(NEURONS):  # a Gaussian of (chi, tau) is the product of one of chi and one of tau
+    for k in range(NEURONS):  # a Gaussian of (chi, tau) is a Gaussian of chi times one of tau
         state.psi_v[k] = (state.psi_v[k] if tau_felt else 0.0) * state.psi_f[k]
     return True
 
@@ -135,8 +135,8 @@ def fill_basis(gains, state, p, v, p_r, v_r):
 def diagonal_gaussians(gains, square, total, n, factor, psi):
     """exp(-precision |z - c_k 1|^2) for the centres c_k on the diagonal, from |z|^2, sum(z) and the dimension n of z.
 
-    ``factor`` = exp(-2 n distance^2 precision), by which the ratio of neighbours falls. Written to ``psi`` (12,); returns False
-    and leaves it alone where every value is below 3e-20, which no force can feel.
+    The ratio of neighbouring values falls by ``factor`` = exp(-2 n distance^2 precision) from one to the next. Values are written
+    to ``psi`` (12,). If all are below 3e-20, too small to affect a force, nothing is written and the result is False.
     """
     first, step, precision = gains.first_centre, gains.centre_distance, gains.precision
     last = first + (NEURONS - 1) * step
@@ -161,12 +161,12 @@ def weights(state: np.ndarray) -> Weights:
 
 @dataclass(frozen=True)
 class SORLC:
-    """Gains of Table 2, and the readings of the basis.
+    """SORLC with the gains of Table 2, and a choice of basis.
 
-    ``published`` follows the paper: positions leave [-6, 6] within 10 s, the basis vanishes and SORLC is a saturated PD law.
-    ``scaled`` feeds the basis the tracking errors over ``position_scale`` and ``velocity_scale`` instead, so the identifier
-    sees signals inside its range along the whole run; ``off`` has no networks. With the published Gamma_f and nu_f the leak
-    holds the identifier below a fifth of the PD terms, so ``scaled`` has its own: see :meth:`scaled`.
+    ``published`` follows the paper: once positions leave [-6, 6], within 10 s, the basis vanishes and SORLC is a saturated PD
+    law with compensator. ``scaled`` feeds the basis the tracking errors divided by ``position_scale`` and ``velocity_scale``
+    instead, so its inputs stay within its range for the whole run. ``off`` has no networks. With the published Gamma_f and
+    nu_f, the leak keeps the identifier below a fifth of the PD terms; :meth:`scaled` therefore sets other values.
     """
 
     basis: Literal["published", "scaled", "off"] = "published"
@@ -178,10 +178,10 @@ class SORLC:
     critic_rate: float = 4.0  # gamma_c
     actor_rate: float = 6.0  # gamma_a
     control_weight: float = 1.0  # beta_V
-    tau_sign: Literal[-1, 1] = -1  # sign of tau in (40); +1 is the reading of erratum 2
-    identifier_weights: tuple[float, ...] = (1.0, 0.98, 0.96, 0.94)  # constant fill of omega_f(0), one per agent
-    actor_weights: tuple[float, ...] = (0.5, 0.48, 0.46, 0.44)
-    critic_weights: tuple[float, ...] = (1.0, 0.96, 0.92, 0.88)
+    tau_sign: Literal[-1, 1] = -1  # sign of tau in (40); -1 as published, +1 corrects erratum 2
+    identifier_weights: tuple[float, ...] = (1.0, 0.98, 0.96, 0.94)  # initial value of every entry of omega_f, one per agent
+    actor_weights: tuple[float, ...] = (0.5, 0.48, 0.46, 0.44)  # the same for omega_a
+    critic_weights: tuple[float, ...] = (1.0, 0.96, 0.92, 0.88)  # the same for omega_c
     centre_range: float = 6.0  # centres evenly spaced on [-6, 6]
     width: float = 2.0
     position_scale: float = 1.0  # [m], scaled basis only
@@ -214,7 +214,7 @@ class SORLC:
                 raise ConfigurationError(f"SORLC.{name} must be finite numbers, at least one, got {fills}")
 
     def _require_theorem_1(self) -> None:
-        """Gain conditions (42), without the one on xi_e, which the paper does not define (erratum 14)."""
+        """Check the gain conditions (42), except the one on xi_e, which the paper does not define (erratum 14)."""
         conditions = {
             "xi_p > 2": self.position_error_gain > 2,
             "xi_v > 3": self.velocity_error_gain > 3,
@@ -229,10 +229,10 @@ class SORLC:
 
     @classmethod
     def scaled(cls, **changes: Any) -> "SORLC":
-        """The scaled basis with learning gains of its own, chosen from the sweep that ``marlbc ablation`` prints.
+        """SORLC with the scaled basis and its own learning gains, chosen from the sweep that ``marlbc ablation`` prints.
 
-        Gamma_f Psi^T Psi / 100 is the identifier's bandwidth: 1000 and width 6 make it about 90 rad/s, a factor 8 below
-        where a substep of 5 ms starts to oscillate.
+        The identifier's bandwidth is Gamma_f Psi^T Psi / 100. A rate of 1000 and a width of 6 make it about 90 rad/s, a factor
+        of 8 below the bandwidth at which the loop starts to oscillate with a substep of 5 ms.
         """
         return cls(**{"basis": "scaled", "identifier_rate": 1000.0, "identifier_leak": 1e-3, "width": 6.0, **changes})
 
@@ -242,7 +242,7 @@ class SORLC:
 
     @property
     def decay_rates(self) -> tuple[float, ...]:
-        """Decay rates of the compensator (30) and of the identifier's leak (37) [1/s]."""
+        """Decay rates of the compensator (30) and of the identifier through its leak (37) [1/s]."""
         return self.compensator_gain, self.identifier_rate * self.identifier_leak
 
     def params(self, agent: int, limit: float) -> dict[str, Any]:

@@ -1,11 +1,11 @@
 """Non-singular terminal sliding-mode control: Y. Feng, X. Yu, Z. Man, Automatica 38(12), 2159-2167, 2002, equations (8), (9).
 
 Axis by axis s = e_p + (1/beta) sig(e_v)^gamma with 1 < gamma = p/q < 2, and u = -f^ - (beta/gamma) sig(e_v)^(2 - gamma)
-- k sat(s/phi): on s = 0 the error reaches zero in finite time, and no power of the law is negative, so it has no singularity. The
-sign function of the original is a saturation with boundary layer phi, as usual, since it would chatter in sampled time.
+- k sat(s/phi). On s = 0 the error reaches zero in finite time. No exponent in the law is negative, so it has no singularity. As
+usual, a saturation with boundary layer phi replaces the sign function of the original, which would chatter in sampled time.
 
-As gamma > 1, s is blind to small velocity errors: inside the layer the damping is (beta/gamma) |e_v|^(1 - gamma) alone, which
-grows without bound near zero, so a sampled loop ends in a small limit cycle instead of exactly at zero.
+Since gamma > 1, s hardly depends on small velocity errors: inside the layer the only damping is (beta/gamma) |e_v|^(1 - gamma),
+which grows without bound near zero, so a sampled loop ends in a small limit cycle instead of at zero.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 @laws.controller(gains=("model_weight", "surface_gain", "power", "reaching_gain", "boundary_layer", "limit"))
 def terminal_sliding(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """u = -w f - (beta/gamma) sig(e_v)^(2 - gamma) - k sat(s/phi), s = e_p + sig(e_v)^gamma / beta, then the limit; no state."""
+    """u = -w f - (beta/gamma) sig(e_v)^(2 - gamma) - k sat(s/phi), s = e_p + sig(e_v)^gamma / beta, clipped; stateless."""
     beta, gamma, k, phi = gains.surface_gain, gains.power, gains.reaching_gain, gains.boundary_layer
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
@@ -30,13 +30,13 @@ def terminal_sliding(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class TerminalSliding:
-    """The textbook law with a boundary layer; gains chosen on the case study, not taken from a source."""
+    """The textbook law with a boundary layer. The gains are chosen on the case study, not taken from a source."""
 
     surface_gain: float = 4.0  # beta
     power: float = 1.25  # gamma = p/q
     reaching_gain: float = 150.0  # k [N]
     boundary_layer: float = 1.0  # phi [m]
-    model: Literal["exact", "none"] = "exact"  # f^: the true f, or nothing
+    model: Literal["exact", "none"] = "exact"  # f^: the true drag f, or zero
     limited: bool = False
     law = staticmethod(terminal_sliding)
 
@@ -48,7 +48,7 @@ class TerminalSliding:
 
     @property
     def linear_gains(self) -> None:
-        """Unbounded near zero: powers below 1 have no largest gain."""
+        """None: the gain of a power below 1 is unbounded near zero."""
         return
 
     def params(self, agent: int, limit: float) -> laws.Numbers:

@@ -1,5 +1,5 @@
-"""The laws of the mission (behaviors, composition, orders, disturbances) and how a law is compiled."""
+"""The laws of the mission (behaviors, composition, orders, disturbances) and their compilation."""
 
 import lazy_loader
 
-__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, {"laws"})  # marlbc_mj.laws is looked up here
+__getattr__, __dir__, __all__ = lazy_loader.attach(__name__, {"laws"})  # for marlbc_mj.laws

@@ -1,8 +1,8 @@
 """Elementary behaviors: obstacle avoidance (9), formation maintenance (10), formation reconstruction (11), agent avoidance.
 
 Each is closed-loop inverse kinematics (8): v = J^+ (rho_d' + Lambda rho~). The desired centroid path enters as feed-forward
-(erratum 3: p_c cancels in the error, so the feed-forward is the velocity of p_cd). Avoidance of other agents, AA, is the
-project's: the paper has none, so its agents are free to collide.
+(erratum 3: p_c cancels in the error, so the feed-forward is the velocity of p_cd). Agent avoidance, AA, is defined by this
+project: the paper has no such behavior, so its agents may collide.
 """
 
 from dataclasses import dataclass
@@ -14,19 +14,20 @@ from marlbc_mj.core import laws
 from marlbc_mj.util.errors import ConfigurationError
 
 EVERYTHING, NEAREST_OBSTACLE, NEAREST_NEIGHBOR = 0, 1, 2
-"""The part of the surroundings that a behavior's law needs: all obstacles and agents, or only the nearest of one kind. Of large
-teams, a law that says so
-(by an attribute ``sees``) is handed that one alone, found in a grid; what it computes is the same."""
+"""The part of the surroundings that a behavior's law needs: all obstacles and agents, or only the nearest of one kind.
+
+A behavior declares it in the attribute ``sees``. In large teams its law then receives only the nearest one, found in a grid. The
+result is the same."""
 
 
 @laws.allocation_free
 def nearest_obstacle(p: np.ndarray, obstacles: np.ndarray, normal: np.ndarray) -> float:
-    """Clearance d = min_k (|p - o_k| - radius_k) [m], negative inside (erratum 7), and the outward unit normal.
+    """Return the clearance d = min_k (|p - o_k| - radius_k) [m], negative inside (erratum 7); write the outward unit normal.
 
     Args:
         p: (2,) [m].
         obstacles: (K, 3 or more), rows x, y, radius [m]; K = 0 gives an infinite clearance and a zero normal.
-        normal: (2,), written in place; (1, 0) at the very centre of an obstacle, where no direction is defined.
+        normal: (2,), written in place; (1, 0) at the exact center of an obstacle, where no direction is defined.
     """
     clearance: float = _nearest(p, obstacles, normal)[0]
     return clearance
@@ -34,7 +35,7 @@ def nearest_obstacle(p: np.ndarray, obstacles: np.ndarray, normal: np.ndarray) -
 
 @laws.allocation_free
 def _nearest(p, obstacles, normal):
-    """:func:`nearest_obstacle`, and which one it is (-1: there is none)."""
+    """The clearance of :func:`nearest_obstacle`, and the index of that obstacle, -1 if there is none."""
     clearance, nearest = np.inf, -1
     normal[0] = 0.0
     normal[1] = 0.0
@@ -57,7 +58,7 @@ def _fill_clearances(positions, obstacles, out):
 
 
 def clearances(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-    """:func:`nearest_obstacle`'s clearance [m] at every one of ``positions`` (..., 2) [m], (...,)."""
+    """The clearance (...,) [m] of :func:`nearest_obstacle` at each of the ``positions`` (..., 2) [m]."""
     flat = np.ascontiguousarray(positions, dtype=np.float64).reshape(-1, 2)
     out = np.empty(len(flat))
     _fill_clearances(flat, np.ascontiguousarray(obstacles, dtype=np.float64), out)
@@ -73,7 +74,7 @@ def _fill_clearances_among(positions, obstacles, out):
 
 
 def clearances_among(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
-    """The same at ``positions`` (T, N, 2) [m] among obstacles (T, K, 3 or more) of the same times, (T, N)."""
+    """The clearances (T, N) [m] at ``positions`` (T, N, 2) [m] among obstacles (T, K, 3 or more) at the same T times."""
     out = np.empty(positions.shape[:2])
     arrays = (np.ascontiguousarray(a, dtype=np.float64) for a in (positions, obstacles))
     _fill_clearances_among(*arrays, out)
@@ -84,8 +85,8 @@ def clearances_among(positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray
 def obstacle_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
     """OA (9): v = n Lambda max(0, d_OA - d), J = n^T.
 
-    One-sided by default: the equality task as published attracts agents from beyond d_OA (erratum 6). Where obstacles move,
-    d' = n^T (v - o'), so that n n^T o' is fed forward; ``obstacles`` then is (K, 5), with o' in its last columns.
+    The task is one-sided by default, because the published equality task attracts agents from beyond d_OA (erratum 6). If
+    obstacles move, d' = n^T (v - o'), so n n^T o' is fed forward; ``obstacles`` is then (K, 5), with o' in its last columns.
     """
     clearance, k = _nearest(p, obstacles, jacobian_out[0])
     error = gains.safe_distance - clearance
@@ -104,10 +105,10 @@ def obstacle_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jac
 def agent_avoidance(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
     """AA: v = n (n^T p_cd' + Lambda max(0, d_AA - d)), J = n^T. Defined by this project.
 
-    d = |p - p_j| to the nearest other agent j and n = (p - p_j) / d. The rate d' = n^T (v - p_j') has the neighbor's velocity in
-    it, which an agent does not know; the path's, which the team has in common, stands in for it. One-sided, and more so than OA:
-    from d_AA on it has no row, so that on top it shuts no direction, and an agent that may leave does. Two agents at one place
-    separate along x.
+    d = |p - p_j| is the distance to the nearest other agent j, and n = (p - p_j) / d. The rate d' = n^T (v - p_j') contains the
+    neighbor's velocity, which an agent does not know, so the velocity of the common path replaces it. Unlike OA, the task has no
+    Jacobian row from d_AA on: even at the highest priority it then blocks no direction, and the agent is free to move away. Two
+    agents at the same place separate along x.
     """
     nearest, distance = -1, np.inf
     for other in range(team.shape[0]):
@@ -143,10 +144,10 @@ def formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out
 def line_formation(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
     """FR along the line of its slot: v = p_cd' + Lambda (s e_a + e_c), s = max(0, 1 - (|e_c| / w)^2), J = I.
 
-    e_a and e_c are the parts of the slot's error along the path and across it. So an agent first goes to the line that its slot
-    moves on, and along it only then: beside an opening it does not run into the wall. On the line it is :func:`formation`, and so
-    it is on a path at rest. The two parts are those of line-of-sight guidance (T. I. Fossen, Handbook of Marine Craft
-    Hydrodynamics and Motion Control, 2011, section 10.3); the factor s is the project's.
+    e_a and e_c are the components of the slot error along and across the path. So an agent first goes to the line on which its
+    slot moves, and only then along it: beside an opening it does not run into the wall. On the line, and if the path is at rest,
+    the law equals :func:`formation`. The two components are those of line-of-sight guidance (T. I. Fossen, Handbook of Marine
+    Craft Hydrodynamics and Motion Control, 2011, section 10.3). The factor s is specific to this project.
     """
     speed = np.sqrt(path[1, 0] ** 2 + path[1, 1] ** 2)
     x, y = path[0, 0] + gains.slot[0] - p[0], path[0, 1] + gains.slot[1] - p[1]
@@ -174,7 +175,7 @@ class Behavior(Protocol):
     @property
     def complete(self) -> bool: ...
     def params(self, agent: int) -> laws.Numbers:
-        """The law's gains by name, for this agent."""
+        """The gains of the law by name, for one agent."""
         ...
 
 
@@ -184,7 +185,7 @@ class ObstacleAvoidance:
 
     gain: float = 20.0  # Lambda_OA [1/s]
     safe_distance: float = 2.0  # d_OA [m]
-    two_sided: bool = False  # the published equality task (erratum 6)
+    two_sided: bool = False  # True: the published equality task (erratum 6)
     name: str = "OA"
     complete = False
     sees = NEAREST_OBSTACLE
@@ -203,7 +204,7 @@ class AgentAvoidance:
     """Keep ``distance`` from the nearest other agent."""
 
     gain: float = 20.0  # Lambda_AA [1/s]
-    distance: float = 1.5  # d_AA, between middles [m]
+    distance: float = 1.5  # d_AA, between centers [m]
     name: str = "AA"
     complete = False
     sees = NEAREST_NEIGHBOR
@@ -219,7 +220,7 @@ class AgentAvoidance:
 
 @dataclass(frozen=True)
 class Formation:
-    """Hold a slot around the moving desired centroid: FM (10), and with the column's offsets FR (11)."""
+    """Hold a slot around the moving desired centroid: FM (10), or FR (11) with the offsets of the column."""
 
     name: str
     offsets: tuple[tuple[float, float], ...]  # (x, y) of each agent [m]
@@ -238,9 +239,9 @@ class Formation:
 
 @dataclass(frozen=True)
 class LineFormation(Formation):
-    """Hold a slot, and come to it along the line that it moves on."""
+    """Hold a slot, approaching first the line on which it moves."""
 
-    width: float = 1.5  # w: as far from that line nothing is done about the error along it [m]
+    width: float = 1.5  # w: at this distance from the line and beyond, the error along it is ignored [m]
     law = staticmethod(line_formation)
 
     def __post_init__(self) -> None:

@@ -1,12 +1,12 @@
-"""Which references of limited acceleration keep inequality tasks possible: those from which braking straight stays clear.
+"""Admissible references of limited acceleration: those from which braking in a straight line keeps all distances.
 
-An agent's *way* is the straight line that it makes until it rests, if it brakes from the next mission step on. A velocity is
-admissible if its way keeps d_OA + m from every obstacle at rest, and if it and the way of every other agent keep d_AA + m between
-any two of their points. What is left of a way after one mission step lies within the way that was foreseen. So an agent that
-brakes stays admissible: from an admissible state there always is an admissible velocity, for any desired velocities.
+An agent's *braking path* is the straight line that it travels until it rests, if it brakes from the next mission step on. A
+velocity is admissible if its braking path keeps d_OA + m from every obstacle at rest and d_AA + m from every point of the braking
+paths of all other agents. One mission step later, the remaining braking path lies within the old one. So an agent that brakes
+stays admissible: from an admissible state there is always an admissible velocity, whatever the desired velocities are.
 
-For one obstacle and T -> 0, |v| max(0, -n . v) <= 2 A (d - d_OA - m) is enough. The distance to a convex body is convex along a
-line, so at the end of the way and before it is at least d + n . v |v| / (2 A).
+For one obstacle and T -> 0, |v| max(0, -n . v) <= 2 A (d - d_OA - m) is sufficient: the distance to a convex body is convex along
+a line, so on an approach it is at least d + n . v |v| / (2 A) everywhere on the braking path.
 """
 
 import numpy as np
@@ -14,25 +14,25 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free
 
 BISECTIONS = 8
-"""Halvings of the change of velocity, where all of it cannot be had."""
+"""Number of bisections of the change of velocity, if the full change is not admissible."""
 
 
 @allocation_free
 def restrain(i, before, barrier, at, obstacles, v_r):
-    """Change the desired velocity ``v_r[i]`` of agent ``i`` to an admissible one that the acceleration limit allows, in place.
+    """Replace the desired velocity ``v_r[i]`` of agent ``i`` by an admissible one within the acceleration limit, in place.
 
-    It lies between braking and the desired velocity within its limit, close to the latter, and is found by bisection. Agents
-    choose one
-    after the other: i knows what those before it chose, and those behind it can still brake from the velocity that they have.
-    Moving obstacles bound the desired velocity only (:mod:`marlbc_mj.core.barriers`); nothing is promised for them.
+    The result lies between the braking velocity and the desired velocity, which is first cut to the acceleration limit. Bisection
+    brings it close to the latter. Agents choose one after the other: agent i knows the choices of the agents before it, and the
+    agents after it can still brake from their present velocities. Moving obstacles bound only the desired velocity
+    (:mod:`marlbc_mj.core.barriers`); there is no guarantee for them.
 
     Args:
-        i: agent.
-        before: (2,) its velocity in the mission step before [m/s].
+        i: index of the agent.
+        before: (2,) its velocity in the previous mission step [m/s].
         barrier: see :class:`marlbc_mj.core.barriers.Barrier`, with a finite ``braking``.
-        at: (N, 2) [m].
-        obstacles: (K, 3) x, y, radius [m]; (K, 5) where they move.
-        v_r: (N, 2) [m/s], new for the agents before i, and that of the mission step before for those behind it.
+        at: (N, 2) positions of the agents [m].
+        obstacles: (K, 3) x, y, radius [m]; (K, 5) if they move.
+        v_r: (N, 2) [m/s], already chosen for the agents before i, and of the previous mission step for the agents after i.
     """
     brake_x, brake_y = brake(before[0], before[1], barrier)
     x, y = v_r[i, 0] - before[0], v_r[i, 1] - before[1]
@@ -54,9 +54,9 @@ def restrain(i, before, barrier, at, obstacles, v_r):
 
 @allocation_free
 def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
-    """Whether the way of agent ``i`` with velocity (x, y) keeps all distances, or as much of them as if it braked.
+    """Whether the braking path of agent ``i`` from velocity (x, y) keeps all distances, or comes no closer than braking now does.
 
-    ``brake_x``, ``brake_y`` [m/s] is the velocity if it brakes; the rest as in :func:`restrain`.
+    (``brake_x``, ``brake_y``) [m/s] is its velocity if it brakes now; the other arguments are those of :func:`restrain`.
     """
     time, brake_time = stopping_time(x, y, barrier), stopping_time(brake_x, brake_y, barrier)
     a, b, c, d = time * x, time * y, brake_time * brake_x, brake_time * brake_y
@@ -87,9 +87,9 @@ def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
 
 @allocation_free
 def stopping_time(x, y, barrier):
-    """L(s) / s [s], where L(s) = (s + A T / 2)^2 / (2 A) is the length of the way from a velocity (x, y) of speed s.
+    """L(s) / s [s], where L(s) = (s + A T / 2)^2 / (2 A) is the length of the braking path from a velocity (x, y) of speed s.
 
-    The reference holds s for a mission step T and then loses A T in every step. L(s) - s T >= L(s - A T): ways are nested.
+    The reference holds s for a mission step T and then loses A T in every step. L(s) - s T >= L(s - A T), so paths are nested.
     For T -> 0, L is s^2 / (2 A).
     """
     speed, half = np.sqrt(x * x + y * y), 0.5 * barrier.braking * barrier.duration
@@ -98,7 +98,7 @@ def stopping_time(x, y, barrier):
 
 @allocation_free
 def brake(x, y, barrier):
-    """The velocity (x, y) [m/s] one mission step later if it brakes straight."""
+    """The velocity one mission step after (x, y) [m/s] when braking in a straight line."""
     speed, loss = np.sqrt(x * x + y * y), barrier.braking * barrier.duration
     factor = 1.0 - loss / speed if speed > loss else 0.0
     return factor * x, factor * y
@@ -106,9 +106,9 @@ def brake(x, y, barrier):
 
 @allocation_free
 def least_distance(x, y, a, b, c, d):
-    """Least |(x, y) + s (a, b) - t (c, d)| over s and t in [0, 1]: how near any points of two ways are to each other.
+    """Least |(x, y) + s (a, b) - t (c, d)| over s and t in [0, 1]: the distance between two line segments.
 
-    (x, y) is from where the second begins to where the first begins, (a, b) and (c, d) are the two ways [m].
+    (x, y) points from the start of the second segment to that of the first, (a, b) and (c, d) are the segments as vectors [m].
     """
     cross = a * d - b * c
     if cross != 0.0 and 0.0 <= (c * y - d * x) / cross <= 1.0 and 0.0 <= (a * y - b * x) / cross <= 1.0:
@@ -119,7 +119,7 @@ def least_distance(x, y, a, b, c, d):
 
 @allocation_free
 def _from_origin(x, y, a, b):
-    """Distance of the segment from (x, y) to (x + a, y + b) from the origin."""
+    """Distance from the origin to the segment between (x, y) and (x + a, y + b)."""
     square = a * a + b * b
     s = min(max(-(x * a + y * b) / square, 0.0), 1.0) if square > 0.0 else 0.0
     return np.sqrt((x + s * a) ** 2 + (y + s * b) ** 2)

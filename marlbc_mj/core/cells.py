@@ -1,8 +1,9 @@
-"""A uniform grid over points: the nearest one in constant time, exactly the one that trying them all finds.
+"""A uniform grid over points that finds the nearest point in constant time, with the same result as trying all points.
 
-A grid is one float64 array, so that worlds keep theirs as rows of a batch: a header, for every point the next one in its cell,
-and for every cell its first point. It is a linked cell list with about one point a cell. Where a grid cannot help (numbers that
-are not finite, a query from far away), all points are tried, so a grid changes the cost of a query and never its result.
+A grid is one float64 array, so that worlds can store theirs as rows of a batch: a header, then the next point in the same cell
+for every point, then the first point of every cell. It is a linked cell list with about one point per cell. If a grid cannot help
+(numbers that are not finite, a query from far away), all points are tried, so a grid changes the cost of a query, never its
+result.
 """
 
 import numpy as np
@@ -10,17 +11,17 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free, compiled
 
 _COLUMNS, _ROWS, _X, _Y, _SIZE, _WIDEST, _HEADER = 0, 1, 2, 3, 4, 5, 6
-LARGEST = 1e12  # coordinates beyond this are not put into a grid [m]
+LARGEST = 1e12  # no grid is built if coordinates or radii exceed this [m]
 FARTHEST = 1e6  # [cells] a query from farther away tries all points
-SLACK = 1e-6  # [cells] by which rounding may put a point into the cell beside its own
+SLACK = 1e-6  # [cells] rounding error that may put a point into an adjacent cell
 WORTH = 2048
-"""Pairs of query and point from which on building a grid pays: measured, it costs the same at 1 000, a third at 16 000, a tenth
-at 65 000."""
+"""Number of query-point pairs above which building a grid pays off. Measured against trying all pairs, it costs the same at 1 000
+pairs, a third at 16 000, and a tenth at 65 000."""
 
 
 @allocation_free
 def room(points):
-    """Length of the array for a grid of that many points."""
+    """Length of the array for a grid of that number of points."""
     return _HEADER + 4 * points + 8
 
 
@@ -60,13 +61,13 @@ def fill(points, grid):
 
 @allocation_free
 def nearest(p, points, grid, own):
-    """Index k of the least |p - points_k| - radius_k, the first of equals; -1 where there is none.
+    """Index k with the least |p - points_k| - radius_k, the lowest index on ties; -1 if there is no point.
 
     Args:
         p: (2,) [m].
-        points: (n, 2 or more) that ``grid`` was filled with; a third column is a radius [m], else it is 0.
-        grid: from :func:`fill`; an empty one has all points tried.
-        own: index that does not count, -1 for none.
+        points: (n, 2 or more), the points in ``grid``; a third column is the radius [m], which is 0 without one.
+        grid: filled by :func:`fill`; if it is empty, all points are tried.
+        own: index of a point to skip, -1 for none.
     """
     n = points.shape[0]
     columns = int(grid[_COLUMNS]) if grid.shape[0] > 0 else 0
@@ -83,7 +84,7 @@ def nearest(p, points, grid, own):
     best, found = np.inf, -1
     while ring <= last and (ring - 1 - SLACK) * size - grid[_WIDEST] <= best:
         for r in range(max(row - ring, 0), min(row + ring, rows - 1) + 1):
-            whole = r == row - ring or r == row + ring  # a ring's first and last row, of the others only the ends
+            whole = r == row - ring or r == row + ring  # first and last row of the ring; of the other rows only both ends
             for c in range(max(column - ring, 0), min(column + ring, columns - 1) + 1):
                 if whole or c == column - ring or c == column + ring:
                     k = int(first[r * columns + c])
@@ -98,7 +99,7 @@ def nearest(p, points, grid, own):
 
 @allocation_free
 def _of_all(p, points, own):
-    """The result of :func:`nearest`, from its definition."""
+    """The result of :func:`nearest`, found by trying all points."""
     best, found = np.inf, -1
     for k in range(points.shape[0]):
         gap = _gap(p, points, k)

@@ -12,22 +12,22 @@ PROTOCOLS = ("flooding", "consensus")
 
 @dataclass(frozen=True)
 class Communication:
-    """How the agents of one scenario hear each other. The default is ideal: every message reaches every agent at once.
+    """How the agents of one scenario communicate. The default is ideal: every message reaches every agent at once.
 
-    Every ``period`` an agent broadcasts; who is within ``range`` then hears it ``delay`` later, unless the message is lost. Each
-    direction of each link loses its messages independently, by numbers drawn from the world's seed: the same for any batch size
-    and number of threads. Agents that are silent hear, but send nothing. Where agents are is what is measured.
+    Every ``period`` an agent broadcasts. Agents within ``range`` at that time receive the message ``delay`` later, unless it is
+    lost. Each direction of each link loses messages independently, by random numbers from the world's seed that are the same for
+    any batch size and number of threads. Silent agents receive, but do not send. Distances are those of measured positions.
 
     Raises:
         ConfigurationError: naming the invalid value.
     """
 
-    protocol: Literal["flooding", "consensus"] = "flooding"  # newest entries passed on, or dynamic average consensus
-    range: float = np.inf  # how far a message gets [m]
-    period: float = 0.0  # between two broadcasts of an agent, in whole mission steps; 0: every mission step [s]
-    delay: float = 0.0  # from sending to hearing, in whole mission steps [s]
-    loss: float = 0.0  # share of one-way messages that are lost, at least 0 and below 1
-    silent: tuple[int, ...] = ()  # agents that stop sending, from 0
+    protocol: Literal["flooding", "consensus"] = "flooding"  # pass on the newest entries, or dynamic average consensus
+    range: float = np.inf  # how far a message reaches [m]
+    period: float = 0.0  # time between two broadcasts of an agent, a multiple of the mission step; 0: every mission step [s]
+    delay: float = 0.0  # time from sending to receiving, a multiple of the mission step [s]
+    loss: float = 0.0  # probability that a one-way message is lost, at least 0 and below 1
+    silent: tuple[int, ...] = ()  # indices of the agents that stop sending, counted from 0
     silent_from: float = 0.0  # when they stop [s]
 
     def __post_init__(self) -> None:
@@ -44,9 +44,11 @@ class Communication:
             raise ConfigurationError(f"communication.loss must be at least 0 and below 1, got {self.loss}")
 
     def check(self, starts: np.ndarray, mission_step: float) -> None:
-        """Raise ConfigurationError for what does not fit a team that starts at ``starts`` (N, 2) [m].
+        """Check the settings for a team that starts at ``starts`` (N, 2) [m].
 
-        Silent agents that are not there, times that are no whole number of mission steps, a range that leaves the team in parts.
+        Raises:
+            ConfigurationError: a silent agent that does not exist, a time that is no whole number of mission steps, or a range
+                that leaves the team disconnected at the start.
         """
         agents = len(starts)
         for agent in self.silent:
@@ -72,7 +74,7 @@ IDEAL = Communication()
 
 
 def within_range(position: np.ndarray, reach: float) -> np.ndarray:
-    """(B, N, N) bool: which pairs of agents at positions (B, N, 2) [m] are at most ``reach`` [m] apart; nobody with itself."""
+    """(B, N, N) bool: whether two agents at positions (B, N, 2) [m] are at most ``reach`` [m] apart; no agent with itself."""
     agents = position.shape[1]
     apart = ~np.eye(agents, dtype=np.bool_)
     if reach == np.inf:
@@ -82,7 +84,7 @@ def within_range(position: np.ndarray, reach: float) -> np.ndarray:
 
 
 def components(link: np.ndarray) -> np.ndarray:
-    """(B, N) int64: the connected component of each agent, named after its first agent, in graphs (B, N, N) of two-way links."""
+    """(B, N) int64: the connected component of each agent, as its lowest agent index, in graphs (B, N, N) of two-way links."""
     agents = link.shape[1]
     part = np.tile(np.arange(agents), (len(link), 1))
     near = link | np.eye(agents, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""How laws and the helpers that they call are compiled: by numba, on first use, cached on disk."""
+"""Compilation of laws and of the helpers that they call: by numba, on first use, cached on disk."""
 
 import dis
 import os
@@ -10,8 +10,8 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, cast
 
-# Read once, when the first OpenMP library loads. Threads that spin while they wait would take the cores from torch's (and from
-# other processes'): with both at work the same training step took 4 to 6 times longer.
+# OpenMP reads this once, when its first library loads. Threads that spin while they wait would take cores from torch and from
+# other processes: with both active, the same training step took 4 to 6 times longer.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 import numba
@@ -21,24 +21,24 @@ from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
 Law = Callable[..., Any]
-"""A compiled law, or, of every kind but behaviors, a plain Python function with the same arguments."""
+"""A compiled law. All kinds except behaviors may also be plain Python functions with the same arguments."""
 
 
 def sources_stamp(package: Path) -> int:
-    """Checksum of all source files below ``package`` that hold compiled code.
+    """Checksum of all source files below ``package`` that contain compiled code.
 
-    numba keeps compiled code until the file of its function changes. What a function calls is compiled into it, from whatever
-    file, so code of this package is kept until any of these files changes.
+    numba keeps compiled code until the file of its function changes. But functions from other files are compiled into their
+    callers, so compiled code of this package is kept only until any of these files changes.
     """
     texts = (path.read_bytes() for path in sorted(package.rglob("*.py")))
     return zlib.crc32(b"".join(text for text in texts if any(mark in text for mark in COMPILED_MARKS)))
 
 
 def threads_usable(threads: int) -> bool:
-    """Have numba share loops out over ``threads`` threads; False: the loop is to run in series, with the same results.
+    """Set numba to ``threads`` threads; False if the loop must run in series, which gives the same results.
 
-    A process that was forked from one whose threads ran has none, and GNU OpenMP would end it: it works in series. Processes that
-    are started with ``spawn`` have threads of their own.
+    A process forked from one that had started threads has none, and GNU OpenMP would terminate it, so it must run in series.
+    Processes started with ``spawn`` have threads of their own.
     """
     global _threads_of
     if threads == 1 or _threads_of not in (0, os.getpid()):
@@ -49,19 +49,20 @@ def threads_usable(threads: int) -> bool:
 
 
 _threads_of = 0
-"""The process in which numba has started threads; 0: none."""
+"""ID of the process in which numba has started threads; 0 if none."""
 
 COMPILED_MARKS = (b"import numba", b"from numba", b"core.laws", b"core.compiling", b"core import laws")
-"""Texts by which files with compiled code are found."""
+"""Texts that identify files with compiled code."""
 _PACKAGE = Path(__file__).parents[1]
 SOURCES = sources_stamp(_PACKAGE)
 _MOST_BESIDE = 500
-"""More Python files in the folder of a user's law than these are not looked at."""
+"""Greatest number of Python files in the folder of a user's law that are checked for changes."""
 
 
 def _stamp(function: Law) -> tuple[Any, ...]:
-    """The sources that compiled code of a function depends on: this package, and for a user's law the files beside it and what
-    it uses.
+    """Checksums of the sources that a function's compiled code depends on.
+
+    These are this package and, for a user's law, the Python files in its folder and the values and functions that it uses.
     """
     path = Path(function.__code__.co_filename)
     if path.is_relative_to(_PACKAGE):
@@ -78,11 +79,11 @@ def _checksum(file: Path) -> int:
 
 
 _VALUES = (bool, int, float, complex, str, tuple, np.generic, np.ndarray)
-"""Kinds of global values and constants that numba compiles into a function."""
+"""Types of global values and constants that numba compiles into a function."""
 
 
 def _used(function: Law, seen: set[int]) -> Iterator[str]:
-    """Text of a function's code, and of the values and functions that it finds by global names."""
+    """Texts of a function's code and of the values and functions that it uses by global names."""
     function = plain(function)
     code = getattr(function, "__code__", None)
     if code is None or id(function) in seen:
@@ -102,11 +103,14 @@ def _used(function: Law, seen: set[int]) -> Iterator[str]:
 
 
 def raising_line(function: Law, seen: set[int]) -> str | None:
-    """``file.py, line 12`` of a ``raise`` or an ``assert`` in a function or in a compiled helper that it calls; None without.
+    """Location of a ``raise`` or ``assert`` in a function or a compiled helper that it calls; None if there is none.
 
     Args:
         function: compiled or plain.
-        seen: functions that have been looked at, by ``id``.
+        seen: ``id`` of each function already examined.
+
+    Returns:
+        A text such as ``file.py, line 12``, or None.
     """
     function = plain(function)
     if id(function) in seen or not isinstance(function, FunctionType):
@@ -121,9 +125,7 @@ def raising_line(function: Law, seen: set[int]) -> str | None:
 
 
 def _jit(function: Law, cache: bool = True, **options: Any) -> Law:
-    """Compile, and keep the result on disk where there is a place for it: not for a function typed at a prompt, nor without a
-    writable folder.
-    """
+    """Compile a function, and cache the result on disk unless it was typed at a prompt or no folder is writable."""
     options = {"error_model": "numpy", "nogil": True, **options}
     try:
         law = numba.njit(cache=cache, **options)(function)
@@ -142,14 +144,14 @@ class Index(IndexDataCacheFile):
     """numba's index of a function's compiled code on disk, in which each signature is pickled by itself.
 
     A signature may name a type that only some processes can import, such as a NamedTuple of a script. numba pickles all
-    signatures together. One that cannot be read would keep other processes from finding or adding any. Here it stays for those
-    who can read it.
+    signatures together, so one that cannot be unpickled would keep other processes from finding or adding any. Here it is kept
+    for the processes that can unpickle it.
     """
 
     def _load_index(self) -> dict[Any, str]:
         try:
             kept = super()._load_index()
-        except Exception:  # torn
+        except Exception:  # damaged file
             return {}
         return {_signature(key): name for key, name in kept.items()}
 
@@ -158,7 +160,7 @@ class Index(IndexDataCacheFile):
 
 
 def _signature(pickled: bytes) -> Any:
-    """What was pickled; the bytes themselves where this process lacks a type that they name."""
+    """The unpickled signature; the bytes themselves if this process cannot import a type that it names."""
     try:
         return _unpickled(pickled)
     except Exception:
@@ -169,16 +171,16 @@ _unpickled = lru_cache(maxsize=None)(pickle.loads)
 
 
 _unkept: list[Any] = []
-"""Functions whose compiled code has no place on disk."""
+"""Functions whose compiled code cannot be cached on disk."""
 
 
 def compiled_in_vain() -> bool:
-    """Whether something has been compiled that the next process must compile again: no folder for it can be written."""
+    """Whether the next process must compile something again, because it could not be cached on disk."""
     return any(law.signatures for law in _unkept)
 
 
 def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:
-    """Access to the cache; None where its files are torn, come from elsewhere or cannot be written: then the law is compiled."""
+    """Wrap an access to the cache: None if its files are damaged, foreign or not writable; the law is then compiled."""
 
     def attempt(*arguments: Any) -> Any:
         try:
@@ -190,9 +192,9 @@ def _forgiving(access: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def threaded(function: Law) -> Law:
-    """Compile a loop over worlds whose ``numba.prange`` is shared out over threads.
+    """Compile a loop over worlds whose ``numba.prange`` is distributed over threads.
 
-    Such a loop counts in uint64. It should hand on ``np.int64`` of that: otherwise whatever it calls is compiled once more.
+    The loop index is uint64. Pass ``np.int64`` of it to other functions, otherwise each of them is compiled once more.
     """
     return _jit(function, parallel=True)
 
@@ -203,21 +205,21 @@ def compiled(function: Law) -> Law:
 
 
 def inlined(function: Law) -> Law:
-    """A helper of laws, pasted into its caller: for a few lines that run in every substep."""
+    """Inline a helper of laws into its callers: for a few lines that run in every substep."""
     return cast(Law, register_jitable(inline="always")(function))
 
 
 def on_both_paths(function: Law) -> Law:
-    """A part of the loop that runs as Python when Python calls it, and is compiled when compiled code does.
+    """Declare a part of the loop that runs as Python when called from Python, and is compiled when called from compiled code.
 
-    So it may be handed objects (laws, MuJoCo's step) or their addresses. Unlike :func:`inlined` it is typed and compiled once.
+    So it accepts objects (laws, MuJoCo's step) or their addresses. Unlike an :func:`inlined` helper it is compiled only once.
     """
     return cast(Law, register_jitable(error_model="numpy", _nrt=False)(function))
 
 
 @inlined
 def clip(value, limit):
-    """Saturation (2): ``value`` within +-limit. NaN passes through, so that the run stops instead of going on at the limit."""
+    """Saturation (2): clip ``value`` to +-limit. NaN passes through, so the run stops instead of continuing at the limit."""
     if value > limit:
         return limit
     if value < -limit:
@@ -226,10 +228,10 @@ def clip(value, limit):
 
 
 def allocation_free(function: Law, cache: bool = True) -> Law:
-    """Compile a law, or a helper that laws call: as :func:`compiled`, and without reference counting.
+    """Compile a law or a helper of laws like :func:`compiled`, but without reference counting.
 
-    Counting the arguments of one call costs more than the arithmetic of most laws. The price: the function cannot create arrays;
-    scratch belongs in a law's ``state``.
+    Counting the references of one call's arguments costs more than the arithmetic of most laws. The price is that the function
+    cannot create arrays; keep scratch in a law's ``state``.
     """
     return _jit(function, cache, _nrt=False)
 
@@ -240,5 +242,5 @@ def is_compiled(law: Law) -> bool:
 
 
 def plain(law: Law) -> Law:
-    """The law as plain Python: for a debugger, and for measuring the gain of compilation."""
+    """The law as plain Python: for a debugger, and for measuring the speedup by compilation."""
     return law.py_func if isinstance(law, Dispatcher) else law

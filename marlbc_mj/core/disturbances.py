@@ -1,4 +1,4 @@
-"""Unknown dynamics f(chi) of the plant (1). One law and one dataclass each."""
+"""Disturbances: the unknown dynamics f(chi) of the plant (1), each with one law and one dataclass."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from marlbc_mj.core.stopping import ForceBound
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 HARMONICS = 12
-"""Sines of wind gusts, on each axis."""
+"""Number of sines of wind gusts per axis."""
 
 
 @laws.disturbance(gains="scale")
@@ -53,7 +53,7 @@ GUSTS = {"scale": (), "steady": 2, "amplitude": SINES, "frequency": SINES, "phas
 
 @laws.disturbance(gains=GUSTS)
 def wind_gusts(gains, t, p, v, force_out):
-    """f = scale (w + sum_k a_k sin(w_k t + phase_k)), alike for all agents; w is steady, each axis has its own sines."""
+    """f = scale (w + sum_k a_k sin(w_k t + phase_k)), the same for all agents; w is steady, each axis has its own sines."""
     for axis in range(2):
         force_out[axis] = gains.steady[axis]
         for k in range(HARMONICS):
@@ -63,9 +63,9 @@ def wind_gusts(gains, t, p, v, force_out):
 
 @runtime_checkable
 class Disturbance(Protocol):
-    """The interface of disturbances. Its first gain is ``scale``, which a perturbation draw multiplies.
+    """The interface of disturbances. The first gain is ``scale``, which the draw of a perturbation multiplies.
 
-    One that offers ``force_bound() -> ForceBound`` needs no further settings for a shield.
+    A disturbance with a method ``force_bound() -> ForceBound`` needs no further settings for a shield.
     """
 
     @property
@@ -114,7 +114,7 @@ class LinearDrag(_Scaled):
 
 @dataclass(frozen=True)
 class QuadraticDrag(_Scaled):
-    """Drag of a body in fast air."""
+    """Aerodynamic drag, quadratic in the speed."""
 
     coefficient: float = 0.1  # c [N s^2/m^2]
     law = staticmethod(quadratic_drag)
@@ -126,7 +126,7 @@ class QuadraticDrag(_Scaled):
 
 @dataclass(frozen=True)
 class ConstantWind(_Scaled):
-    """A constant force; unlike (1) asks, it does not vanish at rest."""
+    """A constant force. Contrary to the assumption of (1), it does not vanish at rest."""
 
     force: tuple[float, float] = (5.0, 0.0)  # w [N]
     law = staticmethod(constant_wind)
@@ -138,15 +138,15 @@ class ConstantWind(_Scaled):
 
 @dataclass(frozen=True)
 class WindGusts(_Scaled):
-    """Wind that comes and goes: a steady force and ``HARMONICS`` sines whose frequencies and phases ``seed`` draws.
+    """Gusty wind: a steady force plus ``HARMONICS`` sines per axis, with frequencies and phases drawn from ``seed``.
 
-    The wind of a seed depends on the mission time only. Harmonic k has an amplitude that falls with its
-    frequency as 1 / sqrt(1 + (w_k T)^2), as in a Dryden spectrum, and together they have the root mean square ``strength``.
+    For a given seed, the wind depends only on the mission time. The amplitude of harmonic k falls with its frequency as
+    1 / sqrt(1 + (w_k T)^2), as in a Dryden spectrum, and all harmonics together have the root mean square ``strength``.
     """
 
     steady: tuple[float, float] = (2.0, 0.0)  # [N]
     strength: float = 10.0  # RMS of the gusts on each axis [N]
-    time: float = 4.0  # T, how long a gust lasts [s]
+    time: float = 4.0  # T: typical duration of a gust [s]
     seed: int = 0
     law = staticmethod(wind_gusts)
 
@@ -163,7 +163,7 @@ class WindGusts(_Scaled):
         return laws.gains_of(self, **self._harmonics())
 
     def _harmonics(self) -> dict[str, np.ndarray]:
-        """Amplitude [N], frequency [rad/s] and phase of every sine, (2, HARMONICS) each."""
+        """Amplitude [N], frequency [rad/s] and phase [rad] of every sine, (2, HARMONICS) each."""
         rng = np.random.default_rng(self.seed)
         place = (np.arange(HARMONICS) + rng.uniform(0.0, 1.0, (2, HARMONICS))) / HARMONICS  # one frequency in each band
         ratio = np.exp(np.log(0.2) + np.log(50.0) * place)  # w_k T, from 0.2 to 10
@@ -173,7 +173,7 @@ class WindGusts(_Scaled):
         return {"amplitude": amplitude, "frequency": ratio / self.time, "phase": phase}
 
     def force_bound(self) -> ForceBound:
-        """|f_i| <= scale (|w_i| + sum_k a_k) on each axis: the sines all at their peaks."""
+        """|f_i| <= scale (|w_i| + sum_k a_k) on each axis, with all sines at their peaks."""
         peaks = np.abs(self.steady) + np.sum(self._harmonics()["amplitude"], axis=1)
         return ForceBound(abs(self.scale) * float(np.hypot(*peaks)))
 
@@ -185,14 +185,14 @@ DISTURBANCES: dict[str, tuple[Callable[..., Disturbance], str]] = {
     "wind": (ConstantWind, "a constant force"),
     "gusts": (WindGusts, "wind that comes and goes, drawn by its seed"),
 }
-"""Class and one line of description by name."""
+"""Class and one-line description of each disturbance, by name."""
 
 
 def make_disturbance(name: str, scale: float = 1.0) -> Disturbance:
-    """A disturbance by name, times ``scale``.
+    """Make a disturbance by name, with its force multiplied by ``scale``.
 
     Raises:
-        ConfigurationError: unknown name, or a scale that is not finite.
+        ConfigurationError: an unknown name, or a scale that is not finite.
     """
     if name not in DISTURBANCES:
         raise unknown("disturbance", name, DISTURBANCES)

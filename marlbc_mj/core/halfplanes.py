@@ -1,13 +1,14 @@
-"""The velocity nearest to a desired one that satisfies half-planes, exactly: a quadratic program in the plane, without a solver.
+"""The velocity nearest to a desired one within half-planes: an exact solution of a planar quadratic program, without a solver.
 
-minimise |v - wish|^2  subject to  n_k . v >= b_k  and  |v| <= speed.
+minimize |v - wish|^2  subject to  n_k . v >= b_k  and  |v| <= speed.
 
-Half-planes are inserted one at a time: where one cuts off the optimum so far, the new optimum lies on its border, and there the
-problem has one dimension (M. de Berg et al., Computational Geometry, ch. 4; J. van den Berg et al., Reciprocal n-body collision
-avoidance, 2011). Where half-planes contradict, those of a higher level win: the greatest violation of the first level is made as
-small as possible, then that of the second, and so on, then the distance from the desired velocity.
+Half-planes are inserted one at a time: if one cuts off the optimum so far, the new optimum lies on its border, where the problem
+has one dimension (M. de Berg et al., Computational Geometry, ch. 4; J. van den Berg et al., Reciprocal n-body collision
+avoidance, 2011). If half-planes contradict each other, the more important levels win: the greatest violation of the first level
+is minimized, then that of the second, and so on, and finally the distance from the desired velocity.
 
-A half-plane is a row of four: n_x, n_y (a unit normal), b [m/s], level. Rows are sorted by level, the most important first.
+A half-plane is a row of four numbers: n_x, n_y (a unit normal), b [m/s], level. Rows are sorted by level, the most important
+first.
 """
 
 import numpy as np
@@ -15,20 +16,20 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free
 
 PARALLEL = 1e-12  # sine below which two borders are parallel
-ROUND_OFF = 1e-12  # violation that counts as none [m/s]
-MEETING = 1e-10  # by which borders may miss each other and still meet [m/s]
-RELAXATION = 1e-9  # beyond the least violation, so that rounding leaves something feasible [m/s]
+ROUND_OFF = 1e-12  # violation up to which a half-plane counts as satisfied [m/s]
+MEETING = 1e-10  # gap up to which borders count as meeting [m/s]
+RELAXATION = 1e-9  # added to the least violation, so that rounding leaves a feasible point [m/s]
 
 
 @allocation_free
 def closest(wish, speed, planes, count, v):
-    """The velocity closest to ``wish`` (2,) [m/s] that satisfies half-planes, or violates them least, into ``v`` (2,).
+    """Write into ``v`` (2,) the velocity closest to ``wish`` (2,) [m/s] that satisfies the half-planes or violates them least.
 
     Args:
-        wish: (2,) [m/s]; may not be ``v``.
+        wish: (2,) desired velocity [m/s]; must not be the array ``v``.
         speed: greatest |v| [m/s].
-        planes: (n, 4) half-planes; where they contradict, bounds are relaxed in place by the least violation.
-        count: how many rows of ``planes`` there are.
+        planes: (n, 4) half-planes; if they contradict each other, bounds are relaxed in place by the least violation.
+        count: number of rows of ``planes`` in use.
         v: (2,) [m/s], written in place.
 
     Returns:
@@ -55,11 +56,11 @@ def closest(wish, speed, planes, count, v):
 
 @allocation_free
 def _least_violation(planes, first, end, speed, v):
-    """Least greatest violation z >= 0 [m/s] of rows ``first`` to ``end``, while the rows before ``first`` hold.
+    """Minimize the greatest violation z >= 0 [m/s] of rows ``first`` to ``end`` - 1, subject to the rows before; returns z.
 
-    ``v`` (2,) satisfies those rows; it is moved to where z is least. Where row i violates more than all before it, it is the one
-    that violates most at the optimum too. So z = b_i - n_i . v, and every other row j asks for (n_j - n_i) . v >= b_j - b_i: a
-    linear program in v.
+    ``v`` (2,) must satisfy the rows before ``first`` and is moved to the minimum. If row i is violated more than all rows before
+    it, it is also the most violated of them at the optimum. Then z = b_i - n_i . v, and every row j before it requires
+    (n_j - n_i) . v >= b_j - b_i: a linear program in v.
     """
     least = 0.0
     for i in range(first, end):
@@ -75,10 +76,10 @@ def _least_violation(planes, first, end, speed, v):
 
 @allocation_free
 def _insert(goal, planes, stop, first, most, speed, v):
-    """Optimum over the first ``stop`` rows and the disc |v| <= ``speed``, into ``v``; False where there is none.
+    """Write the optimum over the first ``stop`` rows and the disc |v| <= ``speed`` into ``v``; False if there is none.
 
-    With ``most`` < 0 it is nearest to the point ``goal``. Else it is farthest in the direction ``goal``, and rows from ``first``
-    on say that row ``most`` violates more than they do.
+    If ``most`` < 0, the optimum is the point nearest to ``goal``. Otherwise it is the farthest point in the direction ``goal``,
+    and rows from ``first`` on require row ``most`` to be violated at least as much as they are.
     """
     if most < 0:
         _shorten(goal, speed, v)
@@ -93,7 +94,7 @@ def _insert(goal, planes, stop, first, most, speed, v):
 
 @allocation_free
 def _border(planes, k, first, most):
-    """Unit normal and bound of row ``k`` as :func:`_insert` takes it."""
+    """Unit normal and bound of row ``k`` in the form that :func:`_insert` uses."""
     if most < 0 or k < first:
         return planes[k, 0], planes[k, 1], planes[k, 2]
     x, y, bound = planes[k, 0] - planes[most, 0], planes[k, 1] - planes[most, 1], planes[k, 2] - planes[most, 2]
@@ -105,7 +106,7 @@ def _border(planes, k, first, most):
 
 @allocation_free
 def _on_border(goal, planes, k, first, most, speed, v):
-    """Optimum on the border of row ``k``, subject to the rows before it, into ``v``; False where there is none."""
+    """Write the optimum on the border of row ``k``, subject to the rows before it, into ``v``; False if there is none."""
     x, y, bound = _border(planes, k, first, most)
     if abs(bound) > speed + MEETING:
         return False
@@ -134,7 +135,7 @@ def _on_border(goal, planes, k, first, most, speed, v):
 
 @allocation_free
 def _shorten(vector, length, out):
-    """``vector`` (2,), no longer than ``length``, into ``out`` (2,)."""
+    """Write ``vector`` (2,), shortened to at most ``length``, into ``out`` (2,)."""
     size = np.sqrt(vector[0] ** 2 + vector[1] ** 2)
     factor = length / size if size > length else 1.0
     out[0], out[1] = factor * vector[0], factor * vector[1]

@@ -1,4 +1,4 @@
-"""The kinds of laws: the signature of each, and the function on rows of float64 that the loop calls for a law of it."""
+"""The kinds of laws: the signature of each kind, and the function on rows of float64 that the loop calls for its laws."""
 
 import zlib
 from types import FunctionType
@@ -15,8 +15,8 @@ _MATRIX = types.float64[:, ::1]
 
 BEHAVIOR = types.int64(_VECTOR, _VECTOR, _MATRIX, _MATRIX, _MATRIX, types.int64, _VECTOR, _MATRIX)
 """gains (P,), p (2,) [m], path (2, 2): desired centroid [m] and its velocity [m/s], obstacles (K, 3): x, y, radius [m], or
-(K, 5) where they move: their velocity [m/s] too, team (N, 2): everyone's position [m], agent, velocity_out (2,) [m/s],
-jacobian_out (2, 2) -> rows used of the Jacobian."""
+(K, 5) with their velocity [m/s] if they move, team (N, 2): positions of all agents [m], agent: its index, velocity_out (2,)
+[m/s], jacobian_out (2, 2) -> number of rows of the Jacobian in use."""
 
 CONTROLLER = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
 """gains (P,), state (S,) changed in place, p (2,) [m], v (2,) [m/s], p_r (2,) [m], v_r (2,) [m/s], drag (2,) [N]: the
@@ -26,38 +26,39 @@ DISTURBANCE = types.void(_VECTOR, types.float64, _VECTOR, _VECTOR, _VECTOR)
 """gains (P,), t [s], p (2,) [m], v (2,) [m/s], force_out (2,) [N]."""
 
 DRIVE = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, types.float64, _VECTOR)
-"""gains (P,), state (S,) changed in place, the robot's own part of qpos and of qvel, planar force (2,) [N] that is wanted,
-h [s], ctrl_out (actuators,): MuJoCo's controls, in the order of the robot's MJCF. Called before every substep."""
+"""gains (P,), state (S,) changed in place, the robot's own part of qpos and of qvel, desired planar force (2,) [N], h [s],
+ctrl_out (actuators,): MuJoCo's controls, in the order of the robot's MJCF. Called before every substep."""
 
 READING = types.void(_VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR, _VECTOR)
 """gains (P,), state (S,) as the drive left it, the robot's own part of qpos, of qvel and of actuator_force, p_out (2,) [m],
-v_out (2,) [m/s], force_out (2,) [N]: the planar force that the actuators really gave. Called after every substep."""
+v_out (2,) [m/s], force_out (2,) [N]: the planar force that the actuators applied. Called after every substep."""
 
 TEAM_CONTROLLER = types.void(_MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, _MATRIX, types.float64, _MATRIX)
-"""A controller for every agent in turn: the arguments of :data:`CONTROLLER`, one row per agent."""
+"""A controller applied to every agent in turn: the arguments of :data:`CONTROLLER`, one row per agent."""
 
 TEAM_DISTURBANCE = types.void(_VECTOR, types.float64, _MATRIX, _MATRIX, _MATRIX)
-"""A disturbance for every agent in turn: the arguments of :data:`DISTURBANCE`, one row per agent."""
+"""A disturbance applied to every agent in turn: the arguments of :data:`DISTURBANCE`, with one row per agent
+in p, v and force_out."""
 
 _SPANS = types.int64[:, :, ::1]
 TEAM_DRIVE = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _MATRIX, types.float64, _SPANS, _VECTOR)
-"""A drive for every robot in turn: gains (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (N, 3, 2): first
-and last + 1 of each robot in qpos, in qvel and in ctrl; the whole ctrl."""
+"""A drive applied to every robot in turn: gains (N, P), state (N, S), the whole qpos and qvel, forces (N, 2), h, spans (N, 3, 2):
+first and last + 1 index of each robot in qpos, in qvel and in ctrl; the whole ctrl."""
 
 TEAM_READING = types.void(_MATRIX, _MATRIX, _VECTOR, _VECTOR, _VECTOR, _SPANS, _MATRIX, _MATRIX, _MATRIX)
-"""A reading of every robot in turn: gains, state, the whole qpos, qvel and actuator_force, spans; p, v, force (N, 2)."""
+"""A reading applied to every robot in turn: gains, state, the whole qpos, qvel and actuator_force, spans; p, v, force (N, 2)."""
 
 
 def _law(*arguments: Any) -> Any:
-    """Stands for the law in the templates below."""
+    """Placeholder for the law in the templates below."""
 
 
 def _gains(row: Any) -> Any:
-    """Stands for the view of a row of gains by their names."""
+    """Placeholder for the view of a row of gains by their names."""
 
 
 def _state(row: Any) -> Any:
-    """Stands for the view of a row of state by its names."""
+    """Placeholder for the view of a row of state by its names."""
 
 
 def _behavior_on_rows(gains, p, path, obstacles, team, agent, velocity_out, jacobian_out):
@@ -95,15 +96,15 @@ ON_ROWS = {
     DRIVE: (TEAM_DRIVE, _drive_team),
     READING: (TEAM_READING, _reading_team),
 }
-"""What the loop calls for each kind of law: its signature, and the template of the function."""
+"""Signature and template of the function that the loop calls for each kind of law."""
 
 
 @intrinsic
 def _as_record(typing_context, row, dtype):
-    """The beginning of a row as a record; compiled code only.
+    """View the beginning of a row as a record, in compiled code only.
 
-    NumPy's ``view`` does the same with checks that cost more than a small law. They are needless: every row that the loop hands
-    on was packed by the same names.
+    NumPy's ``view`` does the same with checks that cost more than a small law. They are unnecessary here, because every row that
+    the loop passes was packed with the same names.
     """
     record = dtype.dtype
 
@@ -115,7 +116,7 @@ def _as_record(typing_context, row, dtype):
 
 
 def _reader(names: Names) -> Law:
-    """The function that turns a row into what the law is handed: a record, or the row itself where there are no names."""
+    """Make the function that turns a row into the argument of a law: a record, or the row itself if there are no names."""
     dtype = names.dtype
 
     def read(row):
@@ -129,13 +130,13 @@ def _reader(names: Names) -> Law:
 
 
 def on_rows(law: Law, signature: Any) -> Law:
-    """The template of a kind of law with this very law in it: a Python function, to be called or to be compiled.
+    """Insert a law into the template of its kind; returns a Python function that can be called or compiled.
 
-    Why it is put together from a code object: numba keeps compiled code on disk under the file, first line and name of a
-    function, and under a pickle of what the function closes over. An ordinary closure over a compiled law would be compiled
-    anew in every process, because the pickle of a compiled law is a different one in each. So the template refers to its law by a
-    global name, and takes the place (file and line) and the name of the law for its own. The names of gains and state go into
-    the function's name by a checksum: were they declared in another file, numba would not see them change.
+    The function is made from a code object because of numba's cache, which stores compiled code under the file, first line and
+    name of a function and a pickle of its closure. The pickle of a compiled law differs between processes, so an ordinary closure
+    over one would be compiled again in each of them. Therefore the template refers to its law by a global name, and takes over
+    the law's file, line and name. The function's name includes a checksum of the names of gains and state: if these are declared
+    in another file, numba does not notice that they change.
     """
     declared = interface(law)
     name, source = getattr(law, "__name__", "law"), getattr(plain(law), "__code__", None)

@@ -1,9 +1,9 @@
-"""What a law is: a small compiled function of arrays for one agent, with one fixed signature per kind.
+"""Laws: small compiled functions of arrays for one agent, with one fixed signature per kind.
 
-Behaviors (6)-(11), controllers (36)-(41), disturbances (1) and the two sides of a robot are all *laws*. A law is decorated with
+Behaviors (6)-(11), controllers (36)-(41), disturbances (1), and drives and readings of robots are *laws*. A law is decorated with
 :func:`behavior`, :func:`controller`, :func:`disturbance`, :func:`drive` or :func:`reading`; it is then compiled on first use,
-callable from Python as an ordinary function, and callable by address from the compiled closed loop. A law that a user writes is
-therefore the equal of one shipped here. Outputs are written in place; only a behavior returns something, its number of rows.
+callable from Python as an ordinary function, and callable by address from the compiled closed loop. So user-defined laws work
+exactly like those shipped here. Outputs are written in place; only a behavior returns a value, its number of Jacobian rows.
 
 =============  ==========================================================================================
 kind           arguments
@@ -20,8 +20,8 @@ The decorator declares the names of gains and state, which the law then reads an
     @laws.controller(gains=("position_gain", "limit"), state={"integral": 2})
     def law(gains, state, p, v, p_r, v_r, drag, h, force_out): ... gains.limit ... state.integral[axis] ...
 
-All other arguments are contiguous float64 arrays and numbers. For the loop, gains and state are rows of float64 as well: what it
-calls by address is the law's team form, which sees each row by its names. A law that declares no names is handed the rows.
+All other arguments are contiguous float64 arrays and numbers. The loop stores gains and state as rows of float64. It calls the
+law's team form by address, which views each row by its names. A law that declares no names receives the rows themselves.
 
 Set ``NUMBA_DISABLE_JIT=1`` to run every law as plain Python, for a debugger or for coverage.
 """
@@ -67,10 +67,10 @@ from marlbc_mj.util.modules import blame
 
 
 def for_team(law: Law, signature: Any) -> Law:
-    """The law for the Python path: on rows of float64, as the loop calls it; applied to every agent in turn, a behavior to one.
+    """The law in the form that the Python path calls: on rows of float64, for all agents in turn, or for one if it is a behavior.
 
-    The function raises ConfigurationError where the law reads a name that it does not declare, and SimulationError where it
-    raises anything else.
+    The returned function raises ConfigurationError if the law reads a name that it does not declare, and SimulationError for any
+    other error of the law.
     """
     team = _entry(law, signature) if is_compiled(law) else on_rows(law, signature)
 
@@ -88,9 +88,9 @@ def for_team(law: Law, signature: Any) -> Law:
 
 
 def _declare(function: Law, signature: Any, gains: Declared, state: Declared = ()) -> Law:
-    """Compile a law, and the team form that the loop calls: an indirect call costs more than most laws, so it makes one per team.
+    """Compile a law and the team form that the loop calls: an indirect call costs more than most laws, so it makes one per team.
 
-    The team form of a law that closes over values is not cached on disk, since numba cannot see those values there.
+    The team form of a closure is not cached on disk, because numba would not notice a change of the values that it closes over.
     """
     _check_arguments(function, signature)
     vars(function)["interface"] = Interface(signature, Names.of(gains), Names.of(state))
@@ -107,11 +107,11 @@ ARGUMENTS = {
     DRIVE: "gains, state, qpos, qvel, force, h, ctrl_out",
     READING: "gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out",
 }
-"""Arguments of every kind of law, by position."""
+"""Positional arguments of every kind of law."""
 
 
 def _check_arguments(function: Law, signature: Any) -> None:
-    """Raise ConfigurationError for a law with another number of arguments than its kind has."""
+    """Raise ConfigurationError if a law does not take the number of arguments of its kind."""
     wanted = ARGUMENTS[signature]
     try:
         inspect.signature(function).bind(*wanted.split(", "))
@@ -121,7 +121,7 @@ def _check_arguments(function: Law, signature: Any) -> None:
 
 
 def _decorator(function: Law | None, signature: Any, gains: Declared, state: Declared = ()) -> Law:
-    """The law, or the decorator where its names come first."""
+    """Declare the law, or return a decorator if only the names are given."""
     return _declare(function, signature, gains, state) if function else lambda law: _declare(law, signature, gains, state)
 
 
@@ -136,10 +136,10 @@ def controller(function: Law | None = None, *, gains: Declared = (), state: Decl
 
 
 def disturbance(function: Law | None = None, *, gains: Declared = ()) -> Law:
-    """Declare an unknown dynamics f(chi) of (1) and the names of its gains; arguments as in :data:`DISTURBANCE`.
+    """Declare a disturbance f(chi) of (1) and the names of its gains; arguments as in :data:`DISTURBANCE`.
 
     Raises:
-        ConfigurationError: the first gain is not named ``scale``: a perturbation draw multiplies it.
+        ConfigurationError: the first gain is not ``scale``, which the draw of a perturbation multiplies.
     """
     names = Names.of(gains)
     if names.shapes and names.shapes[0] != ("scale", ()):
@@ -153,20 +153,21 @@ def drive(function: Law | None = None, *, gains: Declared = (), state: Declared 
 
 
 def reading(function: Law | None = None, *, gains: Declared = (), state: Declared = ()) -> Law:
-    """Declare how a robot's planar motion and force are read. It shares gains and state with the drive, so name them alike;
-    arguments as in :data:`READING`.
+    """Declare how a robot's planar motion and force are read; arguments as in :data:`READING`.
+
+    It shares gains and state with the drive, so both must declare the same names.
     """
     return _decorator(function, READING, gains, state)
 
 
 def address(law: Law, signature: Any) -> int:
-    """Machine address of what the compiled loop calls for a law: its team form, and for a behavior the behavior itself.
+    """Machine address of the function that the compiled loop calls for a law: its team form, or for a behavior one agent's form.
 
-    It is looked for once: a compiled law keeps it.
+    The law keeps the address, so it is looked up only once.
 
     Raises:
         ConfigurationError: the law is plain Python, was declared as another kind of law, reads a name that it does not declare,
-            raises errors, which threads would lose, or does not compile.
+            raises errors (which threads would lose), or does not compile.
     """
     if not isinstance(law, Dispatcher):
         raise ConfigurationError(f"law {name_of(law)!r} is not compiled; decorate it with marlbc_mj.core.laws")
@@ -178,7 +179,7 @@ def address(law: Law, signature: Any) -> int:
 
 
 def _find_address(law: Any, signature: Any) -> int:
-    """:func:`address` of a compiled law that was declared as this kind."""
+    """Find the :func:`address` of a compiled law that was declared as this kind."""
     name, line = name_of(law), raising_line(law, set())
     if line is not None:
         raise ConfigurationError(
@@ -198,14 +199,14 @@ def _find_address(law: Any, signature: Any) -> int:
 
 
 def _entry(law: Law, signature: Any) -> Any:
-    """The team form of a law: made where the law is declared, and anew for one that came out of a pickle."""
+    """The team form of a law: made when the law is declared, or here if the law was unpickled."""
     if not hasattr(law, "entry"):
         cast(Any, law).entry = allocation_free(on_rows(law, signature), cache=False)
     return cast(Any, law).entry
 
 
 def _arguments(declared: Interface) -> tuple[Any, ...]:
-    """Types of a law's own arguments: records where it has names."""
+    """Types of a law's own arguments, with records for gains and state that have names."""
     arguments = list(declared.signature.args)
     for at, names in enumerate(declared[1:]):
         if names.shapes:
@@ -214,7 +215,7 @@ def _arguments(declared: Interface) -> tuple[Any, ...]:
 
 
 def _last_line(error: Exception) -> str:
-    """The line of a numba error that says what is wrong, with a hint where a law creates arrays."""
+    """The line of a numba error that states the cause, or a hint if a law creates arrays."""
     text = str(error)
     if "NRT required" in text or "Only accept returning of array" in text:
         return "a law cannot create arrays; keep scratch in its state"

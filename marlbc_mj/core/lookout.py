@@ -1,10 +1,11 @@
-"""What was around every agent when it last looked: while nobody has moved far since, a shield need not look at the rest again.
+"""The look-out of a shield: lists of what was near every agent when it last looked. Until agents move far, the rest is ignored.
 
-The idea is that of Verlet's neighbor lists (1967), except that each agent looks again by itself, so that one fast agent does not
-make all others look. Agent i looked from x_i. Things k that left it at most the room R there, |x_i - x_k| - kept <= R, are in
-its list; an agent that looks puts itself into the lists of others, too. If i has moved by s_i since, and no agent by more than s,
-then what is not listed leaves it more than R - s_i - s, and what is listed no less than the least room then, less s_i + s.
-Obstacles are at rest; where they move, or messages are late, there is no look-out.
+The idea is that of Verlet's neighbor lists (1967), except that each agent renews its own list, so that one fast agent does not
+make all others look. Let x_i be the place from which agent i last looked. Its list holds the things k, obstacles and agents, to
+which it had at most the room R there: |x_i - x_k| - kept <= R. An agent that looks also enters itself into the lists of others.
+If agent i has moved by s_i since, and no agent by more than s, then its room to unlisted things is more than R - s_i - s, and its
+room to listed things is at least the least room at that time minus s_i + s. The look-out is used only if obstacles are at rest
+and no messages are late.
 """
 
 import numpy as np
@@ -13,18 +14,19 @@ from marlbc_mj.core.laws import allocation_free, inlined
 from marlbc_mj.core.stopping import anything_near, concerns, near, thing_count
 
 SKIN = 0.1
-"""Share of R that an agent may move before it looks again."""
+"""Distance that an agent may move before it looks again, as a share of R."""
 LISTED = 24
-"""Things that are listed for an agent; where more are around, all are tried."""
-ROOM_ERROR = 1e-9  # of what is computed here [m]
+"""Greatest length of the list of an agent; if more things are near, all things are checked."""
+ROOM_ERROR = 1e-9  # rounding error of the rooms computed here [m]
 X, Y, FREE = 0, 1, 2
-"""Columns of ``looked``: where the agent was, the least room that it had, at most R [m]."""
+"""Columns of ``looked``: where the agent last looked, and the least room that it had there, at most R [m]."""
 
 
 @allocation_free
 def forget_moved(obstacles, looked, seen):
-    """Have all agents look again if ``obstacles`` (K, 3) are not those of the last look: between mission steps anybody may have
-    moved them. ``looked`` (N, 3) and ``seen`` (K, 3) are changed in place.
+    """Make all agents look again if ``obstacles`` (K, 3) are not those of the last look.
+
+    Callers may move them between mission steps. ``looked`` (N, 3) and ``seen`` (K, 3) are changed in place.
     """
     same = True
     for k in range(seen.shape[0]):
@@ -39,20 +41,20 @@ def forget_moved(obstacles, looked, seen):
 
 @inlined
 def vicinity(numbers):
-    """R [m]: the distances to keep, once more."""
+    """R [m]: the sum of the distances kept from obstacles and from agents."""
     return numbers.clearance + numbers.agent_distance
 
 
 @inlined
 def displacement(view, i):
-    """How far agent ``i`` is from where it looked [m]."""
+    """Distance of agent ``i`` from where it last looked [m]."""
     x, y = view.p[i, 0] - view.looked[i, X], view.p[i, 1] - view.looked[i, Y]
     return np.sqrt(x * x + y * y)
 
 
 @allocation_free
 def look_out(numbers, view):
-    """Agents that have moved far look again; returns the farthest that an agent is now from where it looked [m]."""
+    """Make agents that have moved far look again; returns the greatest displacement of the other agents [m]."""
     farthest, skin = 0.0, SKIN * vicinity(numbers)
     for i in range(view.p.shape[0]):
         moved = displacement(view, i)
@@ -65,7 +67,7 @@ def look_out(numbers, view):
 
 @allocation_free
 def look(numbers, view, i):
-    """Agent ``i`` looks from where it is: its row of ``view.looked`` and its list are made anew, and it is put into others'."""
+    """Renew the list of agent ``i`` and its row of ``view.looked`` from where it is, and enter it into the lists of others."""
     count, around = view.obstacles.shape[0], vicinity(numbers)
     view.looked[i, X], view.looked[i, Y], view.looked[i, FREE] = view.p[i, 0], view.p[i, 1], around
     view.around[i, 0] = 0
@@ -87,7 +89,7 @@ def look(numbers, view, i):
 
 @allocation_free
 def enter(listed, k):
-    """Put thing ``k`` into a list (1 + LISTED,): its length, or -1 where things do not fit, then things in ascending order."""
+    """Insert thing ``k`` into a list (1 + LISTED,): its length, or -1 after an overflow, then the things in ascending order."""
     length = listed[0]
     if length < 0:
         return
@@ -107,27 +109,27 @@ def enter(listed, k):
 
 @inlined
 def most_room(view, i, longest, need):
-    """Things with more room than this [m] leave agent ``i`` more than ``need`` [m], whatever they are."""
+    """Distance [m] beyond the kept one above which no obstacle or agent leaves agent ``i`` less room than ``need`` [m]."""
     return 2.0 * need - view.stopping[i] + longest + ROOM_ERROR
 
 
 @inlined
 def is_alone(view, i, longest, need, farthest):
-    """Whether the look-out says that nothing leaves agent ``i`` less room than ``need`` [m].
+    """Whether the least room at the last look shows that nothing leaves agent ``i`` less room than ``need`` [m].
 
     Args:
-        view: with what was seen.
+        view: contains the results of the last look.
         i: the agent.
         longest: the team's greatest stopping distance [m].
         need: at least the agent's own stopping distance [m].
-        farthest: that of :func:`look_out` [m].
+        farthest: the result of :func:`look_out` [m].
     """
     return view.looked[i, FREE] - displacement(view, i) - farthest > most_room(view, i, longest, need)
 
 
 @inlined
 def is_listed(numbers, view, i, longest, need, farthest):
-    """Whether the list has all that may leave agent ``i`` less room than ``need`` [m]; arguments of :func:`is_alone`."""
+    """Whether the list has everything that may leave agent ``i`` less room than ``need`` [m]; arguments of :func:`is_alone`."""
     left = vicinity(numbers) - displacement(view, i) - farthest
     return view.around[i, 0] >= 0 and left > most_room(view, i, longest, need)
 
@@ -137,12 +139,12 @@ def gather(numbers, view, i, longest, need, farthest):
     """Fill ``view.near`` with all things that leave agent ``i`` less room than ``need`` [m], in ascending order.
 
     Args:
-        numbers: the shield's.
-        view: to fill; where there is no look-out, grids are those of this moment.
+        numbers: numbers of the shield.
+        view: filled in place; without a look-out, its grids must be up to date.
         i: the agent.
         longest: the team's greatest stopping distance [m].
-        need: see above [m].
-        farthest: that of :func:`look_out` [m].
+        need: room below which things are gathered [m].
+        farthest: the result of :func:`look_out` [m].
     """
     found, watched = 0, view.looked.shape[0] > 0
     if watched and is_listed(numbers, view, i, longest, need, farthest):

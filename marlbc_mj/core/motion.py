@@ -1,7 +1,7 @@
-"""Obstacles that move with the mission clock: in a straight line, or back and forth. Beyond the paper, whose Assumption 2 has
-them at rest.
+"""Obstacles that move with the mission time: in a straight line, or back and forth.
 
-One law for the engine, metrics and drawings, so that an obstacle has one place at one time.
+This extends the paper, whose Assumption 2 has obstacles at rest. The engine, metrics and drawings use the same law, so that an
+obstacle has one position at any time.
 """
 
 import numpy as np
@@ -9,9 +9,9 @@ import numpy as np
 from marlbc_mj.core.laws import allocation_free, compiled
 
 NUMBERS = 6
-"""Columns of a motion: velocity x, y [m/s], amplitude x, y [m], angular frequency [rad/s], phase [rad]."""
+"""Number of columns of a motion: velocity x, y [m/s], amplitude x, y [m], angular frequency [rad/s], phase [rad]."""
 MOVING = 5
-"""Columns of an obstacle that moves: x, y, radius [m], velocity x, y [m/s]."""
+"""Number of columns of a moving obstacle: x, y, radius [m], velocity x, y [m/s]."""
 
 
 @allocation_free
@@ -35,7 +35,7 @@ def move(t, anchors, motions, out):
 
 @allocation_free
 def drift(t, obstacles, out):
-    """Where obstacles (K, 5) are after ``t`` [s] if each keeps the velocity it has, (K, 5) in ``out``: a tracker's prediction."""
+    """Predict obstacles (K, 5) after ``t`` [s] at constant velocity, as a tracker does, into ``out`` (K, 5)."""
     for k in range(obstacles.shape[0]):
         for axis in range(2):
             out[k, axis] = obstacles[k, axis] + obstacles[k, 3 + axis] * t
@@ -50,7 +50,7 @@ def _fill_moved(times, anchors, motions, out):
 
 
 def moved(times: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """:func:`move` at every one of ``times`` (M,) [s]: (M, K, 5)."""
+    """The obstacles (M, K, 5) that :func:`move` gives at each of the ``times`` (M,) [s]."""
     times = np.ascontiguousarray(times, dtype=np.float64)
     out = np.empty((len(times), len(anchors), MOVING))
     _fill_moved(times, np.ascontiguousarray(anchors, dtype=np.float64), np.ascontiguousarray(motions, dtype=np.float64), out)
@@ -58,16 +58,16 @@ def moved(times: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.nda
 
 
 def obstacles_at(time: float, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """(K, 3) x, y, radius [m] at ``time`` [s]; ``motions`` (0, 6) leaves the anchors (K, 3) where they are."""
+    """(K, 3) x, y, radius [m] of obstacles at ``time`` [s]; with ``motions`` (0, 6) these are the anchors (K, 3)."""
     if len(motions) == 0:
         return anchors
-    return np.ascontiguousarray(moved(np.array([time]), anchors, motions)[0, :, :3])  # compiled functions are made for such
+    return np.ascontiguousarray(moved(np.array([time]), anchors, motions)[0, :, :3])  # compiled functions expect this
 
 
 def nearest_places(times: np.ndarray, positions: np.ndarray, anchors: np.ndarray, motions: np.ndarray) -> np.ndarray:
-    """(K, 3) obstacles, each where it is nearest to an agent in an episode: the place to draw in a picture without time.
+    """(K, 3) obstacles, each at its closest approach to an agent in an episode: where a still picture draws it.
 
-    ``positions`` (M, N, 2) [m] at ``times`` (M,) [s].
+    ``positions`` (M, N, 2) [m] are those at ``times`` (M,) [s].
     """
     if len(motions) == 0:
         return anchors

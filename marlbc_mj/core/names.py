@@ -1,4 +1,4 @@
-"""Names for the numbers of a law: a law reads ``gains.limit`` or ``state.tau[axis]``, and the loop has rows of float64."""
+"""Names for the numbers of a law: a law reads ``gains.limit`` or ``state.tau[axis]``, while the loop stores rows of float64."""
 
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ Numbers = Mapping[str, Any] | Sequence[float] | np.ndarray
 
 
 class Owner(NamedTuple):
-    """The object that owns the names, for messages."""
+    """The law that owns the names, and the word for them in error messages."""
 
     law: str
     word: str  # "gain" or "state"
@@ -26,16 +26,16 @@ class Owner(NamedTuple):
 
 @dataclass(frozen=True)
 class Names:
-    """The fields of one row of float64, in this order. Without fields the row stays a plain vector."""
+    """The named fields of one row of float64, in order. Without fields the row is a plain vector."""
 
     shapes: tuple[tuple[str, tuple[int, ...]], ...] = ()  # name and shape of each field; () is a single number
 
     @classmethod
     def of(cls, declared: "Names | str | Iterable[str] | Mapping[str, Shape]") -> "Names":
-        """Names from what a decorator is given: names of single numbers, or names with the shapes of arrays.
+        """Make names from the argument of a decorator: names of single numbers, or a mapping of names to array shapes.
 
         Raises:
-            ConfigurationError: a name that stands twice, is no identifier, or already means something to NumPy's records.
+            ConfigurationError: a name that occurs twice, is not an identifier, or is an attribute of NumPy's records.
         """
         if isinstance(declared, Names):
             return declared
@@ -59,18 +59,18 @@ class Names:
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """The names alone."""
+        """The names without shapes."""
         return tuple(name for name, _ in self.shapes)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Names in a pickle are their shapes: the record's class is made anew."""
+        """Pickle the shapes only; the record's class is created again."""
         return Names, (self.shapes,)
 
     @cached_property
     def dtype(self) -> np.dtype[Any]:
-        """The row as one record, which Python and compiled code read alike.
+        """The type of the row as one record, which Python and compiled code read in the same way.
 
-        Its attributes are properties. NumPy's own records look each one up in Python, which takes five times as long.
+        Its attributes are properties, because NumPy's own records look each one up in Python, which takes five times as long.
         """
         fields: dict[str, Any] = {name: property(itemgetter(name), _setter(name)) for name in self.names}
         record = type("record", (np.void,), {"__slots__": (), **fields})
@@ -82,13 +82,13 @@ class Names:
         return self.dtype.itemsize // 8 if self.shapes else 0
 
     def at(self, name: str) -> int:
-        """Where in the row a field begins."""
+        """Index in the row at which a field begins."""
         return int(dict(self.dtype.fields or {})[name][1]) // 8
 
     def view(self, rows: np.ndarray) -> Any:
-        """One row (S or more,) as a record with these fields; a stack (..., S) as an array of records.
+        """View one row (S or more,) as a record with these fields, or a stack (..., S) as an array of records.
 
-        Nothing is copied: what is written to a field is written to the row.
+        Nothing is copied: writing to a field writes to the row.
         """
         if not self.shapes:
             return rows
@@ -97,10 +97,10 @@ class Names:
         return rows[..., : self.size].view(self.dtype)[..., 0].view(np.recarray)
 
     def row(self, numbers: Numbers, owner: Owner, default: float | None = None) -> np.ndarray:
-        """``numbers`` packed into one row (S,). A single number fills an array; a name left out has the default, if there is one.
+        """Pack ``numbers`` into one row (S,). A single number fills an array; an omitted name takes the default, if there is one.
 
         Raises:
-            ConfigurationError: a name that is missing or unknown, a shape that does not fit, or numbers without names.
+            ConfigurationError: a missing or unknown name, a wrong shape, or numbers without names although the row has names.
         """
         given = numbers._asdict() if hasattr(numbers, "_asdict") else numbers
         if not isinstance(given, Mapping):
@@ -118,7 +118,7 @@ class Names:
         return out
 
     def _vector(self, numbers: Sequence[float] | np.ndarray, owner: Owner) -> np.ndarray:
-        """Numbers without names, for a law that declares none."""
+        """Pack numbers without names, for a law that declares none."""
         if self.shapes:
             raise ConfigurationError(
                 f"law {owner.law!r} takes its {owner.word}s by name, got {numbers if np.ndim(numbers) == 0 else tuple(numbers)}; "
@@ -130,7 +130,7 @@ class Names:
         return row
 
     def _require(self, given: Mapping[str, Any], owner: Owner, complete: bool) -> None:
-        """Raise ConfigurationError unless the names given are these."""
+        """Raise ConfigurationError for an unknown name and, if ``complete``, for a missing one."""
         there = ", ".join(self.names) or "none; declare them in the law's decorator"
         for name in given:
             if name not in self.names:
@@ -148,7 +148,7 @@ def _setter(name: str) -> Callable[[Any, Any], None]:
 
 
 def _floats(value: Any, what: str) -> np.ndarray:
-    """A copy of a value as float64; ConfigurationError for one that is no number."""
+    """A copy of a value as float64; raises ConfigurationError if it is not numeric."""
     try:
         return np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -160,7 +160,7 @@ Declared = Names | str | Iterable[str] | Mapping[str, Shape]
 
 
 class Interface(NamedTuple):
-    """What a law was declared as: its kind, and the names of its gains and of its state."""
+    """The declaration of a law: its kind, and the names of its gains and state."""
 
     signature: Any = None
     gains: Names = Names()
@@ -168,7 +168,7 @@ class Interface(NamedTuple):
 
 
 def interface(law: Law) -> Interface:
-    """What a law was declared as, compiled or plain; an undeclared function has no kind and no names."""
+    """The declaration of a law, compiled or plain; an undeclared function has no kind and no names."""
     return cast(Interface, getattr(plain(law), "interface", Interface()))
 
 
@@ -180,11 +180,11 @@ def require_kind(law: Law, signature: Any) -> None:
 
 
 def pack_gains(law: Law, numbers: Numbers, kind: Any = None) -> np.ndarray:
-    """The row (P,) of gains that the loop hands to a law, from numbers by name.
+    """Pack numbers by name into the row (P,) of gains that the loop passes to a law.
 
     Raises:
-        ConfigurationError: a name that is missing or unknown, or an array of the wrong shape; says which, and shows the names.
-            With a ``kind``: the law was declared as another one.
+        ConfigurationError: a missing or unknown name, or an array of the wrong shape; the message says which. With a ``kind``,
+            also a law that was declared as another kind.
     """
     if kind is not None and interface(law).signature is not None:
         require_kind(law, kind)
@@ -192,26 +192,26 @@ def pack_gains(law: Law, numbers: Numbers, kind: Any = None) -> np.ndarray:
 
 
 def pack_state(law: Law, numbers: Numbers) -> np.ndarray:
-    """The row (S,) of a law's state, from numbers by name; what is left out starts at 0.
+    """Pack numbers by name into the row (S,) of a law's state; omitted names start at 0.
 
     Raises:
-        ConfigurationError: an unknown name, or an array of the wrong shape; says which, and shows the names.
+        ConfigurationError: an unknown name, or an array of the wrong shape; the message says which.
     """
     return interface(law).state.row(numbers, Owner(name_of(law), "state"), default=0.0)
 
 
 def as_gains(law: Law, numbers: Numbers) -> Any:
-    """Gains as a law reads them, for calling it from Python; see :func:`pack_gains`."""
+    """Gains in the form that a law reads, for calling it from Python; see :func:`pack_gains`."""
     return interface(law).gains.view(pack_gains(law, numbers))
 
 
 def as_state(law: Law, numbers: Numbers) -> Any:
-    """State as a law reads and writes it, for calling it from Python; see :func:`pack_state`."""
+    """State in the form that a law reads and writes, for calling it from Python; see :func:`pack_state`."""
     return interface(law).state.view(pack_state(law, numbers))
 
 
 def gains_of(owner: Any, **given: Any) -> dict[str, Any]:
-    """Gains of ``owner.law`` by name: those given, and all others from the fields of ``owner`` that have their names.
+    """Gains of ``owner.law`` by name: those in ``given``, and all others from the fields of ``owner`` with the same names.
 
     Raises:
         ConfigurationError: the law has a gain that is neither given nor a field.
@@ -227,14 +227,14 @@ def gains_of(owner: Any, **given: Any) -> dict[str, Any]:
 
 
 def name_of(law: Law) -> str:
-    """A law's name, for messages."""
+    """A law's name, for error messages."""
     return str(getattr(law, "__name__", repr(law)))
 
 
 def refuse_undeclared(law: Law, error: Exception) -> None:
     """Raise ConfigurationError if an error means that a law uses a name that it does not declare; else do nothing.
 
-    NumPy's records say so by AttributeError, numba's compiler by KeyError.
+    NumPy's records raise AttributeError for such a name, numba's compiler KeyError.
     """
     said = re.search(r"record'? object has no attribute '(\w+)'", str(error)) if isinstance(error, AttributeError) else None
     wrong = said.group(1) if said else error.args[0] if isinstance(error, KeyError) else None

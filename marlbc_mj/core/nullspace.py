@@ -1,8 +1,9 @@
-"""The terms of null-space composition (12): the part that one behavior adds, and the directions that it closes (erratum 5).
+"""One term of null-space composition (12): the velocity that a behavior adds, and the directions that it blocks (erratum 5).
 
-A^+ A is the orthogonal projector onto the row space of A, the Jacobians of all behaviors of higher priority. So N = I - A^+ A is
-applied through an orthonormal basis of that space: no inverse is formed, a rank-deficient stack needs no special case, and any
-number of behaviors with any Jacobians composes by the same lines. :func:`marlbc_mj.engine.composition.compose` is the whole sum.
+A stacks the Jacobians of all behaviors of higher priority, and A^+ A is the orthogonal projector onto its row space. So
+N = I - A^+ A is applied through an orthonormal basis of that space: no inverse is formed, a rank-deficient stack needs no special
+case, and the same code composes any number of behaviors with any Jacobians. :func:`marlbc_mj.engine.composition.compose` computes
+the whole sum.
 """
 
 import numpy as np
@@ -15,9 +16,9 @@ RANK_TOLERANCE = 1e-9
 
 @allocation_free
 def add_behavior(velocity, jacobian, rows, basis, rank, out):
-    """One term of (12): add the part of ``velocity`` that those above leave free, and shut the directions of ``jacobian``.
+    """Add one term of (12): the part of ``velocity`` that higher priorities leave free; block the directions of ``jacobian``.
 
-    The first ``rank`` rows of ``basis`` span the Jacobians above; returns the new rank. At full rank nothing is left to add.
+    The first ``rank`` rows of ``basis`` span the Jacobians of higher priority. Returns the new rank. Full rank adds nothing.
     """
     n = out.shape[0]
     if rank == n:
@@ -39,9 +40,9 @@ def add_behavior(velocity, jacobian, rows, basis, rank, out):
 
 @allocation_free
 def _project(vector, basis, rank):
-    """Put the part of ``vector`` (n,) outside the span of the first ``rank`` rows of ``basis`` into row ``rank``; its length.
+    """Put the part of ``vector`` (n,) outside the span of the first ``rank`` rows of ``basis`` into row ``rank``.
 
-    The projection is done twice, which brings it to machine precision.
+    Returns its length. Projecting twice makes the result accurate to machine precision.
     """
     n = vector.shape[0]
     for axis in range(n):

@@ -15,9 +15,9 @@ SEPARATOR = ">"
 class Orders:
     """All priority orders of M behaviors, in lexicographic order.
 
-    A behavior is *complete* when its Jacobian has full column rank (FM and FR: J = I): nothing of lower priority is then
-    left to project. Two orders that agree down to their first complete behavior give the same command and count as
-    equal, so the 6 orders of OA, FM and FR make 4 commands (spec: FM, FR, OA>FM, OA>FR).
+    A behavior is *complete* if its Jacobian has full column rank (FM and FR: J = I). Behaviors of lower priority then have no
+    effect. Two orders that agree down to their first complete behavior give the same command and count as equal, so the 6 orders
+    of OA, FM and FR make 4 commands (FM, FR, OA>FM, OA>FR).
     """
 
     def __init__(self, names: Sequence[str], complete: Sequence[bool]) -> None:
@@ -45,21 +45,21 @@ class Orders:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Every order's full name, ``"OA>FM>FR"`` for example, by index."""
+        """Full name of every order by index, for example ``"OA>FM>FR"``."""
         return tuple(SEPARATOR.join(self.behaviors[j] for j in row) for row in self.table)
 
     def read(self, given: Any) -> np.ndarray:
-        """Indices as compiled code takes them, int64 and contiguous, from what a caller hands in; of any shape and range.
+        """Convert a caller's orders to contiguous int64 indices for compiled code; shape and range are not checked.
 
         Args:
-            given: whole numbers, or names as :meth:`index` takes them: an array, nested lists or a tensor in main memory.
+            given: integers, or names that :meth:`index` accepts: an array, nested lists or a tensor in main memory.
 
         Raises:
-            ConfigurationError: anything else, or a name that is no order's.
+            ConfigurationError: any other type, or a name that is not an order.
         """
         try:
             array = np.asarray(given)
-        except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; a tensor on a GPU, or one that wants gradients
+        except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; a tensor on a GPU, or one that requires gradients
             raise ConfigurationError(f"orders must be integers, got {type(given).__name__}: {one_line(error)}") from None
         if array.dtype.kind == "U":
             array = np.array([self.index(str(name)) for name in array.ravel()], dtype=np.int64).reshape(array.shape)

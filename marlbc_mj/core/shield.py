@@ -1,15 +1,15 @@
-"""The shield: the force that is nearest to the controller's and keeps every agent able to stop in time, whatever f does.
+"""The shield: the force nearest to the controller's that keeps every agent able to stop in time, whatever f does.
 
-What is safe is in :mod:`marlbc_mj.core.stopping`: the velocity w that a force leads to must be in one disc for every thing
-that is near. Braking is in all of them at once from |v| = h U / m on; below it, stopping within the substep is, but for a
-drift of h^2 B / m that retreating from the nearest thing takes back. Hence S is invariant for any number of agents and any
-controller, see docs/shield.md for the proof and for what is assumed.
+:mod:`marlbc_mj.core.stopping` defines what is safe: the velocity w that a force leads to must be in one disc for every near thing
+(obstacle or agent). From |v| = h U / m on, braking is in all discs at once. Below it, stopping within the substep is, except for
+a drift of h^2 B / m, which a retreat from the nearest thing makes up for. Hence S is invariant for any number of agents and any
+controller; docs/shield.md has the proof and its assumptions.
 
-The least change for one thing is the projection of w on its disc. It is the discrete, whole form of the barrier sqrt(2 a d) + n.v
-(Wang, Ames & Egerstedt 2017): nothing is linearized, and the tangential speed counts.
+The least change for one thing is the projection of w onto its disc. This is the exact discrete form of the barrier
+sqrt(2 a d) + n.v (Wang, Ames & Egerstedt 2017): nothing is linearized, and the tangential speed counts.
 
-Robots whose force is not known to act at once are shielded one level higher, by :func:`restrain_references`: their references
-always can brake, and robots are assumed to stay within a tube around them.
+Robots without a known ``force_error`` are shielded one level higher, by :func:`restrain_references`: their references can always
+brake, and the robots are assumed to stay within a tube around them.
 """
 
 from dataclasses import dataclass
@@ -41,44 +41,46 @@ from marlbc_mj.core.stopping import (
 )
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
-ROUNDS = 8  # of projections, where several things are near
+ROUNDS = 8  # greatest number of projections if several things are near
 SPEED_BROKEN, FORCE_BROKEN, STATE_BROKEN, MOTION_BROKEN, TUBE_BROKEN = 0, 1, 2, 3, 4
-"""Assumptions that are watched: the speed cap, the bound of all that is not u, that the state is in S, that it is in S for
-obstacles that move, and the tube around references."""
+"""Monitored assumptions: the speed cap, the bound of all forces other than u, the state in S, the state in S with respect to
+moving obstacles, and the tube around references."""
 ASSUMPTIONS = ("speed", "force", "state", "motion", "tube")
-"""Their names, in the order of their indices."""
+"""Names of the monitored assumptions, by index."""
 
 
 @dataclass(frozen=True)
 class Shield:
-    """Assumptions and distances of a shield. None takes the scenario's or the robot's own number.
+    """Assumptions and distances of a shield. None takes the number of the scenario or the robot.
 
-    What can be checked is checked when a world is made; what cannot is watched while it runs, see :class:`ShieldCounts`.
+    Assumptions that can be checked are checked when a world is made. The others are monitored while it runs, see
+    :class:`ShieldCounts`.
 
     Raises:
         ConfigurationError: naming the invalid value.
     """
 
-    force_limit: float | None = None  # U, available in every direction within a substep; None: the scenario's, per axis [N]
-    disturbance: ForceBound | None = None  # of |f|; None: the scenario's disturbance at the greatest scale that it draws
-    speed_cap: float | None = None  # v_s; None: where f takes half of what it leaves of U at rest [m/s]
-    force_error: float | None = None  # of the robot within a substep, see Robot; None: the robot's own, if it is known [N]
-    clearance: float | None = None  # from obstacles; None: the scenario's safe distance [m]
-    agent_distance: float | None = None  # between middles; None: two radii of the robot [m]
-    margin: float = 1e-3  # that both distances are exceeded by [m]
-    position_error: float = 0.0  # between what is known of p and p itself [m]
-    velocity_error: float = 0.0  # of v [m/s]
-    latency: float = 0.0  # of messages between agents; a whole number of substeps [s]
-    message_loss: float = 0.0  # share of messages that are lost, at random
+    force_limit: float | None = None  # U: force available in every direction within a substep; None: the scenario's, per axis [N]
+    disturbance: ForceBound | None = None  # bound of |f|; None: that of the scenario's disturbance at its greatest drawn scale
+    speed_cap: float | None = None  # v_s; None: the speed at which half of the braking force at rest is left [m/s]
+    force_error: float | None = None  # bound of the robot's own error within a substep; None: the robot's, if known [N]
+    clearance: float | None = None  # distance kept from obstacles; None: the scenario's safe distance [m]
+    agent_distance: float | None = None  # distance kept between the centers of agents; None: two radii of the robot [m]
+    margin: float = 1e-3  # added to both distances [m]
+    position_error: float = 0.0  # greatest error of the known position p [m]
+    velocity_error: float = 0.0  # greatest error of the known velocity v [m/s]
+    latency: float = 0.0  # latency of messages between agents; a whole number of substeps [s]
+    message_loss: float = 0.0  # probability that a message is lost
     silent: int = -1  # agent whose messages are all lost; -1: none
-    obstacle_speed: float = 2.0  # at most, where obstacles move [m/s]
-    obstacle_acceleration: float = 2.0  # at most, where they move [m/s^2]
-    level: Literal["force", "reference"] | None = None  # what is changed; None: forces, if the robot's force_error is known
-    tube: float | None = None  # around references, which this shields; None: computed or the robot's own, if it is known [m]
+    obstacle_speed: float = 2.0  # greatest speed of moving obstacles [m/s]
+    obstacle_acceleration: float = 2.0  # greatest acceleration of moving obstacles [m/s^2]
+    level: Literal["force", "reference"] | None = None
+    """What is changed. None: references if a tube is given, the force error is unknown or the team is mixed, otherwise forces."""
+    tube: float | None = None  # radius of the tube around references [m]; None: computed, or the robot's own, if known
 
     @property
     def mailed(self) -> bool:
-        """Whether agents know each other's states from messages that may be late or lost; else they know them at every moment."""
+        """Whether agents know each other's states only from messages that may be late or lost, not in every substep."""
         return self.latency > 0.0 or self.message_loss > 0.0 or self.silent >= 0
 
     def __post_init__(self) -> None:
@@ -115,11 +117,11 @@ class Shield:
 
 
 class ShieldCounts(NamedTuple):
-    """Interventions and breaches of a shield since the episode began: rows of one team, or (B, ...) of many."""
+    """Interventions of a shield and breaches of its assumptions since the episode began, for one team or for many, (B, ...)."""
 
-    interventions: np.ndarray  # (N,) substeps in which it changed the force, or the reference velocity
-    change: np.ndarray  # (N,) integral of |u - wish| dt, or m |v_r - wish| of every mission step [N s]
-    breaches: np.ndarray  # (N, 5) substeps in which an assumption did not hold, in the order of ASSUMPTIONS
+    interventions: np.ndarray  # (N,) number of substeps in which the shield changed the force or reference velocity
+    change: np.ndarray  # (N,) integral of |u - wish| dt, or sum of m |v_r - wish| over mission steps [N s]
+    breaches: np.ndarray  # (N, 5) number of substeps in which each of the ASSUMPTIONS did not hold
 
 
 @allocation_free
@@ -134,9 +136,9 @@ def within(x, y, centre_x, centre_y, radius):
 
 @allocation_free
 def nearest_safe(numbers, view, i, x, y):
-    """The desired velocity (x, y) [m/s], projected repeatedly on the disc that it is farthest out of; one thing needs one round.
+    """Project the desired velocity (x, y) [m/s] repeatedly onto the disc that it violates most; one thing needs one round.
 
-    The result is within what the actuators reach; whether it is safe is for :func:`~marlbc_mj.core.stopping.stays_safe` to say.
+    The result is within reach of the actuators; :func:`~marlbc_mj.core.stopping.stays_safe` tells whether it is safe.
     """
     authority = view.h * numbers.force_limit / numbers.mass
     speed = min(numbers.speed_cap, speed_of(numbers, view, i) + authority)
@@ -160,8 +162,10 @@ def nearest_safe(numbers, view, i, x, y):
 
 @allocation_free
 def last_resort(numbers, view, i, k):
-    """Braking with all there is, down to rest; of an agent that is slow already, what is nearest to rest and safe, and where
-    nothing is, a retreat from thing ``k``, as far as f may push meanwhile. Rest is that of thing ``k``, if it moves.
+    """The velocity [m/s] after braking at full force towards rest, which is relative to thing ``k`` if that moves.
+
+    If the agent can stop within the substep but rest is not safe, it is the safe velocity nearest to rest. If none is found, it
+    is a retreat from thing ``k`` as fast as f may push meanwhile.
     """
     authority = view.h * numbers.force_limit / numbers.mass
     pace_x, pace_y = pace_of(view, k)
@@ -182,7 +186,7 @@ def last_resort(numbers, view, i, k):
 def safe_velocity(numbers, view, i, k, x, y):
     """The first of {the projection of (x, y); its tangential part; braking} that stays safe: w [m/s] of agent ``i``.
 
-    Where obstacles move, braking may not stay safe either: then it is the one of first and last that is less far out.
+    If obstacles move, braking may not be safe either. Then it is the projection or braking, whichever violates its discs less.
     """
     next_x, next_y = nearest_safe(numbers, view, i, x, y)
     if stays_safe(numbers, view, i, next_x, next_y):
@@ -205,17 +209,17 @@ def safe_velocity(numbers, view, i, k, x, y):
 
 @allocation_free
 def farthest_out(numbers, view, i, x, y):
-    """How far w = (x, y) is out of the disc that it is farthest out of [m/s]; 0 where it is in all of them."""
+    """Greatest distance by which w = (x, y) is outside a disc [m/s]; 0 if it is inside all of them."""
     worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
     return most_violated(numbers, view, i, max(braking(numbers, worst), 0.0), reach_of(numbers, view, worst), x, y)[1]
 
 
 @allocation_free
 def watch_assumptions(numbers, view, i, last, breaches):
-    """Count for agent ``i`` a speed beyond the cap, and a force beyond its bound since the ``last`` substep (2, 2): v and u.
+    """Count for agent ``i`` a speed above the cap, and a force above its bound since the ``last`` substep (2, 2): v and u.
 
-    All that is not u shows in m (v+ - v) / h - u: disturbance, contact, lag and loss of actuators. What of it is friction against
-    the motion does not count: it only takes agents nearer to rest, which is in every disc.
+    All forces other than u appear in m (v+ - v) / h - u: disturbance, contact, lag and loss of actuators. Friction against the
+    motion is not counted, because it only brings agents nearer to rest, which is in every disc.
     """
     x, y = view.moving[i, 0], view.moving[i, 1]
     speed = np.sqrt(x * x + y * y)
@@ -235,7 +239,7 @@ def watch_assumptions(numbers, view, i, last, breaches):
 
 @allocation_free
 def target_of(numbers, view, i, force):
-    """(w [m/s], worst speed [m/s], need [m]): where ``force`` (2,) [N] takes agent ``i``, and how near things matter then."""
+    """(w [m/s], worst speed [m/s], need [m]) of agent ``i`` under ``force`` (2,) [N]; things with less room than need matter."""
     per = view.h / numbers.mass
     x, y = view.v[i, 0] + per * force[0], view.v[i, 1] + per * force[1]
     worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
@@ -244,7 +248,7 @@ def target_of(numbers, view, i, force):
 
 @allocation_free
 def most_needed(numbers, view, i, worst, need):
-    """How near things matter to agent ``i`` whatever is done about its force [m]: at least ``need`` [m] of :func:`target_of`."""
+    """Room [m] below which things matter to agent ``i`` for any force of the shield; at least ``need`` of :func:`target_of`."""
     authority = view.h * numbers.force_limit / numbers.mass
     fastest = speed_of(numbers, view, i) + authority + spread_of(numbers, view, i) + TINY
     return max(need, reach_of(numbers, view, max(worst, fastest)))
@@ -252,9 +256,9 @@ def most_needed(numbers, view, i, worst, need):
 
 @allocation_free
 def shield_agent(numbers, view, i, target, force, counts):
-    """Replace ``force`` (2,) [N] of agent ``i`` by the nearest that keeps the team in S; one that does so stays bit for bit.
+    """Replace ``force`` (2,) [N] of agent ``i`` by the nearest one that keeps the team in S; a safe force is left unchanged.
 
-    ``view.near`` has all that may matter; ``target`` is that of :func:`target_of`.
+    ``view.near`` must contain all things that may matter; ``target`` is the result of :func:`target_of`.
     """
     per = view.h / numbers.mass
     x, y, worst, need = target
@@ -272,7 +276,7 @@ def shield_agent(numbers, view, i, target, force, counts):
 
 @allocation_free
 def fill_stopping(numbers, view):
-    """Stopping distances L_i of one team, into the view; returns the greatest [m]."""
+    """Write the stopping distances L_i of one team into the view; returns the greatest one [m]."""
     longest = 0.0
     for i in range(view.p.shape[0]):
         view.stopping[i] = stopping_distance(numbers, speed_of(numbers, view, i))
@@ -282,15 +286,17 @@ def fill_stopping(numbers, view):
 
 @allocation_free
 def shield_team(numbers, view, last, force, counts):
-    """Shield the forces (N, 2) [N] of one team, which all agents choose at once, knowing each other's present state or, where
-    messages are late, the half-planes in its place.
+    """Shield the forces (N, 2) [N] of one team.
+
+    All agents choose at the same time. They know each other's current states or, if messages may be late, the half-planes that
+    replace them.
 
     Args:
-        numbers: the shield's.
-        view: what it knows.
-        last: (N, 2, 2) v and u of the substep before, NaN at the start; this one's afterwards.
+        numbers: numbers of the shield.
+        view: what the shield knows of the team.
+        last: (N, 2, 2) v and u of the previous substep, NaN at the start; replaced by those of this substep.
         force: (N, 2) the controllers' forces; changed in place.
-        counts: rows of this team; added to.
+        counts: counts of this team; incremented in place.
     """
     longest, farthest, watched = fill_stopping(numbers, view), 0.0, view.looked.shape[0] > 0
     if watched:
@@ -312,7 +318,7 @@ def shield_team(numbers, view, last, force, counts):
 
 @allocation_free
 def fill_grids(view):
-    """Sort the team, and obstacles that move, into the view's grids, if it has any; a mission step has sorted the others."""
+    """Sort the team and moving obstacles into the view's grids, if it has any; obstacles at rest are already sorted."""
     if view.grid.shape[0] > 0:
         if view.obstacles.shape[1] > 3:
             fill(view.obstacles, view.grid[: room(view.obstacles.shape[0])])
@@ -321,17 +327,17 @@ def fill_grids(view):
 
 @allocation_free
 def restrain_references(numbers, braking_limit, duration, at, obstacles, previous, v_r):
-    """Change reference velocities ``v_r`` (N, 2) [m/s], in place: references, a tube around each, can brake before anything.
+    """Change reference velocities ``v_r`` (N, 2) [m/s] in place, so that all references, each with a tube, can brake in time.
 
-    See :func:`marlbc_mj.core.braking.restrain`, which agents go through one after the other.
+    :func:`marlbc_mj.core.braking.restrain` is applied to one agent after the other.
 
     Args:
-        numbers: the shield's.
+        numbers: numbers of the shield.
         braking_limit: acceleration limit of references [m/s^2].
-        duration: of a mission step [s].
-        at: (N, 2) references [m].
+        duration: duration of a mission step [s].
+        at: (N, 2) reference positions [m].
         obstacles: (K, 3) x, y, radius [m].
-        previous: (N, 2) v_r of the mission step before [m/s]; what was chosen afterwards.
+        previous: (N, 2) v_r of the previous mission step [m/s]; replaced by the chosen v_r.
         v_r: (N, 2) desired velocities within the limits of speed and acceleration.
     """
     kept, between = numbers.clearance + numbers.tube, numbers.agent_distance + 2.0 * numbers.tube

@@ -1,23 +1,23 @@
-"""From which states can agents stop in time? The stopping ball, the safe set, and the forces that lead from it into it.
+"""States from which agents can stop in time: the stopping ball, the safe set, and the forces that keep a state in that set.
 
 The plant is m v' = u + f with |f| <= B(|v|), a :class:`ForceBound`, and |u| <= U in every direction. Braking decelerates by at
-least a_b(|v|) = (U - B(|v|)) / m, so the path that is left is at most L(v) = |v|^2 / (2 a_b(|v|)), the radius of the *stopping
+least a_b(|v|) = (U - B(|v|)) / m, so the remaining path is at most L(v) = |v|^2 / (2 a_b(|v|)), the radius of the *stopping
 ball*. A team is safe in
 
     S = {d_k >= L_i for every obstacle k,  |p_i - p_j| - D >= L_i + L_j for every pair,  |v_i| <= v_s},
 
-with d_k the clearance beyond the distance that is kept. A force leads from S to S if its worst next state does. The next velocity
-v+ = v + h (u + f) / m lies in a ball of radius h B / m around w = v + h u / m, and moves the agent by h v+. Obstacles are convex,
-so d+ >= d + h n.v+ with n the normal, and d+ >= L(v+) is
+with d_k the clearance in excess of the kept distance. A force keeps the team in S if its worst next state is in S. The next
+velocity v+ = v + h (u + f) / m lies in a ball of radius h B / m around w = v + h u / m, and moves the agent by h v+. Obstacles
+are convex, so d+ >= d + h n.v+ with n the normal, and d+ >= L(v+) holds if
 
     |w - a h n| + h B / m <= sqrt(2 a C + a^2 h^2),   a = a_b(|w| + h B / m):
 
-w must be in a disc. C is the room: d_k for an obstacle; of a pair each agent takes half of the gap |p_i - p_j| - D - L_i - L_j,
-so C = L_i + gap / 2.
+w must be in a disc. C is the *room*. For an obstacle it is d_k. In a pair each agent takes half of the gap
+|p_i - p_j| - D - L_i - L_j, so C = L_i + gap / 2.
 
-An obstacle that moves is looked at in its own frame: v - v_k in the place of v, and m A_o added to B, with A_o the acceleration
-that it may have. To stop then means to follow it. That keeps clear of one thing that moves; of several there may be no force that
-keeps clear of all, see docs/shield.md.
+A moving obstacle is treated in its own frame: v - v_k replaces v, and m A_o is added to B, with A_o the greatest acceleration of
+the obstacle. Stopping then means following it. This avoids one moving obstacle; with several there may be no force that avoids
+all of them, see docs/shield.md.
 """
 
 from typing import NamedTuple
@@ -27,8 +27,8 @@ import numpy as np
 from marlbc_mj.core.cells import nearest, room
 from marlbc_mj.core.laws import allocation_free, inlined
 
-FAR = 1e9  # stopping distance of a speed from which nothing brakes [m]
-TINY = 1e-9  # rounding of a speed [m/s] or distance [m]
+FAR = 1e9  # stopping distance at a speed that leaves no force to brake [m]
+TINY = 1e-9  # rounding error of a speed [m/s] or distance [m]
 
 
 class ForceBound(NamedTuple):
@@ -44,85 +44,85 @@ class ForceBound(NamedTuple):
 
 
 class ShieldNumbers(NamedTuple):
-    """A shield's assumptions, all resolved, as the laws take them."""
+    """Assumptions and distances of a shield as numbers, without open fields."""
 
     force_limit: float  # U [N]
     box: float  # limit of the actuators per axis [N]
     mass: float  # [kg]
-    constant: float  # of the force bound [N]
-    linear: float  # [N s/m]
-    quadratic: float  # [N s^2/m^2]
-    speed_cap: float  # [m/s]
-    clearance: float  # kept from obstacles, with margin and error [m]
-    agent_distance: float  # D, with margin and errors [m]
-    velocity_error: float  # of what is known of v, and of what v may lag behind the force [m/s]
+    constant: float  # constant term of the force bound [N]
+    linear: float  # linear coefficient of the force bound [N s/m]
+    quadratic: float  # quadratic coefficient of the force bound [N s^2/m^2]
+    speed_cap: float  # v_s [m/s]
+    clearance: float  # distance kept from obstacles, including margin and error [m]
+    agent_distance: float  # D, including margin and errors [m]
+    velocity_error: float  # greatest error of the known v, plus the lag of v behind the force [m/s]
     slack: float = 0.0  # part of the margin that drifts may use up before the state counts as outside S [m]
-    friction: float = 0.0  # that only slows an agent down, and does not count as a disturbance [N]
-    obstacle_speed: float = 0.0  # of obstacles that move, at most [m/s]
-    obstacle_acceleration: float = 0.0  # A_o, likewise [m/s^2]
-    latency: float = 0.0  # of messages [substeps]
-    quantile: float = -np.inf  # messages are lost where a standard normal number is below
+    friction: float = 0.0  # friction that only slows an agent down, and does not count as a disturbance [N]
+    obstacle_speed: float = 0.0  # greatest speed of moving obstacles [m/s]
+    obstacle_acceleration: float = 0.0  # A_o: greatest acceleration of moving obstacles [m/s^2]
+    latency: float = 0.0  # latency of messages [substeps]
+    quantile: float = -np.inf  # a message is lost if its standard normal number is below this
     silent: float = -1.0  # agent whose messages are all lost; negative: none
-    tube: float = 0.0  # of a shield of references: how far agents may be from theirs [m]; 0: a shield of forces
+    tube: float = 0.0  # greatest distance of agents from their references [m], for a shield of references; 0: a shield of forces
 
 
 _RECORD = np.dtype((np.record, [(name, np.float64) for name in ShieldNumbers._fields]))
 
 
 def as_records(numbers: ShieldNumbers) -> np.ndarray:
-    """(1,) records with the same fields: a loop over threads takes arrays within a named tuple, but no named tuple."""
+    """A (1,) array of records with the same fields: a threaded loop takes arrays, but no tuples, within a NamedTuple."""
     return np.array([tuple(numbers)], dtype=_RECORD)
 
 
 NO_SHIELD = ShieldNumbers(0.0, np.inf, 1.0, 0.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)
-"""Numbers of a team that has none."""
+"""Numbers of a team without a shield."""
 
 
 class ShieldView(NamedTuple):
     """What a shield sees of one team at the start of a substep."""
 
     h: float  # substep [s]
-    p: np.ndarray  # (N, 2) as it is known [m]
-    v: np.ndarray  # (N, 2) as it is known [m/s]
-    moving: np.ndarray  # (N, 2) v itself, for what is watched [m/s]
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move
+    p: np.ndarray  # (N, 2) known positions [m]
+    v: np.ndarray  # (N, 2) known velocities [m/s]
+    moving: np.ndarray  # (N, 2) true velocities, for monitoring [m/s]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] if they move
     stopping: np.ndarray  # (N,) L_i, filled by shield_team [m]
-    grid: np.ndarray  # room for a grid of the obstacles, filled, and one of the team; empty where trying all pairs costs less
-    planes: np.ndarray  # (N, N, 2, 3) half-planes in the place of agents, see marlbc_mj.core.stamps; (0, 0, 2, 3): all know all
+    grid: np.ndarray  # filled grid of the obstacles, then room for one of the team; empty if trying all pairs costs less
+    planes: np.ndarray  # (N, N, 2, 3) half-planes that replace agents, see marlbc_mj.core.stamps; (0, 0, 2, 3) without messages
     looked: np.ndarray  # (N, 3) where each agent last looked from, see marlbc_mj.core.lookout; (0, 3): no look-out
-    around: np.ndarray  # (N, 1 + LISTED) int64, what was around each agent when it looked; (0, 1 + LISTED)
-    near: np.ndarray  # (1 + things,) int64 scratch: how many things may be too near to the agent at hand, then which
+    around: np.ndarray  # (N, 1 + LISTED) int64, things near each agent when it looked; (0, 1 + LISTED): no look-out
+    near: np.ndarray  # (1 + things,) int64 scratch: number of things that may matter to the current agent, then their indices
 
 
 @inlined
 def force_bound(numbers, speed):
-    """B at a speed [m/s], in N."""
+    """B [N] at a speed [m/s]."""
     return numbers.constant + speed * (numbers.linear + speed * numbers.quadratic)
 
 
 @inlined
 def braking(numbers, speed):
-    """a_b [m/s^2] at a speed [m/s]; not positive where f may be stronger than the actuators."""
+    """a_b [m/s^2] at a speed [m/s]; not positive if f may be stronger than the actuators."""
     return (numbers.force_limit - numbers.constant - speed * (numbers.linear + speed * numbers.quadratic)) / numbers.mass
 
 
 @allocation_free
 def stopping_distance(numbers, speed):
-    """L = |v|^2 / (2 a_b(|v|)) [m] of a speed [m/s]."""
+    """L = |v|^2 / (2 a_b(|v|)) [m] at a speed [m/s]."""
     a = braking(numbers, speed)
     return 0.5 * speed * speed / a if a > 0.0 else FAR
 
 
 @allocation_free
 def following_distance(numbers, speed):
-    """L [m] of a ``speed`` [m/s] relative to an obstacle that moves."""
+    """L [m] at a ``speed`` [m/s] relative to a moving obstacle."""
     a = braking(numbers, speed + numbers.obstacle_speed) - numbers.obstacle_acceleration
     return 0.5 * speed * speed / a if a > 0.0 else FAR
 
 
 @allocation_free
 def retreat_drift(numbers, h, speed):
-    """What a retreat at ``speed`` [m/s] may cost of the gap to other things in one substep [m]: 2 h^2 B / m + L(2 h B / m)."""
+    """Greatest loss of gap to other things [m] by a retreat at ``speed`` [m/s] in one substep: 2 h^2 B / m + L(2 h B / m)."""
     fastest = 2.0 * h * force_bound(numbers, speed) / numbers.mass
     return h * fastest + stopping_distance(numbers, fastest)
 
@@ -136,19 +136,19 @@ def speed_of(numbers, view, i):
 
 @inlined
 def spread_of(numbers, view, i):
-    """Radius h B / m of the ball that v+ lies in [m/s]; the error of what is known of v adds to it."""
+    """Radius of the ball that contains v+ [m/s]: h B / m plus the error of the known velocity."""
     return view.h * force_bound(numbers, speed_of(numbers, view, i)) / numbers.mass + numbers.velocity_error
 
 
 @allocation_free
 def thing_count(view):
-    """How many things there are: obstacles, then agents, then two half-planes per agent where messages may be late."""
+    """Number of things: obstacles, then agents, then two half-planes per agent if messages may be late."""
     return view.obstacles.shape[0] + view.p.shape[0] + 2 * view.planes.shape[0]
 
 
 @allocation_free
 def concerns(view, i, k):
-    """Whether agent ``i`` keeps clear of thing ``k``: not of itself, and of half-planes in the place of agents."""
+    """Whether agent ``i`` keeps clear of thing ``k``: never of itself, and of half-planes instead of agents if there are any."""
     j = k - view.obstacles.shape[0]
     if view.planes.shape[0] == 0:
         return j != i
@@ -157,7 +157,7 @@ def concerns(view, i, k):
 
 @allocation_free
 def plane_distance(view, i, k):
-    """(d [m], n) of agent ``i`` from the half-plane that is thing ``k``."""
+    """(d [m], n): distance of agent ``i`` from the border of the half-plane that is thing ``k``, and the normal."""
     j = (k - view.obstacles.shape[0] - view.p.shape[0]) // 2
     slot = (k - view.obstacles.shape[0] - view.p.shape[0]) % 2
     x, y = view.planes[i, j, slot, 0], view.planes[i, j, slot, 1]
@@ -166,19 +166,19 @@ def plane_distance(view, i, k):
 
 @allocation_free
 def moves(view, k):
-    """Whether thing ``k`` is an obstacle that moves."""
+    """Whether thing ``k`` is a moving obstacle."""
     return k >= 0 and k < view.obstacles.shape[0] and view.obstacles.shape[1] > 3
 
 
 @allocation_free
 def pace_of(view, k):
-    """Velocity of the frame that thing ``k`` is looked at in [m/s]: an obstacle's own; 0 for one at rest, an agent or -1."""
+    """Velocity [m/s] of the frame in which thing ``k`` is treated: that of a moving obstacle; 0 for other things and -1."""
     return (view.obstacles[k, 3], view.obstacles[k, 4]) if moves(view, k) else (0.0, 0.0)
 
 
 @allocation_free
 def reach_of(numbers, view, speed):
-    """How near things matter to an agent that may have ``speed`` [m/s] after this substep [m]: h |v| + L(v)."""
+    """Room [m] below which things matter to an agent that may have ``speed`` [m/s] after this substep: h |v| + L(v)."""
     if view.obstacles.shape[1] > 3:
         speed += numbers.obstacle_speed + view.h * numbers.obstacle_acceleration
         a = braking(numbers, speed + numbers.obstacle_speed) - numbers.obstacle_acceleration
@@ -189,7 +189,7 @@ def reach_of(numbers, view, speed):
 
 @allocation_free
 def near(numbers, view, i, k, need):
-    """Whether thing ``k`` leaves agent ``i`` less room than ``need`` [m]. No roots."""
+    """Whether thing ``k`` leaves agent ``i`` less room than ``need`` [m]; computed without square roots."""
     count = view.obstacles.shape[0]
     if k < count:
         x, y = view.p[i, 0] - view.obstacles[k, 0], view.p[i, 1] - view.obstacles[k, 1]
@@ -235,17 +235,18 @@ def gap_to(numbers, view, i, k):
 
 @allocation_free
 def disc_of(numbers, view, i, k, a, x, y):
-    """(centre x, centre y, radius) [m/s]: the disc that w must be in for thing ``k``.
+    """(center x, center y, radius) [m/s]: the disc that w must be in for thing ``k``.
 
-    ``a`` [m/s^2] brakes from (x, y). Outside S, where the gap is negative, it must not become more so. For an obstacle that moves
-    the disc is around its velocity, and ``a`` is what brakes relative to it.
+    ``a`` [m/s^2] is the deceleration of braking from (x, y). Outside S, where the gap is negative, the disc keeps the gap from
+    becoming more negative. For a moving obstacle the disc is relative to its velocity, and ``a`` is replaced by the deceleration
+    relative to it.
     """
     gap, normal_x, normal_y = gap_to(numbers, view, i, k)
     spread, drawn = spread_of(numbers, view, i), 0.0
     pace_x, pace_y = pace_of(view, k)
     if moves(view, k):
         spread += view.h * numbers.obstacle_acceleration
-        drawn = 0.5 * view.h * view.h * numbers.obstacle_acceleration  # what the obstacle may come nearer by
+        drawn = 0.5 * view.h * view.h * numbers.obstacle_acceleration  # how much nearer the obstacle may come
         worst = np.sqrt((x - pace_x) ** 2 + (y - pace_y) ** 2) + spread
         a = max(braking(numbers, worst + numbers.obstacle_speed) - numbers.obstacle_acceleration, 0.0)
     j = k - view.obstacles.shape[0]
@@ -257,7 +258,7 @@ def disc_of(numbers, view, i, k, a, x, y):
 
 @allocation_free
 def excess(numbers, view, i, k, a, x, y):
-    """How far w = (x, y) and the ball around it stick out of thing ``k``'s disc [m/s]; not positive inside."""
+    """How far the ball around w = (x, y) extends beyond the disc of thing ``k`` [m/s]; not positive inside."""
     centre_x, centre_y, radius = disc_of(numbers, view, i, k, a, x, y)
     x, y = x - centre_x, y - centre_y
     return np.sqrt(x * x + y * y) - radius
@@ -265,7 +266,7 @@ def excess(numbers, view, i, k, a, x, y):
 
 @allocation_free
 def stays_safe(numbers, view, i, x, y):
-    """Whether every state that w = (x, y) [m/s] may lead agent ``i`` to is in S."""
+    """Whether every state to which w = (x, y) [m/s] may lead agent ``i`` is in S."""
     worst = np.sqrt(x * x + y * y) + spread_of(numbers, view, i)
     a = braking(numbers, worst)
     if worst > max(numbers.speed_cap, speed_of(numbers, view, i)) + TINY or not a > 0.0:
@@ -280,7 +281,7 @@ def stays_safe(numbers, view, i, x, y):
 
 @allocation_free
 def most_pressing(numbers, view, i, need):
-    """The thing with the least gap among those that leave less room than ``need`` [m]; -1: there is none."""
+    """The thing with the least gap among those that leave less room than ``need`` [m]; -1 if there is none."""
     least, found = np.inf, -1
     for n in range(view.near[0]):
         k = view.near[1 + n]
@@ -293,7 +294,7 @@ def most_pressing(numbers, view, i, need):
 
 @allocation_free
 def most_violated(numbers, view, i, a, need, x, y):
-    """(thing, excess): the disc that w = (x, y) is farthest out of [m/s]; -1 where it is in all of them."""
+    """(thing, excess [m/s]) of the disc that w = (x, y) violates most; the thing is -1 if w is in all discs."""
     worst, found = 0.0, -1
     for n in range(view.near[0]):
         k = view.near[1 + n]
@@ -308,7 +309,7 @@ def most_violated(numbers, view, i, a, need, x, y):
 def anything_near(numbers, view, i, longest, need):
     """Whether anything may leave agent ``i`` less room than ``need`` [m]; ``longest`` [m] is the team's greatest L.
 
-    Where the view has grids, the nearest obstacle and the nearest agent say it; else there may be.
+    If the view has grids and no half-planes, the nearest obstacle and the nearest agent decide; otherwise the result is True.
     """
     if view.grid.shape[0] == 0 or view.planes.shape[0] > 0:
         return True

@@ -1,6 +1,6 @@
-"""One model assembly: arena + N robots + the scenario's obstacles, built with MjSpec and handed on as one MJCF text.
+"""Model assembly: arena + N robots + the scenario's obstacles, built with MjSpec and returned as one MJCF text.
 
-The engine compiles this text, and the dm_control arena is made from the same text, so there is one model.
+The engine compiles this text, and the dm_control arena is made from the same text, so both use the same model.
 """
 
 from collections.abc import Sequence
@@ -17,37 +17,37 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
 from marlbc_mj.util.text import one_line
 
-POINT_RADIUS = 0.25  # drawn radius of a point obstacle [m]
-OBSTACLE_HEIGHT = 1.2  # [m]
-LEAST_SOLID = 0.05  # radius of a point obstacle that robots can hit, in the robot's length unit [m]
-MARGIN = 4.0  # that the top camera leaves around the mission [m]
+POINT_RADIUS = 0.25  # drawn radius of a point obstacle, in the robot's length unit
+OBSTACLE_HEIGHT = 1.2  # in the robot's length unit
+LEAST_SOLID = 0.05  # radius of a point obstacle that robots can hit, in the robot's length unit
+MARGIN = 4.0  # free space around the mission in the top camera's picture, in the robot's length unit
 MEMORY = 256 * 1024  # arena of one MjData [bytes]; MuJoCo's default is 13.6 MB, too much for thousands of worlds
-MEMORY_PER_AGENT = 4 * 1024  # beyond the first 32; measured with 256: 133 KiB in use. Only what is used becomes resident
-MEMORY_OF_CONTACTS = 512 * 1024  # more of it for every agent that touches ground, obstacles and others [bytes]
+MEMORY_PER_AGENT = 4 * 1024  # for each agent beyond 32; 256 agents use 133 KiB, measured. Only used memory becomes resident
+MEMORY_OF_CONTACTS = 512 * 1024  # for each agent instead, if a robot has a mass of its own and so may have contacts [bytes]
 _OWN = ("timestep", "disableflags")
 OPTIONS = tuple(name for name in dir(mujoco.MjSpec().option) if not name.startswith("_") and name not in _OWN)
-"""Options of a robot's MJCF that the arena takes over, gravity and air among them: whoever flies or slides there depends on them.
+"""Options that the arena takes over from a robot's MJCF, including gravity and air, on which flying and sliding robots depend.
 The time step is the scenario's."""
 MEDIUM = ("gravity", "wind", "density", "viscosity", "magnetic", "disableflags")
-"""Options in which robots of one world must agree; of others, what one robot's file leaves open is as another's says."""
+"""Options that must be equal for all robots of one world. Of the others, a robot's default gives way to another robot's value."""
 
 
 def agent_prefix(agent: int) -> str:
-    """Prefix of every MJCF name of one agent: ``agent1_`` is agent 0's, as the paper counts from 1."""
+    """Prefix of every MJCF name of one agent: ``agent1_`` for agent 0, since the paper counts from 1."""
     return f"agent{agent + 1}_"
 
 
 def assemble(scenario: Scenario, limit: float) -> str:
-    """The MJCF of a whole scenario.
+    """Assemble the MJCF of a scenario.
 
     Args:
-        scenario: which robots, what obstacles, which substep.
-        limit: force range of every motor [N]; infinite, for laws that ignore the actuator, removes those of a robot that has no
-            mass and no force limit of its own.
+        scenario: provides the robots, the obstacles and the substep.
+        limit: force range of every motor [N]. Infinite, for laws that ignore the actuator limit, removes the range of motors of a
+            robot without a mass or a force limit of its own.
 
     Raises:
-        ConfigurationError: unknown robot, one that MuJoCo does not take several times, robots whose options contradict each
-            other, or a limit that is not positive.
+        ConfigurationError: an unknown robot, a robot that MuJoCo does not accept several times, robots with contradicting
+            options, or a limit that is not positive.
     """
     if not limit > 0:
         raise ConfigurationError(f"force limit must be positive, got {limit}")
@@ -72,19 +72,19 @@ def assemble(scenario: Scenario, limit: float) -> str:
 
 @cache
 def _arena() -> mujoco.MjSpec:
-    """The MJCF that every assembly begins with."""
+    """The arena with which every assembly begins."""
     return mujoco.MjSpec.from_file(str(MODELS / "arena.xml"))
 
 
 def unfit(scenario: Scenario, error: Exception) -> ConfigurationError:
-    """The error for robots that MuJoCo takes alone, but not as a team."""
+    """The error for robots that MuJoCo accepts alone, but not as a team."""
     fleet = scenario.fleet
     who, times = (f"robots {fleet.words}", "") if fleet.mixed else (f"robot {fleet.words}", f" {scenario.agents} times")
     return ConfigurationError(f"{who} cannot be put into one world{times}: {one_line(error)}")
 
 
 def _prepare_arena(spec: mujoco.MjSpec, fleet: RobotFleet) -> None:
-    """Take the options of contact from the robots' MJCF, and draw the ground at their scale."""
+    """Set the arena's options, ground contact and memory for the robots, and draw the ground at their scale."""
     children = [(robot.name, robot.spec().option) for robot in fleet.kinds]
     for name in OPTIONS:
         setattr(spec.option, name, _agreed(name, children))
@@ -101,10 +101,10 @@ def _prepare_arena(spec: mujoco.MjSpec, fleet: RobotFleet) -> None:
 
 
 def _agreed(name: str, children: Sequence[tuple[str, Any]]) -> Any:
-    """An option that holds for all robots: the one that is not MuJoCo's default, where the others leave it at that.
+    """The common value of an option for all robots: the one that is not MuJoCo's default, if the others keep the default.
 
     Raises:
-        ConfigurationError: two robots that say different things, or live in different media.
+        ConfigurationError: two robots with different values, neither of them the default, or robots with different media.
     """
     first, chosen = children[0][0], getattr(children[0][1], name)
     if len(children) == 1:
@@ -133,7 +133,7 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
         geom.rgba = agent_color(agent) if robot.mass is None or not geom.material else geom.rgba
         if robot.mass is None:
             geom.mass *= mass / total
-    most = limit if robot.mass is None else min(limit, robot.force_limit)  # what a robot's motors give, no law can change
+    most = limit if robot.mass is None else min(limit, robot.force_limit)  # no law exceeds what a robot's motors provide
     for name in robot.motors:
         motor = child.actuator(name)
         bounded = np.isfinite(most)
@@ -143,8 +143,9 @@ def _attach(spec: mujoco.MjSpec, robot: Robot, agent: int, mass: float, limit: f
 
 
 def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, fleet: RobotFleet) -> None:
-    """A cylinder without contact: the paper's obstacles are passed through, and counted. For robots with contact it is solid,
-    as large as the scenario says, on a body that an episode's draw can move.
+    """Add a cylinder without contact: robots pass through the paper's obstacles, and violations are counted.
+
+    For robots with contact it is solid, has the scenario's radius, and is on a body that an episode's draw can move.
     """
     radius = max(obstacle.radius, POINT_RADIUS * fleet.length)
     height = max(OBSTACLE_HEIGHT * fleet.length, 1.5 * fleet.height)
@@ -165,7 +166,7 @@ def _add_obstacle(spec: mujoco.MjSpec, k: int, obstacle: Obstacle, fleet: RobotF
 
 
 def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario, length: float) -> None:
-    """``top`` sees the whole mission in a 16:9 picture; ``track`` follows its centre of mass; ``length`` [m] is the unit."""
+    """Add ``top``, a 16:9 view of the mission, and ``track``, which follows the center of mass; ``length`` [m] is the unit."""
     low, high = _mission_bounds(scenario)
     width, depth = high - low + 2.0 * MARGIN * length
     fovy = 30.0
@@ -183,7 +184,7 @@ def _add_cameras(spec: mujoco.MjSpec, scenario: Scenario, length: float) -> None
 
 
 def _mission_bounds(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner (2,) [m] of a box around starts, obstacles and the formations' way along the path."""
+    """Lower and upper corner (2,) [m] of a box around the starts, the obstacles and the formations along the path."""
     ends = np.stack([desired_centroid(scenario, time) for time in (0.0, scenario.duration)])
     slots = ends[:, None] + scenario.formations.reshape(1, -1, 2)
     obstacles = scenario.obstacle_array()

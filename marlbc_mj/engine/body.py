@@ -1,4 +1,4 @@
-"""Between planar forces and MuJoCo's controls, and back: directly, or by the robots' own laws."""
+"""Conversion of planar forces to MuJoCo's controls and back, directly or by the robots' own laws."""
 
 from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.engine.native import as_drive, as_reading
@@ -9,7 +9,7 @@ DIVERGED = 1e9
 
 @allocation_free
 def scale_rows(rows, factors):
-    """Multiply every row of (N, 2) by its own of the ``factors`` (N,), in place."""
+    """Multiply each row of ``rows`` (N, 2) by its entry of ``factors`` (N,), in place."""
     for i in range(rows.shape[0]):
         for axis in range(2):
             rows[i, axis] *= factors[i]
@@ -17,7 +17,7 @@ def scale_rows(rows, factors):
 
 @allocation_free
 def shrink_rows(rows, units):
-    """Express every row of (N, 2) in its own of the ``units`` (N,), in place."""
+    """Divide each row of ``rows`` (N, 2) by its entry of ``units`` (N,), in place."""
     for i in range(rows.shape[0]):
         factor = 1.0 / units[i]
         for axis in range(2):
@@ -26,7 +26,7 @@ def shrink_rows(rows, units):
 
 @allocation_free
 def out_of_range(spans, ctrl):
-    """0, or 1 + the first of the agents with these spans (n, 3, 2) that has a control that is not finite or huge."""
+    """1 + the first of the agents with these ``spans`` (n, 3, 2) that has a huge or non-finite control; 0 if there is none."""
     for i in range(spans.shape[0]):
         for k in range(spans[i, 2, 0], spans[i, 2, 1]):
             if not abs(ctrl[k]) < DIVERGED:
@@ -36,9 +36,9 @@ def out_of_range(spans, ctrl):
 
 @on_both_paths
 def actuate(drives, plant, state, qpos, qvel, force, h, ctrl):
-    """Turn planar forces (N, 2) into ctrl: as they are for direct robots, by the ``drives`` of the groups for others.
+    """Convert planar forces (N, 2) to ctrl: unchanged for direct robots, by the ``drives`` of the groups for others.
 
-    Returns 0, or 1 + agent where a control is not finite or huge.
+    Returns 0, or 1 + agent if a control of a group is huge or not finite.
     """
     for i in range(force.shape[0]):
         if plant.ctrl_index[i, 0] >= 0:
@@ -56,7 +56,7 @@ def actuate(drives, plant, state, qpos, qvel, force, h, ctrl):
 
 @on_both_paths
 def read_robots(readings, plant, state, qpos, qvel, actuator_force, p, v, force):
-    """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators really gave."""
+    """Read p and v (N, 2) after a step, and the planar ``force`` (N, 2) that the actuators applied."""
     for i in range(p.shape[0]):
         if plant.ctrl_index[i, 0] >= 0:
             for axis in range(2):

@@ -1,7 +1,8 @@
-"""How a priority order becomes a reference velocity: behaviors evaluated in turn, composed, limited.
+"""From a priority order to a reference velocity: behaviors are evaluated in turn, composed and limited.
 
-Two compositions: in the null space (12), :func:`compose`, where errata 5 and 6 apply; and set-based, :func:`compose_set_based`,
-where avoidance is an inequality. The engine, predictions of supervisors and older frameworks all go through :func:`compose_team`.
+There are two compositions: null-space (12), :func:`compose`, to which errata 5 and 6 apply, and set-based,
+:func:`compose_set_based`, in which avoidance is an inequality. The engine, the predictions of supervisors and the older
+frameworks all use :func:`compose_team`.
 """
 
 from typing import Any, NamedTuple
@@ -19,26 +20,26 @@ from marlbc_mj.engine.native import as_behavior
 from marlbc_mj.engine.references import call
 
 WORKSPACE = 9
-"""Rows of two numbers that a :class:`TeamView` is made from."""
+"""Number of rows of two numbers from which a :class:`TeamView` is made."""
 PLANE_ROWS = 2
-"""Rows more for every half-plane of a set-based composition."""
+"""Number of additional rows per half-plane of a set-based composition."""
 
 
 class Behaviors(NamedTuple):
     """The behaviors of a scenario and how they become references: M behaviors, N agents, O orders, C commands."""
 
-    laws: np.ndarray  # (M,) addresses; the laws themselves where numba is off
-    params: np.ndarray  # (M, N, P) each law's own
+    laws: np.ndarray  # (M,) addresses; the laws themselves if numba is off
+    params: np.ndarray  # (M, N, P) gains of each law for each agent
     sees: np.ndarray  # (M,) what each law looks at, see marlbc_mj.core.behaviors
     table: np.ndarray  # (O, M) behavior indices of every order, highest priority first
     command_of: np.ndarray  # (O,) index of the command that each order gives
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
-    virtual: bool  # behaviors are evaluated at p_r; else at the measured p
-    speed_limit: float  # of references [m/s]
-    acceleration_limit: float  # of references [m/s^2]
+    virtual: bool  # whether behaviors are evaluated at p_r; otherwise at the measured p
+    speed_limit: float  # speed limit of references [m/s]
+    acceleration_limit: float  # acceleration limit of references [m/s^2]
     compose: Any  # entry of the composition: null_space_team or set_based_team
     keeps: np.ndarray  # (M,) distance that an inequality task keeps [m]; 0 for an equality task
-    rate: float  # from here on: how inequality tasks bound references, as in Barrier. Flat, for loops over threads
+    rate: float  # from here on: the fields of Barrier, flat because threaded loops take no nested tuples
     margin: float
     reach: float
     speed: float
@@ -50,7 +51,7 @@ class Behaviors(NamedTuple):
 
 @allocation_free
 def barrier_of(behaviors):
-    """The :class:`Barrier` that behaviors have as flat fields."""
+    """The :class:`Barrier` made of the flat fields of ``behaviors``."""
     return Barrier(
         behaviors.rate,
         behaviors.margin,
@@ -64,12 +65,12 @@ def barrier_of(behaviors):
 
 
 class TeamView(NamedTuple):
-    """What behaviors look at in one team, and room to evaluate them in."""
+    """What behaviors read of one team, and scratch for their evaluation."""
 
-    at: np.ndarray  # (N, 2) positions at which they are evaluated [m]
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move
+    at: np.ndarray  # (N, 2) positions at which behaviors are evaluated [m]
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] if they move
     path: np.ndarray  # (2, 2) p_cd [m] and its velocity [m/s], now
-    grid: np.ndarray  # room for a grid of the obstacles and one of the team; empty where trying all pairs costs less
+    grid: np.ndarray  # room for a grid of the obstacles and one of the team; empty if trying all pairs costs less
     velocity: np.ndarray  # (2,) scratch: one behavior's desired velocity
     jacobian: np.ndarray  # (2, 2) scratch: its Jacobian
     basis: np.ndarray  # (2, 2) scratch: span of the Jacobians of higher priority
@@ -86,7 +87,7 @@ def path_at(t, path, out):
 
 @on_both_paths
 def make_view(t, behaviors, at, obstacles, grid, workspace):
-    """The :class:`TeamView` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids, where there is room, are filled."""
+    """The :class:`TeamView` of a team at ``t`` [s]; ``workspace`` (WORKSPACE, 2). Grids are filled if there is room."""
     path = workspace[0:2]
     path_at(t, behaviors.path, path)
     if grid.shape[0] > 0:
@@ -98,9 +99,9 @@ def make_view(t, behaviors, at, obstacles, grid, workspace):
 
 @on_both_paths
 def desired_velocity(j, i, behaviors, view):
-    """Desired velocity (8) and Jacobian of behavior ``j`` for agent ``i``, into the view; returns the Jacobian's rows.
+    """Write desired velocity (8) and Jacobian of behavior ``j`` for agent ``i`` into the view; returns the number of its rows.
 
-    A law that looks only at the nearest obstacle or neighbor is handed that one alone where the view has a grid to find it in.
+    If the view has a grid, a law that needs only the nearest obstacle or neighbor receives only that one.
     """
     obstacles, team, own = view.obstacles, view.at, i
     if view.grid.shape[0] > 0:
@@ -139,9 +140,9 @@ def compose(order, i, behaviors, view, v_r):
 def compose_set_based(order, i, behaviors, barrier, view, planes, v_r):
     """v_r = argmin |v - v_c|^2 over the v that inequality tasks allow, for agent ``i``, into ``v_r`` (2,) [m/s].
 
-    v_c is what the other behaviors make by (12), no longer than ``barrier.speed``: FM or FR, whichever is higher. OA
-    and AA bound v whatever the order, see :mod:`marlbc_mj.core.barriers`; where they contradict, the one that ``order`` (M,)
-    lists first is violated least. ``planes`` (n, 4) is scratch.
+    v_c composes the other behaviors by (12): FM or FR, whichever comes first. |v| is at most ``barrier.speed``. OA and AA bound v
+    whatever the order is, see :mod:`marlbc_mj.core.barriers`; if they contradict each other, the one that ``order`` (M,) lists
+    first is violated least. ``planes`` (n, 4) is scratch.
     """
     v_r[0] = v_r[1] = 0.0
     rank, count = 0, 0
@@ -162,7 +163,10 @@ def compose_set_based(order, i, behaviors, barrier, view, planes, v_r):
 
 @allocation_free
 def set_based_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
-    """:func:`compose_set_based` for every agent; arguments as of :func:`compose_team`. Returns 0."""
+    """Apply :func:`compose_set_based`, and :func:`restrain` if there is an acceleration limit, to every agent.
+
+    Arguments as in :func:`compose_team`. Returns 0.
+    """
     barrier = barrier_of(behaviors)
     view = make_view(t, behaviors, at, obstacles, grid[:0], workspace)
     planes = workspace[WORKSPACE:].reshape(((workspace.shape[0] - WORKSPACE) // PLANE_ROWS, 2 * PLANE_ROWS))
@@ -177,7 +181,7 @@ def set_based_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
 
 @allocation_free
 def null_space_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
-    """:func:`compose` (12) for every agent; arguments as of :func:`compose_team`. Returns 0."""
+    """Apply :func:`compose` (12) to every agent; arguments as in :func:`compose_team`. Returns 0."""
     view = make_view(t, behaviors, at, obstacles, grid, workspace)
     for i in range(orders.shape[0]):
         compose(behaviors.table[orders[i]], i, behaviors, view, v_r[i])
@@ -186,24 +190,24 @@ def null_space_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
 
 @allocation_free
 def compose_team(t, orders, behaviors, at, obstacles, grid, workspace, v_r):
-    """Reference velocities ``v_r`` (N, 2) [m/s] of a team at ``t`` [s], by the composition of its scenario.
+    """Compute the reference velocities ``v_r`` (N, 2) [m/s] of a team at ``t`` [s] by the composition of its scenario.
 
     Args:
         t: mission time [s].
         orders: (N,) int64, indices into ``behaviors.table``.
-        behaviors: of the scenario.
-        at: (N, 2) positions at which they are evaluated [m].
+        behaviors: behaviors of the scenario.
+        at: (N, 2) positions at which behaviors are evaluated [m].
         obstacles: (K, 3 or 5), see :class:`TeamView`.
-        grid: room for a grid of the obstacles and one of the team, or empty, which has every law try all of them.
-        workspace: (WORKSPACE, 2) scratch; a set-based composition has PLANE_ROWS more for every half-plane.
-        v_r: (N, 2), written in place. A set-based composition of limited acceleration reads the velocities before in it.
+        grid: room for a grid of the obstacles and one of the team; if it is empty, every law tries all of them.
+        workspace: (WORKSPACE, 2) scratch; a set-based composition needs PLANE_ROWS more rows per half-plane.
+        v_r: (N, 2), written in place. A set-based composition with an acceleration limit reads the previous velocities from it.
     """
     call(behaviors.compose, t, orders, behaviors, at, obstacles, grid, workspace, v_r)
 
 
 @allocation_free
 def keep(behaviors, v_r, previous):
-    """Remember v_r (N, 2) in ``previous`` (N, 2) before it is computed anew, where references have limits."""
+    """Save v_r (N, 2) in ``previous`` (N, 2) before it is computed again, if references have limits."""
     if behaviors.speed_limit < np.inf or behaviors.acceleration_limit < np.inf:
         for i in range(v_r.shape[0]):
             for axis in range(2):
@@ -214,7 +218,7 @@ def keep(behaviors, v_r, previous):
 def limit(behaviors, duration, previous, v_r):
     """Bound |v_r| (N, 2) by the speed limit, and its change since ``previous`` by the acceleration limit times ``duration`` [s].
 
-    Directions are kept: both are limits of vectors. Infinite limits cost a comparison.
+    Both limit the length of a vector, so directions are kept. Infinite limits cost one comparison.
     """
     if not (behaviors.speed_limit < np.inf or behaviors.acceleration_limit < np.inf):
         return

@@ -1,4 +1,4 @@
-"""How the loop is called: what a World hands over is referred to once, and worlds are stepped in series or by threads."""
+"""Calls of the loop: a World passes its records once, by reference, and worlds are stepped in series or by threads."""
 
 from typing import Any, NamedTuple
 
@@ -21,7 +21,7 @@ class Loop(NamedTuple):
 
 
 def hand_over(plan: Plan, native: Native, team: Team, record: Record, for_compiled: bool) -> Arguments:
-    """The parts as the loop takes them: referred to, with the entries of what this team needs if the loop is compiled."""
+    """The loop's arguments, by reference; for a compiled loop with the entries of the shield that this team has."""
     mission, plant, team, record = map(refer, (plan.mission, plan.plant, team, record))
     if for_compiled:
         native = refer(_with_shield(native, mission, plan.behaviors, plant, team))
@@ -29,13 +29,13 @@ def hand_over(plan: Plan, native: Native, team: Team, record: Record, for_compil
 
 
 def compiled_loop(arguments: Arguments) -> Any:
-    """A reference to the :class:`Loop` of what was handed over for compiled code."""
+    """A reference to the :class:`Loop` for arguments that :func:`hand_over` made for compiled code."""
     orders, given = np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 2))
     return refer(Loop(entry(mission_step, 0, orders, given, *arguments), refer(arguments)))
 
 
 def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team: Any) -> Native:
-    """``native`` with the entries of the shield that the team has."""
+    """``native`` with the entry of the team's shield, if it has one."""
     forces, references = no_entry(0, 0.0, 0.0, Plant, Team), no_entry(0, MissionRules, Behaviors, Plant, Team)
     if team.last_substep.shape[1] > 0:
         forces = entry(shield_forces, 0, 0.0, 0.0, plant, team)
@@ -46,9 +46,9 @@ def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team:
 
 @compiled
 def play(b, sequence, given, loop):
-    """Mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
+    """Run the mission steps of world ``b`` with the orders ``sequence`` (M, B, N), one after the other.
 
-    Returns the sum of rewards, up to the step that failed if one did; ``team.status`` tells.
+    Returns the sum of rewards. If a step fails (see ``team.status``), the run ends and the sum leaves that step out.
     """
     total, a = 0.0, loop.arguments
     for m in range(sequence.shape[0]):
@@ -66,9 +66,9 @@ def _share_out(returns, sequence, given, loop):
 
 @compiled
 def play_parallel(returns, sequence, given, loop):
-    """:func:`play` of every world into ``returns`` (B,), shared out over numba's threads; the same numbers as in series.
+    """Run :func:`play` for every world on numba's threads into ``returns`` (B,); the results are the same as in series.
 
-    Returns how many worlds failed.
+    Returns the number of worlds that failed.
     """
     _share_out(returns, sequence, given, loop)
     return np.count_nonzero(loop.arguments.team.status)
@@ -76,7 +76,7 @@ def play_parallel(returns, sequence, given, loop):
 
 @compiled
 def play_serial(returns, sequence, given, loop):
-    """:func:`play` of every world into ``returns`` (B,), one after the other. Returns how many worlds failed."""
+    """Run :func:`play` for every world in series into ``returns`` (B,). Returns the number of worlds that failed."""
     for b in range(returns.shape[0]):
         returns[b] = play(b, sequence, given, loop)
     return np.count_nonzero(loop.arguments.team.status)

@@ -1,4 +1,4 @@
-"""The numbers of a set-based composition, from a scenario: which behaviors are inequality tasks, how they bound references."""
+"""Parameters of a set-based composition: which behaviors are inequality tasks, and how they bound references."""
 
 from collections.abc import Sequence
 
@@ -9,19 +9,20 @@ from marlbc_mj.core.behaviors import EVERYTHING, NEAREST_NEIGHBOR, NEAREST_OBSTA
 from marlbc_mj.engine.composition import PLANE_ROWS, WORKSPACE
 from marlbc_mj.scenarios import Scenario
 
-BARRIER_RATE = 4.0  # alpha, at most [1/s]
+BARRIER_RATE = 4.0  # greatest alpha [1/s]
 BARRIER_MARGIN = 0.1  # m, in length units of the robots
-BARRIER_REACH = 3.0  # in length units
-BARRIER_SPEED = 6.0  # of references at most, in length units per second
+BARRIER_REACH = 3.0  # least reach, in length units
+BARRIER_SPEED = 6.0  # greatest reference speed, in length units per second
 _DISTANCES = {NEAREST_OBSTACLE: "safe_distance", NEAREST_NEIGHBOR: "distance"}
-"""Attribute of a behavior that has the distance which it keeps as an inequality task, by what it sees."""
+"""Attribute of a behavior with the distance that it keeps as an inequality task, by what the behavior sees."""
 
 
 def make_barrier(scenario: Scenario) -> Barrier:
-    """How the inequality tasks of a set-based composition bound references, scaled to the robots.
+    """The :class:`Barrier` of a set-based composition, scaled to the robots.
 
-    An agent that approaches at rate alpha brakes with alpha times its speed, so alpha is at most A / speed. Nor may it use up
-    more than the room that is left within a mission step. What two agents do in one step is within reach.
+    An agent that approaches at rate alpha decelerates by alpha times its speed, so alpha is at most A / speed. It is also at most
+    1 / T, so that one mission step cannot use up more than the remaining room. The reach covers the motion of two agents in one
+    mission step.
     """
     unit, duration = scenario.fleet.length, float(scenario.mission_step)
     speed, braking = min(BARRIER_SPEED * unit, float(scenario.speed_limit)), float(scenario.acceleration_limit)
@@ -43,7 +44,7 @@ def make_barrier(scenario: Scenario) -> Barrier:
 
 
 def workspace_rows(scenario: Scenario) -> int:
-    """Rows of two of the scratch in which a team's references are composed."""
+    """Number of rows (of two numbers each) of the scratch in which a team's references are composed."""
     if scenario.composition != "set-based":
         return WORKSPACE
     counts = {NEAREST_OBSTACLE: len(scenario.obstacles), NEAREST_NEIGHBOR: scenario.agents}
@@ -52,7 +53,7 @@ def workspace_rows(scenario: Scenario) -> int:
 
 
 def inequalities_first(scenario: Scenario) -> np.ndarray:
-    """(O, M) orders with inequality tasks in front: those above the first complete behavior as they are ordered, then the rest.
+    """(O, M) orders with all inequality tasks in front: those above the first complete behavior in their order, then the others.
 
     So orders that give the same command give the same motion.
     """
@@ -68,11 +69,11 @@ def inequalities_first(scenario: Scenario) -> np.ndarray:
 
 
 def keeps_array(behaviors: Sequence[Behavior]) -> np.ndarray:
-    """(M,) distance that each behavior keeps as an inequality task [m]: d_OA or d_AA; 0 for one that is an equality task."""
+    """(M,) distance that each behavior keeps as an inequality task [m]: d_OA or d_AA; 0 for an equality task."""
     names = [_DISTANCES.get(getattr(b, "sees", EVERYTHING), "") for b in behaviors]
     return np.array([float(getattr(b, name, 0.0)) for b, name in zip(behaviors, names, strict=True)])
 
 
 def sees_array(behaviors: Sequence[Behavior]) -> np.ndarray:
-    """(M,) what each behavior's law looks at; everything, where it does not say."""
+    """(M,) the part of the surroundings that each behavior's law needs; EVERYTHING if it declares none."""
     return np.array([getattr(b, "sees", EVERYTHING) for b in behaviors], dtype=np.int64)

@@ -1,14 +1,15 @@
-"""One mission step of one team. There is one definition of it, :func:`mission_step`, and of its parts.
+"""One mission step of one team, defined once in :func:`mission_step` and its parts.
 
-The compiled loop runs it for every world; the Python path runs the same source as plain Python, with laws and ``mj_step`` as
-objects; the dm_control task calls its parts from composer's hooks. Its order:
+The compiled loop runs it for every world. The Python path runs the same source as plain Python, with laws and ``mj_step`` as
+objects. The dm_control task calls its parts from composer's hooks. The sequence is:
 
-1. :func:`start`: at t = 0.05 k the orders are read and v_r is computed once, from p_r (``virtual``) or the measured p
-   (``actual``), limited, and held, :func:`begin`; a shield of references may change it, :func:`shield_references`;
-2. for every substep h, :func:`apply`: force from the current errors and weights, weights by explicit Euler, drag at the current
-   (p, v), the robot's controls; MuJoCo's step; :func:`settle`: what was reached is measured, p_r += h v_r;
-3. :func:`finish`: obstacles that move are put where they are then; clearances, formation identifier and reward follow from the
-   positions. So behaviors and supervisors see obstacles where they are at the start of a mission step.
+1. :func:`start`: the orders are read, and :func:`begin` computes v_r once from p_r (``virtual``) or the measured p (``actual``),
+   limits it and holds it for the mission step; a shield of references may change it (:func:`shield_references`);
+2. in every substep h: :func:`apply` computes the force from the current errors and weights, updates the weights by explicit
+   Euler, and sets the drag at the current (p, v) and the robots' controls; MuJoCo steps; :func:`settle` measures the new state
+   and advances p_r by h v_r;
+3. :func:`finish`: moving obstacles are set to their new positions; clearances, formation identifier and reward are computed from
+   the positions. So behaviors and supervisors see obstacles where they are at the start of a mission step.
 """
 
 import numpy as np
@@ -35,7 +36,7 @@ SWITCH_REWARD = -3.0  # (15), once per team (erratum 11)
 
 @allocation_free
 def fill_clearance(p, obstacles, grid, clearance, normal):
-    """Clearance (N,) [m] of every agent at ``p`` (N, 2), by a grid if ``grid`` has room for one; ``normal`` (2,) is scratch."""
+    """Compute ``clearance`` (N,) [m] of agents at ``p`` (N, 2), by a grid if ``grid`` has room; ``normal`` (2,) is scratch."""
     count = obstacles.shape[0]
     near = grid.shape[0] > 0 and count > 0
     if near:
@@ -81,7 +82,7 @@ def valid_orders(orders, count):
 
 @allocation_free
 def count_switches(b, orders, behaviors, team):
-    """Turn the orders (B, N) of world ``b`` into commands and return r2 (15); the first mission step switches nothing."""
+    """Turn the orders (B, N) of world ``b`` into commands and return r2 (15); the first mission step has no switch."""
     switched = False
     for i in range(orders.shape[1]):
         command = behaviors.command_of[orders[b, i]]
@@ -94,9 +95,9 @@ def count_switches(b, orders, behaviors, team):
 
 @allocation_free
 def begin(b, orders, given, mission, behaviors, team):
-    """Orders (B, N) of world ``b`` become commands and reference velocities, held for the mission step; r2 (15) is in the reward.
+    """Turn the orders (B, N) of world ``b`` into commands and the v_r of this mission step; set the reward to r2 (15).
 
-    ``given`` (B, N, 2) [m/s] is taken as v_r in the place of what the orders make; (B, 0, 2) has the orders composed (12).
+    ``given`` (B, N, 2) [m/s] replaces the v_r composed from the orders; if it is (B, 0, 2), the orders are composed.
     """
     v_r, previous = team.reference_velocity[b], team.drag[b]
     keep(behaviors, v_r, previous)
@@ -116,10 +117,10 @@ def begin(b, orders, given, mission, behaviors, team):
 
 @on_both_paths
 def set_forces(b, t, h, native, plant, team):
-    """Drag and controller force of every agent of world ``b`` at ``t`` [s], into ``team.drag`` and ``team.force``.
+    """Write drag and controller force of every agent of world ``b`` at ``t`` [s] into ``team.drag`` and ``team.force``.
 
-    Laws see the measured p and v; their forces count in ``plant.unit_forces``. Returns 0, or 1 + agent where a position,
-    velocity, force or drag left the physical range; then nothing may be stepped.
+    The controller receives measured p and v, the disturbance true ones. Controller forces are in ``plant.unit_forces``. Returns
+    0, or 1 + agent if a position, velocity, force or drag left the physical range; the world must not be stepped then.
     """
     p, v, drag, force = team.position[b], team.velocity[b], team.drag[b], team.force[b]
     seen_p, seen_v = (team.sensed[b, 0], team.sensed[b, 1]) if team.sensed.shape[1] > 0 else (p, v)
@@ -145,7 +146,7 @@ def set_forces(b, t, h, native, plant, team):
 
 @allocation_free
 def shield_references(b, mission, behaviors, plant, team):
-    """After :func:`begin`: change v_r of world ``b`` as little as braking in time needs. Returns 0."""
+    """After :func:`begin`, change v_r of world ``b`` as little as needed for braking in time. Returns 0."""
     numbers, v_r = plant.shield[0], team.reference_velocity[b]
     wish, at, duration = team.force[b], team.reference[b], mission.mission_step
     for i in range(v_r.shape[0]):
@@ -170,7 +171,7 @@ def shield_references(b, mission, behaviors, plant, team):
 
 @allocation_free
 def exchange_messages(b, count, view, numbers, team):
-    """What agents of world ``b`` know of each other by messages, ``count`` substeps after the mission began."""
+    """Exchange the messages between agents of world ``b``, ``count`` substeps after the mission began."""
     fill_stopping(numbers, view)
     latency, seed = int(numbers.latency), team.noise_seed[b]
     stamps, planes, memory, said = team.stamps[b], team.planes[b], team.memory[b], team.said[b]
@@ -179,7 +180,7 @@ def exchange_messages(b, count, view, numbers, team):
 
 @allocation_free
 def shield_forces(b, t, h, plant, team):
-    """Replace the forces of world ``b`` by the nearest that keep the team able to stop. Returns 0."""
+    """Replace the forces of world ``b`` by the nearest ones that keep the team able to stop. Returns 0."""
     known = team.sensed.shape[1] > 0
     p, v = (team.sensed[b, 0], team.sensed[b, 1]) if known else (team.position[b], team.velocity[b])
     obstacles = team.obstacles[b]
@@ -207,10 +208,9 @@ def watch_tube(b, plant, team):
 
 @on_both_paths
 def apply(b, k, mission, native, plant, team):
-    """Substep ``k`` of world ``b`` before MuJoCo's step: force law, shield, drag and robot of every agent, into ctrl and
-    qfrc_applied.
+    """Substep ``k`` of world ``b`` before MuJoCo's step: force law, shield, drag and drive of every agent.
 
-    Returns 0, or 1 + agent + N k where a number left the physical range.
+    Writes ctrl and qfrc_applied. Returns 0, or 1 + agent + N k if a number left the physical range.
     """
     h = mission.substep
     t = team.steps[b] * mission.mission_step + k * h
@@ -236,7 +236,7 @@ def apply(b, k, mission, native, plant, team):
 
 @on_both_paths
 def settle(b, k, mission, native, plant, team, record):
-    """Substep ``k`` of world ``b`` after MuJoCo's step: keep what the law saw, read what was reached, p_r += h v_r."""
+    """Substep ``k`` of world ``b`` after MuJoCo's step: record what the law saw, read the new state, p_r += h v_r."""
     p, v, p_r, v_r, force = team.position[b], team.velocity[b], team.reference[b], team.reference_velocity[b], team.force[b]
     recording = record.force.shape[1] > 0
     if recording:
@@ -261,7 +261,7 @@ def settle(b, k, mission, native, plant, team, record):
 
 @allocation_free
 def judge(b, mission, team):
-    """Put obstacles of world ``b`` where they are now; clearances and G follow. Returns r1 (14)."""
+    """Move the obstacles of world ``b`` to their current positions and update clearances and G. Returns r1 (14)."""
     if team.motions.shape[1] > 0:
         move(team.steps[b] * mission.mission_step, team.anchors[b], team.motions[b], team.obstacles[b])
     p, clearance = team.position[b], team.clearance[b]
@@ -272,14 +272,14 @@ def judge(b, mission, team):
 
 @allocation_free
 def finish(b, mission, team):
-    """End the mission step of world ``b``: the clock goes on, and r1 (14) joins the reward."""
+    """End the mission step of world ``b``: advance the clock and add r1 (14) to the reward."""
     team.steps[b] += 1
     team.reward[b] += judge(b, mission, team)
 
 
 @on_both_paths
 def start(b, orders, given, mission, behaviors, native, plant, team):
-    """:func:`begin`, and what a shield of references, if the team has one, makes of it."""
+    """Run :func:`begin`, and then :func:`shield_references` if the team has a shield of references."""
     begin(b, orders, given, mission, behaviors, team)
     if team.interventions.shape[1] > 0 and plant.shield[0].tube > 0.0:
         call(native.shield_references, b, mission, behaviors, plant, team)
@@ -287,7 +287,7 @@ def start(b, orders, given, mission, behaviors, native, plant, team):
 
 @allocation_free
 def mission_step(b, orders, given, mission, behaviors, native, plant, team, record):
-    """One mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
+    """Run one mission step of world ``b``; returns 1 if a number left the physical range, see ``team.status``, else 0."""
     start(b, orders, given, mission, behaviors, native, plant, team)
     team.status[b] = 0
     for k in range(mission.substeps):
@@ -304,4 +304,4 @@ def mission_step(b, orders, given, mission, behaviors, native, plant, team, reco
 start_compiled = allocation_free(start)
 apply_compiled = allocation_free(apply)
 settle_compiled = allocation_free(settle)
-"""The parts that need MuJoCo between them, compiled for callers that step it themselves."""
+"""Parts of the mission step, compiled for callers that step MuJoCo between them."""

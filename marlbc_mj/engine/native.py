@@ -1,9 +1,8 @@
-"""Calling MuJoCo and laws by address from compiled code. Everything unsafe of this package is in this file.
+"""Unsafe calls from compiled code: MuJoCo and laws by address.
 
-Each function here has two faces. Called from Python it takes objects: a law, ``mujoco.mj_step``, an array. Inside compiled code
-it takes their addresses, plain integers, so that the compiled loop stays cached on disk whatever it calls. Whoever passes
-an address
-keeps its owner (MjModel, MjData, law) alive while the call lasts.
+Each function here has two versions. Called from Python it takes objects: a law, ``mujoco.mj_step``, an array. Inside compiled
+code it takes their addresses, plain integers, so that the compiled loop stays cached on disk whatever it calls. The caller must
+keep the owner of an address (MjModel, MjData, law) alive during the call.
 """
 
 import ctypes
@@ -20,7 +19,7 @@ from marlbc_mj.core import laws
 
 
 def step_address() -> int:
-    """Address of ``mj_step`` in the very library that the mujoco package has loaded."""
+    """Address of ``mj_step`` in the library that the mujoco package has loaded."""
     library = ctypes.CDLL(mujoco._functions.__file__)
     return int(ctypes.cast(library.mj_step, ctypes.c_void_p).value or 0)
 
@@ -37,9 +36,9 @@ class _LogConfig(ctypes.Structure):
 
 
 def keep_mujoco_quiet() -> None:
-    """Have ``mj_step`` called by address neither print nor write MUJOCO_LOG.TXT into the current folder.
+    """Keep ``mj_step``, when called by address, from printing and from writing MUJOCO_LOG.TXT into the current folder.
 
-    A world that diverges is an error of ours, with agent and time. Calls through MuJoCo's Python package warn as they always do.
+    A world that diverges raises this package's own error, with agent and time. Calls through MuJoCo's Python package still warn.
     """
     library = ctypes.CDLL(mujoco._functions.__file__)
     if hasattr(library, "mju_setLogConfig"):
@@ -52,32 +51,32 @@ keep_mujoco_quiet()
 
 
 def call_step(step, model, data):
-    """``step(model, data)``; for ``mj_step``."""
+    """Call ``step(model, data)``, where ``step`` is ``mj_step``."""
     step(model, data)
 
 
 def as_behavior(law):
-    """A behavior that can be called, from its address."""
+    """Turn the address of a behavior into a callable."""
     return law
 
 
 def as_controller(law):
-    """A controller that can be called for a whole team, from its address."""
+    """Turn the address of a team controller into a callable."""
     return law
 
 
 def as_disturbance(law):
-    """A disturbance that can be called for a whole team, from its address."""
+    """Turn the address of a team disturbance into a callable."""
     return law
 
 
 def as_drive(law):
-    """A robot's drive that can be called for a whole team, from its address."""
+    """Turn the address of a team drive into a callable."""
     return law
 
 
 def as_reading(law):
-    """A robot's reading that can be called for a whole team, from its address."""
+    """Turn the address of a team reading into a callable."""
     return law
 
 
@@ -103,13 +102,13 @@ def _doubles_at(typing_context, address, n):
 
 
 class _Doubles(_Intrinsic):  # type: ignore[misc]
-    """The n float64 of one of MuJoCo's arrays: the array itself in Python, from its address a view that owns nothing."""
+    """The n float64 of one of MuJoCo's arrays: the array itself in Python, a non-owning view of its address in compiled code."""
 
     def __call__(self, array, n):
         return array
 
 
-doubles = _Doubles("doubles", _doubles_at)  # an overload would not do: without reference counting none may return an array
+doubles = _Doubles("doubles", _doubles_at)  # no overload: without reference counting, none may return an array
 doubles._register()
 
 
@@ -119,7 +118,7 @@ def _call_step(step, model, data):
 
 
 def _compile_as(function, kind):
-    """Give ``function`` its compiled face: the law of signature ``kind`` at an address."""
+    """Give ``function`` its compiled version, which turns an address into a law of signature ``kind``."""
     function_type = types.FunctionType(kind)
 
     @intrinsic

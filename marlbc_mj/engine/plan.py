@@ -29,7 +29,7 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import guarded
 
 _JOINT_SIZE = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
-"""Numbers of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
+"""Number of entries of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Plan:
     initial_state: np.ndarray  # (N, S) controllers' state at t = 0
     robot_state: np.ndarray  # (N, S) robots' state at t = 0
     disturbance_params: np.ndarray  # (P,)
-    solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) where they pass through
-    shield: Shield | bool | None = None  # as it was asked for
+    solid: np.ndarray  # (K,) int64: mocap rows of obstacles that robots collide with; (0,) if robots pass through
+    shield: Shield | bool | None = None  # the argument of make_plan
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy is made anew: the addresses of laws and of MuJoCo's model are those of one process."""
+        """Pickle the arguments of :func:`make_plan`, since addresses of laws and of the model are valid in one process only."""
         return make_plan, (self.scenario, self.controller, self.shield)
 
     @property
@@ -61,32 +61,32 @@ class Plan:
 
     @property
     def shielded(self) -> bool:
-        """Whether plant.shield is used."""
+        """Whether the team has a shield."""
         return bool(self.shield)
 
     @property
     def mailed(self) -> bool:
-        """Whether agents with a shield know of each other by messages that may be late."""
+        """Whether agents with a shield know each other from messages that may be late or lost."""
         return isinstance(self.shield, Shield) and self.shield.mailed
 
     @property
     def grid_room(self) -> int:
-        """Length of a world's array for grids of obstacles and team; 0 for a team so small that trying all pairs costs less."""
+        """Length of a world's array for grids of obstacles and team; 0 if trying all pairs costs less."""
         return grid_room(self.scenario)
 
     @property
     def workspace_rows(self) -> int:
-        """Rows of two of a world's scratch, see :func:`workspace_rows`."""
+        """Number of rows of a world's scratch, see :func:`workspace_rows`."""
         return workspace_rows(self.scenario)
 
     @property
     def native(self) -> bool:
-        """Whether the compiled loop can run it: every law is compiled."""
+        """Whether the compiled loop can run this plan: every law is compiled."""
         robots_own = [law for robot in self.fleet.kinds for law in (robot.drive, robot.reading) if law is not None]
         return all(map(laws.is_compiled, (self.controller.law, self.scenario.disturbance.law, *robots_own)))
 
     def _laws(self, made: Callable[[laws.Law, Any], Any]) -> tuple[Any, ...]:
-        """Controller, disturbance, and the groups' drives and readings, as ``made`` of law and kind."""
+        """``made(law, kind)`` for the controller, the disturbance, and the drives and readings of all groups."""
         return (
             made(self.controller.law, laws.CONTROLLER),
             made(self.scenario.disturbance.law, laws.DISTURBANCE),
@@ -95,11 +95,11 @@ class Plan:
         )
 
     def readings(self, made: Callable[[laws.Law, Any], Any] = laws.for_team) -> list[Any]:
-        """The reading of each group of the plant, as ``made`` of law and kind; by default for the Python path."""
+        """``made(law, kind)`` for the reading of each group of the plant; by default in the form for the Python path."""
         return [made(cast(laws.Law, group.robot.reading), laws.READING) for group in self.fleet.driven]
 
     def compiled_side(self, data: Sequence[mujoco.MjData]) -> Native:
-        """What compiled code reaches by address, for one MjData per world; whoever calls keeps them alive."""
+        """Addresses for compiled code, with one MjData per world; the caller must keep them alive."""
         *team_laws, drives, readings = self._laws(laws.address)
         arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
         columns = (drives, readings, [d._address for d in data], *arrays)
@@ -107,7 +107,7 @@ class Plan:
         return Native._make((None, None, *entries, *(np.array(column, dtype=np.uint64) for column in columns)))
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
-        """The same objects for the Python path: laws that go through the team agent by agent, MjData and its arrays."""
+        """The same objects for the Python path: laws applied to all agents in turn, MjData and its arrays."""
         team_laws = self._laws(laws.for_team)
         columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
         return Native._make((shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
@@ -122,7 +122,7 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     """Check a scenario with a controller and assemble its model; ``shield=True`` is ``Shield()``.
 
     Raises:
-        ConfigurationError: no controller, or one whose code fails; unknown robot, a substep beyond the controller's stability
+        ConfigurationError: no controller, or one with failing code; an unknown robot, a substep beyond the controller's stability
             limit, a law of the wrong kind, or a shield whose assumptions do not hold.
     """
     if not isinstance(scenario, Scenario):
@@ -168,7 +168,7 @@ def _initial_state(scenario: Scenario, controller: Controller) -> np.ndarray:
 
 
 def make_mission(scenario: Scenario) -> MissionRules:
-    """The clocks of a scenario and what it is judged by, as the loop takes them."""
+    """The time steps and the criteria of a scenario, in the form that the loop takes."""
     return MissionRules(
         mission_step=float(scenario.mission_step),
         substep=float(scenario.substep),
@@ -180,10 +180,10 @@ def make_mission(scenario: Scenario) -> MissionRules:
 
 
 def make_behaviors(scenario: Scenario) -> Behaviors:
-    """The behaviors of a scenario and how they become references, as the loop takes them.
+    """The behaviors of a scenario and their composition, in the form that the loop takes.
 
     Raises:
-        ConfigurationError: a law that is not compiled, or not a behavior's.
+        ConfigurationError: a law that is not compiled, or not that of a behavior.
     """
     addresses, params = behavior_arrays(scenario.behaviors, scenario.agents)
     set_based = scenario.composition == "set-based"
@@ -206,7 +206,7 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
 
 
 def _composed(behaviors: Any) -> tuple[Any, ...]:
-    """Arguments like those of a composition: time, orders, behaviors, positions, obstacles, grid, workspace, velocities."""
+    """Sample arguments of a composition: time, orders, behaviors, positions, obstacles, grid, workspace, velocities."""
     rows = np.zeros((1, 2))
     return 0.0, np.zeros(1, dtype=np.int64), behaviors, rows, rows, np.zeros(1), rows, rows
 
@@ -237,9 +237,9 @@ def _make_plant(scenario: Scenario, controller: Controller, limit: float, model:
 
 
 def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Addresses of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, (N, 2) each, found by name.
+    """Indices of every agent's two axes in qpos, in qvel and in ctrl of a compiled model, (N, 2) each, found by name.
 
-    A free joint's axes are its first two. Robots that are not direct have -1 for ctrl.
+    The axes of a free joint are its first two entries. Robots that are not direct have -1 for ctrl.
     """
     qpos, qvel, ctrl = np.zeros((3, scenario.agents, 2), dtype=np.int64)
     for i, robot in enumerate(scenario.fleet.robots):
@@ -253,7 +253,7 @@ def find_indices(model: mujoco.MjModel, scenario: Scenario) -> tuple[np.ndarray,
 
 
 def find_spans(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
-    """(N, 3, 2): first and last + 1 of every robot in qpos, qvel and ctrl of a compiled model; zeros for direct robots."""
+    """(N, 3, 2): first and last + 1 index of every robot in qpos, qvel and ctrl of a compiled model; zeros for direct robots."""
     fleet, spans = scenario.fleet, np.zeros((scenario.agents, 3, 2), dtype=np.int64)
     counts = {id(robot): len(robot.spec().actuators) for robot in fleet.kinds}
     ends = np.cumsum([counts[id(robot)] for robot in fleet.robots]).tolist()  # attached in turn; nothing else has actuators
@@ -276,10 +276,10 @@ def _solid_obstacles(model: mujoco.MjModel, scenario: Scenario) -> np.ndarray:
 
 
 def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndarray, np.ndarray]:
-    """``behavior_laws`` (M,) and ``behavior_params`` (M, N, P) of a plan, for N ``agents``.
+    """``laws`` (M,) and ``params`` (M, N, P) of :class:`Behaviors`, for N ``agents``.
 
     Raises:
-        ConfigurationError: a law that is not compiled, or not a behavior's.
+        ConfigurationError: a law that is not compiled, or not that of a behavior.
     """
     gains = [[guarded(partial(b.params, i), f"behavior {b.name}: params()") for i in range(agents)] for b in behaviors]
     params = _padded(
@@ -291,14 +291,14 @@ def behavior_arrays(behaviors: Sequence[Behavior], agents: int) -> tuple[np.ndar
 
 
 def grid_room(scenario: Scenario) -> int:
-    """Length of an array for grids of a scenario's obstacles and team; 0 where trying all pairs costs less."""
+    """Length of an array for grids of a scenario's obstacles and team; 0 if trying all pairs costs less."""
     agents, obstacles = scenario.agents, len(scenario.obstacles)
     neighbors = agents if NEAREST_NEIGHBOR in sees_array(scenario.behaviors) else 0
     return int(room(obstacles) + room(agents)) if agents * max(obstacles, neighbors) > WORTH else 0
 
 
 def _padded(rows: Sequence[Sequence[np.ndarray]]) -> np.ndarray:
-    """(M, N, P) float64 from ragged numbers, zeros at the end of the shorter ones."""
+    """(M, N, P) float64 from rows of different length, padded with zeros at the end."""
     width = max(len(numbers) for row in rows for numbers in row)
     out = np.zeros((len(rows), len(rows[0]), width))
     for j, row in enumerate(rows):

@@ -1,12 +1,12 @@
-"""What compiled code is handed by address: NamedTuples of arrays, and its own parts.
+"""What compiled code receives by address: NamedTuples of arrays, and compiled functions.
 
-The loop takes some ninety arrays in six NamedTuples. numba passes a NamedTuple by value: every function that is handed one is
-compiled with hundreds of arguments, and every ``team.position`` reads all of it. A :class:`Reference` is one pointer, and reads
-the field alone. The source is the same for both: attributes have the same names.
+The loop takes about ninety arrays in six NamedTuples. numba passes a NamedTuple by value: every function that takes one is
+compiled with hundreds of arguments, and every ``team.position`` reads all of it. A :class:`Reference` is one pointer and reads
+only the field. The same source works with both, because attributes have the same names.
 
-What a function calls is compiled into it once more. So the loop's large parts are called by address, :func:`call`: each is
-compiled once, and only by those who need it. :func:`entry` compiles one and tells where it is. Its type holds what it takes: a
-wrong argument is an error of the compiler, not of memory.
+numba compiles a function once more into each of its callers. So the large parts of the loop are called by address with
+:func:`call`: each is compiled once, and only if it is needed. :func:`entry` compiles a function and returns its address. Its type
+contains the types of the arguments, so a wrong argument is a compiler error, not a memory error.
 """
 
 from typing import Any
@@ -39,7 +39,7 @@ structref.define_proxy(_Holder, _HolderType, ["values"])
 
 
 class ReferenceType(types.Type):
-    """numba's type of :class:`Reference`: ``target`` is that of the NamedTuple."""
+    """numba's type of :class:`Reference`: ``target`` is the type of the NamedTuple."""
 
     def __init__(self, target: types.BaseTuple) -> None:
         self.target = target
@@ -79,15 +79,15 @@ def _address(typing_context, holder):
 
 @compiled
 def _hold(values):
-    """``values`` in memory, and where they are."""
+    """Store ``values`` in memory; returns their owner and address."""
     holder = _Holder(values)
     return holder, _address(holder)
 
 
 class Reference:
-    """A NamedTuple of arrays and numbers as compiled code takes it: one pointer. Made by :func:`refer`.
+    """A NamedTuple of arrays and numbers that compiled code takes as one pointer. Made by :func:`refer`.
 
-    In Python it reads as the NamedTuple does. Compiled code that is handed it uses the very arrays; numbers are as they were.
+    In Python it reads like the NamedTuple. Compiled code uses the same arrays; numbers are copied when it is made.
     """
 
     def __init__(self, values: Any) -> None:
@@ -102,7 +102,7 @@ class Reference:
         return getattr(self.values, name)
 
     def _replace(self, **changes: Any) -> "Reference":
-        """As of a NamedTuple: another one with some fields changed."""
+        """Another reference with some fields changed, as for a NamedTuple."""
         return Reference(self.values._replace(**changes))
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -111,7 +111,7 @@ class Reference:
 
 
 def refer(values: Any) -> Any:
-    """What stands for a NamedTuple in the loop: a :class:`Reference`; the NamedTuple itself where numba is off."""
+    """A NamedTuple in the form that the loop takes: a :class:`Reference`, or the NamedTuple itself if numba is off."""
     return values if numba.config.DISABLE_JIT else Reference(values)
 
 
@@ -124,7 +124,7 @@ def _unbox_reference(kind, value, c):
 
 
 class EntryType(types.Type):
-    """numba's type of :class:`EntryPoint`: ``kinds`` are those that its function takes."""
+    """numba's type of :class:`EntryPoint`: ``kinds`` are the argument types of its function."""
 
     def __init__(self, kinds: tuple[types.Type, ...]) -> None:
         self.kinds = kinds
@@ -132,7 +132,7 @@ class EntryType(types.Type):
 
 
 class RecordType(types.Type):
-    """Stands for a reference among the kinds of an entry, by the record's name alone: a record may hold entries that take it."""
+    """Type of a reference among the kinds of an entry: the record's name only, since a record may hold entries that take it."""
 
     def __init__(self, record: str) -> None:
         super().__init__(name=f"&{record}")
@@ -145,7 +145,7 @@ class _EntryModel(models.PrimitiveModel):
 
 
 class EntryPoint:
-    """Address of a compiled function, as :func:`call` takes it. Made by :func:`entry`; :func:`no_entry` has its type alone."""
+    """Address of a compiled function for :func:`call`. Made by :func:`entry`, or with the address 0 by :func:`no_entry`."""
 
     def __init__(self, address: int, kinds: tuple[types.Type, ...]) -> None:
         self.address, self._numba_type_ = address, EntryType(kinds)
@@ -160,7 +160,7 @@ def _unbox_entry(kind, value, c):
 
 
 def _passed(kind: Any) -> Any:
-    """The kind as which an argument is passed: whole numbers as int64, arrays as C-contiguous ones, references by name."""
+    """The type of a passed argument: integers as int64, floats as float64, arrays C-contiguous, references by name."""
     if isinstance(kind, types.Array):
         return types.Array(kind.dtype, kind.ndim, "C")
     if isinstance(kind, ReferenceType):
@@ -171,7 +171,7 @@ def _passed(kind: Any) -> Any:
 
 
 def _check(given: Any, wanted: Any) -> None:
-    """Raise a numba error unless an argument can be passed as the kind that an entry takes."""
+    """Raise a numba error unless an argument can be passed as the type that an entry takes."""
     kind = _passed(given)
     if isinstance(given, types.Array) and given.layout != "C":
         raise TypingError(f"an array that is passed to an entry must be contiguous, got {given}")
@@ -201,7 +201,7 @@ def _call_at(typing_context, entry, *arguments):
 
 
 class _Call(_Intrinsic):  # type: ignore[misc]  # numba has no types
-    """Call a function that returns a whole number: itself in Python, by its :class:`EntryPoint` in compiled code."""
+    """Call a function that returns an integer: directly in Python, by its :class:`EntryPoint` in compiled code."""
 
     def __call__(self, function, *arguments):
         return function(*arguments)
@@ -212,7 +212,7 @@ call._register()
 
 
 def entry(function: Any, *arguments: Any) -> Any:
-    """What :func:`call` takes for a compiled ``function`` of such arguments; the function itself where numba is off."""
+    """The :class:`EntryPoint` of a compiled ``function`` for such arguments; the function itself if it is not compiled."""
     if not is_compiled(function):
         return function
     given = [numba.typeof(argument) for argument in arguments]
@@ -226,6 +226,6 @@ def entry(function: Any, *arguments: Any) -> Any:
 
 
 def no_entry(*arguments: Any) -> Any:
-    """A field's value before its :func:`entry` is known: of the same type. A class of records stands for a reference to one."""
+    """A placeholder for an unknown :func:`entry`, of the same type. A record class stands for a reference to such a record."""
     kinds = (RecordType(a.__name__) if isinstance(a, type) else _passed(numba.typeof(a)) for a in arguments)
     return EntryPoint(0, tuple(kinds))

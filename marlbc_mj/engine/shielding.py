@@ -1,4 +1,4 @@
-"""A shield's assumptions, taken from a scenario where they are left open, and checked before anything runs."""
+"""Assumptions of a shield, completed from a scenario and checked before anything runs."""
 
 from dataclasses import replace
 from statistics import NormalDist
@@ -15,24 +15,26 @@ from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
 
 GREATEST_SHARE = 0.25
-"""Of the force limit, that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating keep S."""
+"""Greatest share of the force limit that f may take at the speed |v| = h U / m, so that stopping within a substep and retreating
+keep the state in S."""
 GREATEST_ERROR = 0.5
-"""Of the force limit, that f and the robot's own error may take there: up to it a retreat takes back what a stop costs."""
+"""Greatest share of the force limit that f and the robot's own error may take at that speed, so that a retreat makes up for what
+a stop costs."""
 CREEP = 2.0
-"""Retreats at rest, each with its :func:`drift`, that the margin has room for where several things press at once."""
-FASTEST = 1e3  # speed cap where f does not grow with the speed [m/s]
-LEAST_CREEP = 1e-5  # more, for the drift of a slow motion that ends [m]
-TUBE_SLACK = 1.05  # of a computed tube: the substep's share, which the response in continuous time leaves out
+"""Number of retreats at rest, each with its :func:`retreat_drift`, that the margin allows when several things are near."""
+FASTEST = 1e3  # greatest default speed cap, for an f that does not grow with the speed [m/s]
+LEAST_CREEP = 1e-5  # added for the drift at the end of a slow motion [m]
+TUBE_SLACK = 1.05  # factor on a computed tube for the effect of the substep, which the continuous-time response leaves out
 
 
 def resolve(shield: Shield, scenario: Scenario, limit: float, controller: Controller | None = None) -> ShieldNumbers:
-    """The assumptions of a shield for one scenario, as numbers: of forces, or of references where forces are not known to act.
+    """The numbers of a shield for one scenario, a shield of forces or of references, see ``Shield.level``.
 
     Args:
-        shield: what is assumed; None in a field takes the scenario's.
+        shield: the assumptions; None in a field takes the number of the scenario or the robot.
         scenario: the problem instance.
-        limit: of the actuators per axis [N]; infinite for an unlimited law.
-        controller: that follows references; it matters for a tube around them only.
+        limit: force limit of the actuators per axis [N]; infinite for an unlimited law.
+        controller: the controller that tracks references; needed only for the tube around them.
 
     Raises:
         ConfigurationError: an assumption that does not hold, with the number that breaks it.
@@ -95,7 +97,7 @@ def _of_forces(shield: Shield, scenario: Scenario, robot: Robot, limit: float) -
 
 
 def _of_references(shield: Shield, scenario: Scenario, controller: Controller | None) -> ShieldNumbers:
-    """Numbers of a shield of references, which brake with the scenario's acceleration limit; robots are within a tube of them."""
+    """Numbers of a shield of references: references brake with the scenario's acceleration limit, and robots stay in a tube."""
     fleet = scenario.fleet
     if shield.mailed:
         raise ConfigurationError(
@@ -130,7 +132,7 @@ def _of_references(shield: Shield, scenario: Scenario, controller: Controller | 
 
 
 def _messages(shield: Shield, scenario: Scenario) -> dict[str, float]:
-    """Latency [substeps], loss and the silent agent, of messages between agents."""
+    """Latency [substeps], loss quantile and silent agent, as fields of :class:`ShieldNumbers`."""
     substeps = shield.latency / scenario.substep
     if abs(substeps - round(substeps)) > 1e-9 * max(1.0, substeps):
         raise ConfigurationError(
@@ -144,7 +146,7 @@ def _messages(shield: Shield, scenario: Scenario) -> dict[str, float]:
 
 
 def _missing(robot: Robot) -> str:
-    """What a robot lacks for a shield."""
+    """Error message about what a robot lacks for a shield."""
     if robot.force_error is not None:
         return (
             f"shield: robot {robot.name!r} has no tube, how far [m] it may be from its reference, which a shield of references "
@@ -158,9 +160,9 @@ def _missing(robot: Robot) -> str:
 
 
 def _find_tube(shield: Shield, scenario: Scenario, fleet: RobotFleet, controller: Controller | None) -> float:
-    """How far agents may be from their references [m]: given, computed for direct robots, or measured, in this order.
+    """Greatest distance of agents from their references [m]: given, computed for direct robots, or measured, in this order.
 
-    In a mixed team the widest tube holds for all.
+    In a mixed team the widest tube applies to all agents.
     """
     if shield.tube is not None:
         return shield.tube
@@ -168,7 +170,7 @@ def _find_tube(shield: Shield, scenario: Scenario, fleet: RobotFleet, controller
 
 
 def _tube_of(robot: Robot, shield: Shield, scenario: Scenario, controller: Controller | None) -> float:
-    """How far one robot may be from its reference [m]."""
+    """Greatest distance of one robot from its reference [m]."""
     if robot.direct and not robot.contact and controller is not None:
         return tracking_tube(_with_one(scenario, robot), controller, _disturbance_bound(shield, scenario))
     if robot.tube is None:
@@ -183,7 +185,7 @@ def _tube_of(robot: Robot, shield: Shield, scenario: Scenario, controller: Contr
 
 
 def _with_one(scenario: Scenario, robot: Robot) -> Scenario:
-    """A scenario as one robot of its mixed team sees it: all agents have that robot's mass and limit."""
+    """The scenario of a mixed team, with the mass and force limit of one of its robots for all agents."""
     if not scenario.robots:
         return scenario
     one = RobotFleet((robot,))
@@ -193,7 +195,7 @@ def _with_one(scenario: Scenario, robot: Robot) -> Scenario:
 
 
 def tracking_tube(scenario: Scenario, controller: Controller, bound: ForceBound) -> float:
-    """How far a point mass under PD, or SORLC without networks, may be from a reference of limited acceleration [m].
+    """Greatest distance of a point mass under PD, or SORLC without networks, from a reference of limited acceleration [m].
 
     The error obeys e'' + k_v e' + k_p e = f / m, and e' jumps by at most A T in every mission step. With k_v^2 >= 4 k_p the
     response g to a unit jump is positive, has one peak G and the integral 1 / k_p. So |e| <= (B / m + A) / k_p + A T G, as
@@ -233,7 +235,7 @@ def _peak(k_p: float, k_v: float) -> float:
 
 
 def _check_sensors(shield: Shield, scenario: Scenario) -> None:
-    """Raise ConfigurationError for sensors whose errors are not said."""
+    """Raise ConfigurationError if sensors have errors for which the shield gives no bound."""
     errors = scenario.imperfections
     blurred = (errors.position_noise > 0 or errors.delay > 0) and shield.position_error == 0
     if blurred or ((errors.velocity_noise > 0 or errors.delay > 0) and shield.velocity_error == 0):
@@ -245,7 +247,7 @@ def _check_sensors(shield: Shield, scenario: Scenario) -> None:
 
 
 def _disturbance_bound(shield: Shield, scenario: Scenario) -> ForceBound:
-    """Bound of the disturbance at the greatest scale that is drawn."""
+    """The shield's bound of the disturbance, or the disturbance's own at the greatest scale that is drawn."""
     if shield.disturbance is not None:
         return shield.disturbance
     offered = getattr(scenario.disturbance, "force_bound", None)
@@ -259,7 +261,7 @@ def _disturbance_bound(shield: Shield, scenario: Scenario) -> ForceBound:
 
 
 def _check_bound(bound: ForceBound, error: float, force: float, scenario: Scenario) -> None:
-    """Raise ConfigurationError for a disturbance, or a disturbance and a robot's own error, too strong for the force limit."""
+    """Raise ConfigurationError if a disturbance, alone or with the robot's own error, is too strong for the force limit."""
     speed = scenario.substep * force / scenario.mass
     for size, share, what in (
         (bound.at(speed), GREATEST_SHARE, "the disturbance"),
@@ -273,7 +275,7 @@ def _check_bound(bound: ForceBound, error: float, force: float, scenario: Scenar
 
 
 def _check_braking(shield: Shield, scenario: Scenario, bound: ForceBound, force: float, cap: float) -> None:
-    """Raise ConfigurationError where nothing is left to brake with at the speed cap, or to follow an obstacle with."""
+    """Raise ConfigurationError if no force is left to brake at the speed cap, or to follow a moving obstacle."""
     if not bound.at(cap) < force:
         raise ConfigurationError(
             f"shield: at the speed cap of {cap:g} m/s the disturbance may be {bound.at(cap):.3g} N, so a force limit of "
@@ -290,7 +292,7 @@ def _check_braking(shield: Shield, scenario: Scenario, bound: ForceBound, force:
 
 
 def _speed_cap(bound: ForceBound, force: float) -> float:
-    """The speed at which f takes half of what it leaves of the force limit at rest, at most FASTEST [m/s]."""
+    """The speed at which half of the braking force at rest is left, at most FASTEST [m/s]."""
     half = 0.5 * (force - bound.constant)
     if bound.quadratic > 0.0:
         root = np.sqrt(bound.linear**2 + 4.0 * bound.quadratic * half)
@@ -299,7 +301,7 @@ def _speed_cap(bound: ForceBound, force: float) -> float:
 
 
 def check_draw(numbers: ShieldNumbers, draw: Draw) -> None:
-    """Raise ConfigurationError unless agents at rest at a draw's starts are in the safe set, and obstacles move as is assumed."""
+    """Raise ConfigurationError unless agents at rest at a draw's starts are in the safe set and obstacles move as assumed."""
     speeds = _check_motions(numbers, draw.motions) if len(draw.motions) else np.zeros(len(draw.obstacles))
     starts, obstacles = draw.starts, obstacles_at(0.0, draw.obstacles, draw.motions)
     stop = stopping_distance(numbers, numbers.velocity_error)
@@ -323,7 +325,7 @@ def _check_motions(numbers: ShieldNumbers, motions: np.ndarray) -> np.ndarray:
     """(K,) greatest speeds [m/s] of obstacles that move as ``motions`` (K, 6).
 
     Raises:
-        ConfigurationError: one is faster, or changes its velocity faster, than is assumed.
+        ConfigurationError: an obstacle exceeds the assumed speed or acceleration.
     """
     swing = np.hypot(motions[:, 2], motions[:, 3]) * np.abs(motions[:, 4])
     speeds, accelerations = np.hypot(motions[:, 0], motions[:, 1]) + swing, swing * np.abs(motions[:, 4])

@@ -1,6 +1,6 @@
-"""B teams between mission steps, apart from the physics: how their rows are made, reset, placed and observed.
+"""B teams between mission steps, without the physics: making, resetting, placing and observing their rows.
 
-World and the dm_control task both keep a :class:`~marlbc_mj.engine.records.Team`; this is what they do with it.
+World and the dm_control task both hold a :class:`~marlbc_mj.engine.records.Team` and share these functions.
 """
 
 from typing import Any
@@ -26,7 +26,7 @@ SCRATCH = ("status", "drag", "force", "workspace", "grid", "stopping", "looked",
 
 
 def make_team(plan: Plan, worlds: int) -> Team:
-    """Rows for ``worlds`` teams; :func:`reset` starts an episode in one."""
+    """Allocate the rows of ``worlds`` teams; :func:`reset` starts an episode in one of them."""
     scenario, imperfections = plan.scenario, plan.scenario.imperfections
     agents, count, moving = scenario.agents, len(scenario.obstacles), scenario.moving
     each, pairs, tracks = (worlds, agents), (worlds, agents, 2), (worlds, count if moving else 0)
@@ -79,17 +79,17 @@ def make_team(plan: Plan, worlds: int) -> Team:
 
 
 def make_record(plan: Plan, worlds: int, recording: bool) -> Record:
-    """Room for every substep of one mission step; for none unless ``recording``."""
+    """Allocate the record of every substep of one mission step; it is empty unless ``recording``."""
     shape = (worlds, plan.scenario.substeps if recording else 0, plan.scenario.agents, 2)
     return Record(*(np.zeros(shape) for _ in Record._fields))
 
 
 def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarray:
-    """Put row ``b`` at the start of an episode drawn with ``rng``; returns the starts (N, 2) [m], for :func:`put`.
+    """Set row ``b`` to the start of an episode drawn with ``rng``; returns the starts (N, 2) [m], for :func:`put`.
 
     Raises:
-        ConfigurationError: no layout for this draw, obstacles of a size that the model does not have, or a start that a shield
-            does not allow.
+        ConfigurationError: no layout for this draw, solid obstacles of another size than in the model, or a start that the
+            shield does not allow.
     """
     draw = plan.scenario.draw(rng)
     _check_solid(plan, draw.obstacles)
@@ -106,7 +106,7 @@ def reset(plan: Plan, team: Team, b: int, rng: np.random.Generator) -> np.ndarra
 
 
 def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
-    """Raise ConfigurationError for obstacles (K, 3) that robots would collide with in a size that the model does not have."""
+    """Raise ConfigurationError if solid obstacles (K, 3) have other radii than in the model."""
     scenario = plan.scenario
     if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
         raise ConfigurationError(
@@ -118,9 +118,9 @@ def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
 def place(
     plan: Plan, team: Team, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray | int
 ) -> None:
-    """Put row ``b`` at mission step ``step``; agents and references are at ``position`` [m] and ``velocity`` [m/s], (N, 2) each.
+    """Set row ``b`` to mission step ``step``, agents and references to ``position`` [m] and ``velocity`` [m/s], (N, 2) each.
 
-    Controllers and robots start anew. ``command`` (N,) counts as given last, since ever.
+    Controllers and robots get their initial states. ``command`` (N,) counts as in force from the beginning.
     """
     team.position[b] = team.reference[b] = position
     team.velocity[b] = team.reference_velocity[b] = velocity
@@ -133,14 +133,14 @@ def place(
 
 
 def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocity: np.ndarray) -> None:
-    """Move the physics of row ``b``, ``data``, to positions (N, 2) [m] and velocities (N, 2) [m/s], and measure it.
+    """Set the physics ``data`` of row ``b`` to positions (N, 2) [m] and velocities (N, 2) [m/s], and measure the result.
 
-    The base of a robot that is read elsewhere (a look-ahead point) is shifted until the reading is the position. Its
-    velocity is what its joints allow. Obstacles that are solid go where this episode has them.
+    If a robot's reading is at another point than its base (a look-ahead point), the base is shifted so that the reading is the
+    position; the velocity is then what the joints allow. Solid obstacles are set to their places in this episode.
     """
     plant = plan.plant
     team.last_substep[b] = np.nan
-    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED  # everyone is told of the new places
+    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED  # all agents know the new places
     base = plant.qpos_index.ravel()
     data.qpos[base] = np.ravel(position)
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)
@@ -151,17 +151,17 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
         read_robots(plan.readings(), plant, team.robot[b], data.qpos, data.qvel, data.actuator_force, p, v, force)
         data.qpos[base] += np.ravel(position - p)
         team.velocity[b] = v
-    if team.sensed.shape[1] > 0:  # the past that delays look into is the present
+    if team.sensed.shape[1] > 0:  # delayed sensors measure the present state
         team.history[b] = np.stack([team.position[b], team.velocity[b]])
         count = int(team.steps[b]) * plan.mission.substeps
         sense(plant, team.noise_seed[b], count, team.history[b], team.position[b], team.velocity[b], team.sensed[b])
 
 
 def check_orders(plan: Plan, orders: np.ndarray, worlds: int) -> np.ndarray:
-    """Orders (B, N) int64 as they are.
+    """Check orders (B, N) int64 and return them unchanged.
 
     Raises:
-        ConfigurationError: another shape, or an index that is no order: the compiled loop would read past its tables.
+        ConfigurationError: a wrong shape, or an index that is no order, for which the loop would read past its tables.
     """
     shape, count = (worlds, plan.scenario.agents), len(plan.scenario.orders)
     if orders.shape != shape:
@@ -172,7 +172,7 @@ def check_orders(plan: Plan, orders: np.ndarray, worlds: int) -> np.ndarray:
 
 
 def lasting(team: Team) -> dict[str, np.ndarray]:
-    """The arrays that a mission step depends on, by name: the very ones."""
+    """The arrays on which a mission step depends, by name, without copying."""
     return {name: array for name, array in team._asdict().items() if name not in SCRATCH}
 
 
@@ -183,7 +183,7 @@ def copy_row(source: Team, source_world: int, team: Team, world: int) -> None:
 
 
 def observe(plan: Plan, team: Team) -> Observation:
-    """What supervisors decide on, as copies."""
+    """The observation that supervisors receive, as copies."""
     measured = (team.sensed[:, 0], team.sensed[:, 1]) if team.sensed.shape[1] > 0 else (team.position, team.velocity)
     duration = plan.mission.mission_step
     return Observation(
@@ -202,14 +202,14 @@ def observe(plan: Plan, team: Team) -> Observation:
 
 
 def shield_counts(team: Team) -> ShieldCounts | None:
-    """What the shield of every team did and saw since the episode began, as copies; None without a shield."""
+    """Copies of the shield counts of every team since the episode began; None without a shield."""
     if team.interventions.shape[1] == 0:
         return None
     return ShieldCounts(team.interventions.copy(), team.force_change.copy(), team.breaches.copy())
 
 
 def diverged(plan: Plan, team: Team, b: int, status: int, steps: int) -> SimulationError:
-    """The error for a ``status`` of the loop in the mission step that began at ``steps``: names world, agent and time."""
+    """The error for a ``status`` of the loop in mission step ``steps``, counted from 0: names world, agent and time."""
     agent, substep = (status - 1) % plan.scenario.agents, (status - 1) // plan.scenario.agents
     time = steps * plan.mission.mission_step + substep * plan.mission.substep
     return SimulationError(

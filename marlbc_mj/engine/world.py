@@ -23,15 +23,15 @@ from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.text import one_line
 
 PHYSICS = mujoco.mjtState.mjSTATE_INTEGRATION
-"""What of MuJoCo's data is a world's state."""
+"""The part of MuJoCo's data that is the state of a world."""
 
 
 class Step(NamedTuple):
-    """What one mission step returns."""
+    """Result of one mission step."""
 
     observation: Observation
     reward: np.ndarray  # (B,) r1 + r2 of (13)
-    done: np.ndarray  # (B,) bool: the episode's last mission step has been made
+    done: np.ndarray  # (B,) bool: whether this was the last mission step of the episode
     record: Record | None  # with ``record=True`` only
     shield: ShieldCounts | None = None  # since the episode began, (B, N) each; with a shield only
 
@@ -39,18 +39,18 @@ class Step(NamedTuple):
 class World:
     """B copies of one scenario under one controller.
 
-    Worlds do not interact: results are the same, bit for bit, for any batch size and number of threads. With a compiled
-    controller the whole mission step runs inside one compiled call. A plain Python one takes the Python path: slower, with the
-    same results. ``state`` is the :class:`~marlbc_mj.engine.records.Team` of all worlds, ``data`` has one MjData per world.
+    Worlds do not interact: results are identical to the last bit for any batch size and number of threads. If all laws are
+    compiled, the whole mission step runs inside one compiled call. Otherwise the Python path is used: slower, with the same
+    results. ``state`` is the :class:`~marlbc_mj.engine.records.Team` of all worlds, ``data`` has one MjData per world.
 
     Args:
         scenario: the problem instance.
         controller: the force law and its gains; SORLC by default.
-        worlds: B.
-        threads: worlds are shared out over this many.
-        record: keep every substep.
-        native: None takes the compiled loop where it can, False forces the Python path.
-        shield: changes forces, as little as possible, so that agents can always stop; True is ``Shield()``.
+        worlds: number of worlds B.
+        threads: number of threads over which worlds are distributed.
+        record: whether to record every substep.
+        native: None uses the compiled loop if all laws are compiled, False forces the Python path.
+        shield: changes forces or references as little as possible, so that agents can always stop; True is ``Shield()``.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
@@ -89,27 +89,27 @@ class World:
         self.reset()
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a copy or a pickle holds: the settings, and the state of all worlds. Addresses are nobody else's business."""
+        """Content of a copy or a pickle: the settings and the state of all worlds, but no addresses."""
         options = {"worlds": self.worlds, "threads": self.threads, "record": self._recording, "native": self.native}
         settings = {"scenario": self.scenario, "controller": self.plan.controller, "shield": self.shield, **options}
         return {"settings": settings, "snapshot": self.snapshot()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """Make the worlds anew, and go on where the original was, bit for bit."""
+        """Make the worlds again, and restore the state of the original to the last bit."""
         World.__init__(self, **state["settings"])
         self.restore(state["snapshot"])
 
     def _hand_over(self) -> None:
-        """Give the loop, compiled or not, the very arrays of this World; again wherever they are other ones."""
+        """Pass the arrays of this World to the loop, compiled or not; to be called again if arrays are replaced."""
         plan = self.plan
         self.side = plan.compiled_side(self.data) if self.native else plan.python_side(self.data)
         self._arguments = drivers.hand_over(plan, self.side, self.state, self._record, self.native)
         self._loop = drivers.compiled_loop(self._arguments) if self.native else None
 
     def reset(self, seed: int = 0, mask: np.ndarray | None = None) -> Observation:
-        """Start episodes anew: all of them, or those where ``mask`` (B,) is true.
+        """Start new episodes in all worlds, or in those for which ``mask`` (B,) is true.
 
-        World b draws from its own stream, (seed, b), so what it does depends on neither B nor the other worlds.
+        World b draws from its own stream, (seed, b), so its results depend on neither B nor the other worlds.
         """
         if not isinstance(seed, int | np.integer) or seed < 0:
             raise ConfigurationError(f"seed must be a whole number and not negative, got {seed!r}")
@@ -122,32 +122,32 @@ class World:
         return self.observe()
 
     def begin(self, b: int, rng: np.random.Generator) -> None:
-        """Start an episode drawn with ``rng`` in world ``b`` alone; ``stream(s)`` draws what one world alone does under seed s.
+        """Start an episode drawn with ``rng`` in world ``b`` only; ``stream(s)`` gives the draw of a single world under seed s.
 
         Raises:
-            ConfigurationError: nothing can be flown for this draw; the world is as it was.
+            ConfigurationError: the draw cannot be run; the world is unchanged.
         """
         starts = team.reset(self.plan, self.state, b, rng)
         mujoco.mj_resetData(self.plan.model, self.data[b])
         team.put(self.plan, self.state, b, self.data[b], starts, np.zeros_like(starts))
 
     def copy_world(self, source: "World", source_world: int, world: int) -> None:
-        """Put ``world`` in the state of another World's world: physics, references, controllers, clock. Same plan expected.
+        """Copy the state of a world of another World with the same plan to ``world``: physics, references, controllers, clock.
 
-        For starting many predictions from one state.
+        Used to start many predictions from one state.
         """
         team.copy_row(source.state, source_world, self.state, world)
         mujoco.mj_setState(self.plan.model, self.data[world], source.physics(source_world), PHYSICS)
 
     def place(self, b: int, step: int, position: np.ndarray, velocity: np.ndarray, command: np.ndarray) -> None:
-        """Put world ``b`` in the middle of a mission: an episode that starts along the route.
+        """Set world ``b`` to the middle of a mission: an episode that starts along the route.
 
         Args:
-            b: the world; its obstacles and disturbance stay as they were drawn.
-            step: mission steps that count as made.
+            b: index of the world; its obstacles and disturbance stay as they were drawn.
+            step: number of mission steps that count as completed.
             position: (N, 2) [m] of the agents and of their references alike.
             velocity: (N, 2) [m/s] of both.
-            command: (N,) indices into ``scenario.orders.commands`` that count as given last.
+            command: (N,) indices into ``scenario.orders.commands`` that count as the last commands.
         """
         team.place(self.plan, self.state, b, step, position, velocity, command)
         mujoco.mj_resetData(self.plan.model, self.data[b])
@@ -165,7 +165,7 @@ class World:
         return buffer
 
     def snapshot(self) -> dict[str, np.ndarray]:
-        """Copies of everything that changes while worlds run, by name; :meth:`restore` continues from it bit for bit."""
+        """Copies of all that changes while worlds run, by name; :meth:`restore` resumes from it, identical to the last bit."""
         state = {name: array.copy() for name, array in team.lasting(self.state).items()}
         return {**state, "physics": np.stack([self.physics(b) for b in range(self.worlds)])}
 
@@ -178,16 +178,16 @@ class World:
             mujoco.mj_setState(self.plan.model, self.data[b], snapshot["physics"][b], PHYSICS)
 
     def observe(self) -> Observation:
-        """What a supervisor decides on, as copies."""
+        """The observation that a supervisor receives, as copies."""
         return team.observe(self.plan, self.state)
 
     def step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
-        """One mission step of every world.
+        """Run one mission step of every world.
 
         Args:
             orders: (B, N) integers, indices into ``scenario.orders``, or names of orders.
-            velocity: (B, N, 2) reference velocities v_r [m/s] in the place of the composed ones (12); the orders then are only
-                the label under which the step is counted, priced by r2 and recorded.
+            velocity: (B, N, 2) reference velocities v_r [m/s] that replace the composed ones (12); the orders are then only
+                labels, which count for r2 and the record.
 
         Raises:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
@@ -198,7 +198,7 @@ class World:
         return self._outcome()
 
     def try_step(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> Step:
-        """:meth:`step`, but worlds that diverge stop no other: ``state.status`` is not 0 where one did.
+        """Like :meth:`step`, but diverged worlds do not stop the others; their ``state.status`` is not 0.
 
         Raises:
             ConfigurationError: wrong shape, an index that is no order, or a velocity that is not finite.
@@ -207,7 +207,7 @@ class World:
         return self._outcome()
 
     def rollout(self, orders: np.ndarray) -> np.ndarray:
-        """Many mission steps with orders known beforehand, in one compiled call: a schedule, or candidates of a search.
+        """Run many mission steps with orders known in advance, in one compiled call: a schedule, or candidates of a search.
 
         Args:
             orders: (M, B, N) integers, indices into ``scenario.orders``.
@@ -231,7 +231,7 @@ class World:
         return returns
 
     def _play(self, returns: np.ndarray, sequence: np.ndarray, given: np.ndarray) -> int:
-        """The compiled loop, on one thread or on several; how many worlds failed.
+        """Run the compiled loop on one thread or on several; returns the number of worlds that failed.
 
         Raises:
             SimulationError: a law raised an error, for an assignment of the wrong shape for example.
@@ -243,14 +243,15 @@ class World:
             raise SimulationError(f"a compiled law fails: {blame(error)}") from error
 
     def raise_if_diverged(self) -> None:
-        """Raise SimulationError for the first world that the last :meth:`advance` could not step."""
+        """Raise SimulationError for the first world that diverged in the last :meth:`advance`."""
         if self.state.status.any():
             b = int(np.flatnonzero(self.state.status)[0])
             raise team.diverged(self.plan, self.state, b, int(self.state.status[b]), int(self.state.steps[b]) - 1)
 
     def advance(self, orders: np.ndarray, velocity: np.ndarray | None = None) -> int:
-        """:meth:`step` alone, for ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64, both contiguous: no checks, no
-        copies; how many worlds failed.
+        """Run :meth:`step` without checks and copies; returns the number of worlds that failed.
+
+        ``orders`` (B, N) int64 and ``velocity`` (B, N, 2) float64 must be contiguous.
         """
         given = self._orders_alone if velocity is None else velocity
         if self.native:
@@ -259,11 +260,11 @@ class World:
         return sum(mission_step(b, orders, given, *self._arguments) for b in range(self.worlds))
 
     def _advance_checked(self, orders: np.ndarray, velocity: np.ndarray | None) -> int:
-        """:meth:`advance` with what a caller hands in; how many worlds failed."""
+        """Check the arguments of a caller and :meth:`advance`; returns the number of worlds that failed."""
         return self.advance(self._checked(orders), None if velocity is None else self._checked_velocity(velocity))
 
     def _outcome(self) -> Step:
-        """What the mission step that was just made returns."""
+        """Result of the last mission step."""
         done = self.state.steps >= self.scenario.mission_steps
         return Step(self.observe(), self.state.reward.copy(), done, self._read_record(), team.shield_counts(self.state))
 

@@ -1,1 +1,1 @@
-"""Learned policies without torch: inputs, action sets, decisions, checkpoints."""
+"""Running learned policies without torch: inputs, action sets, decisions, checkpoints."""

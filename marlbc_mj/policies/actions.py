@@ -11,15 +11,15 @@ ACTIONS = ("commands", "orders", "avoidance")
 
 
 def order_of(scenario: Scenario, actions: str) -> np.ndarray:
-    """(A,) index into ``scenario.orders`` of every action of a set.
+    """(A,) index into ``scenario.orders`` of each action in an action set.
 
     Args:
-        scenario: the scenario whose orders are chosen from.
-        actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, those
-            commands that end in the first formation, the shortest first: FM and OA>FM in the case study.
+        scenario: the scenario that defines the orders.
+        actions: ``"commands"``, one order for each distinct command; ``"orders"``, all permutations; ``"avoidance"``, the
+            commands that end in the first formation, shortest first: FM and OA>FM in the case study.
 
     Raises:
-        ConfigurationError: there is no such set.
+        ConfigurationError: unknown action set.
     """
     orders = scenario.orders
     if actions == "commands":

@@ -1,4 +1,4 @@
-"""Checkpoints: arrays as safetensors with a description as JSON in the header; a file is written whole or not at all."""
+"""Checkpoints: arrays as safetensors with a JSON description in the header; a file is written completely or not at all."""
 
 import hashlib
 import itertools
@@ -21,19 +21,19 @@ from marlbc_mj.util.files import staged_file, write_json
 from marlbc_mj.util.provenance import plain_data
 
 FORMAT = 3
-"""Version of the format: a digest covers the arrays and their description."""
+"""Version of the file format, in which a digest covers the arrays and their description."""
 
 
 def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[str, Any]) -> None:
-    """Write arrays and their description as one safetensors file. An existing file is replaced only by a whole one.
+    """Write arrays and their description as one safetensors file. An existing file is replaced only by a complete one.
 
     Args:
         path: the file.
         arrays: arrays by name.
-        description: what the header says, JSON data or dataclasses.
+        description: contents of the header, JSON data or dataclasses.
 
     Raises:
-        ConfigurationError: the file cannot be written, no space left for example.
+        ConfigurationError: the file cannot be written, for example for lack of space.
     """
     arrays = {name: np.asarray(array, order="C") for name, array in arrays.items()}
     said = {**plain_data(description), "format": FORMAT}
@@ -46,9 +46,9 @@ def write_arrays(path: Path, arrays: dict[str, np.ndarray], description: dict[st
 
 
 def digest(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any]) -> str:
-    """SHA-256 of contiguous arrays with their names, types and shapes, and of what is said about them, JSON data.
+    """SHA-256 of contiguous arrays with their names, types and shapes, and of their description (JSON data).
 
-    What ``description`` says about the digest itself is left out.
+    The entry ``sha256`` of ``description`` is excluded.
     """
     said = {name: value for name, value in description.items() if name != "sha256"}
     sha = hashlib.sha256(json.dumps(said, sort_keys=True).encode())
@@ -63,8 +63,8 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """The arrays and the description that :func:`write_arrays` wrote; nothing in the file is ever executed.
 
     Raises:
-        ConfigurationError: no such file, an incomplete one, no checkpoint of this package, one of another format, or one in
-            which any bit has changed.
+        ConfigurationError: the file does not exist, is incomplete, is not a checkpoint of this package, has another format, or
+            differs in any bit from what was written.
     """
     try:
         with safe_open(path, framework="numpy") as file:
@@ -85,8 +85,8 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def _unchanged(arrays: Mapping[str, np.ndarray], description: Mapping[str, Any], header: str | None) -> bool:
-    """Whether arrays and description fit their digest, and the header is spelled as :func:`write_arrays` spells it: ``1E-3`` for
-    ``1e-3`` is a changed bit, too.
+    """Whether arrays and description match their digest, and the header has exactly the text that :func:`write_arrays` writes:
+    ``1E-3`` instead of ``1e-3`` is a change, too.
     """
     try:
         return description.get("sha256") == digest(arrays, description) and header == json.dumps(description)
@@ -104,11 +104,11 @@ def write_policy(path: Path, policy: Policy, description: dict[str, Any]) -> Non
 
 
 def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
-    """A policy and its description, whose ``signature`` has all entries of :func:`signature`.
+    """Read a policy and its description, whose ``signature`` has all entries of :func:`signature`.
 
     Raises:
-        ConfigurationError: as :func:`read_arrays`; arrays that do not make a policy; or a signature with an entry that is missing
-            or cannot be.
+        ConfigurationError: as :func:`read_arrays`; arrays that do not form a policy; or a signature with a missing or invalid
+            entry.
     """
     arrays, description = read_arrays(path)
     try:
@@ -126,7 +126,7 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
 
 
 def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
-    """The reason why arrays are not a policy; empty if they are one."""
+    """The reason why arrays do not form a valid policy; empty if they do."""
     weights, biases, scale = policy.weights, policy.biases, policy.scale
     if len(arrays) != 2 * len(weights) + 1 or not weights:
         return f"it has the arrays {', '.join(sorted(arrays))}"
@@ -166,15 +166,15 @@ SIGNATURE_KINDS: dict[str, type] = {
 
 
 def signature(scenario: Scenario, state: str, actions: str, interval: int) -> dict[str, Any]:
-    """What a policy is tied to: a team, its behaviors, slots and path, its state and its action set.
+    """The settings for which a policy is trained: team, behaviors, slots, path, state and action set.
 
-    Obstacles, starts, drag and duration are not in it: a policy is meant to cope with those.
+    Obstacles, starts, drag and duration are not included, since a policy should cope with different ones.
 
     Args:
         scenario: the scenario of the team.
         state: name of the kind of state.
         actions: name of the action set.
-        interval: mission steps that a decision holds for.
+        interval: mission steps for which a decision holds.
     """
     return {
         "agents": scenario.agents,
@@ -193,7 +193,7 @@ def signature(scenario: Scenario, state: str, actions: str, interval: int) -> di
 
 
 def _unsigned(found: Any) -> str:
-    """The reason why JSON data are not a signature; empty if they are one."""
+    """The reason why JSON data are not a valid signature; empty if they are."""
     if not isinstance(found, dict):
         return "it has no signature"
     for name, kind in SIGNATURE_KINDS.items():
@@ -208,7 +208,7 @@ def _unsigned(found: Any) -> str:
 
 
 def check_signature(path: Path, found: dict[str, Any], scenario: Scenario) -> None:
-    """Raise ConfigurationError, naming the first difference, if a checkpoint's signature is not that of ``scenario``."""
+    """Raise ConfigurationError, naming the first difference, if a checkpoint's signature does not match ``scenario``."""
     fault = _unsigned(found)
     if fault:
         raise ConfigurationError(f"checkpoint {path} cannot be used: {fault}")
@@ -223,14 +223,14 @@ def check_signature(path: Path, found: dict[str, Any], scenario: Scenario) -> No
 def check_policy(path: Path, policy: Policy, agents: int, actions: int, state: int) -> None:
     """Raise ConfigurationError if a policy's networks do not fit the team.
 
-    N networks must give A values each, or one network A^N values of joint actions.
+    Either N networks have A values each, or one network has A^N values of joint actions.
 
     Args:
         path: the checkpoint, for the message.
         policy: the policy.
-        agents: N.
-        actions: A.
-        state: S, size of a state.
+        agents: N, number of agents.
+        actions: A, number of actions.
+        state: S, size of the state.
     """
     networks, columns, inputs = len(policy.weights[0]), policy.columns, len(policy.scale)
     if inputs != state:

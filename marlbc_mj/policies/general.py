@@ -1,8 +1,8 @@
-"""The general policy: one network for every agent of every team, which decides between formation and column, agent by agent; and
-under the null-space composition, where no order avoids by itself, also whether avoidance is on top.
+"""The general policy: one network for every agent of every team. Each agent decides between formation and column and, under the
+null-space composition, where the composition does not avoid by itself, also whether avoidance is on top.
 
-Its inputs are in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one vector per decision and decides on what it sensed
-and what it has heard, however old, from however many; who has heard nothing decides by itself.
+Its inputs are defined in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one feature vector to the others. It decides
+from its own features and those heard so far, of any age and from any number of agents, even none.
 """
 
 import math
@@ -32,60 +32,60 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
 
 KIND = "general"
-"""Name of this kind of policy in a checkpoint's header."""
+"""Entry of a checkpoint's header that identifies general policies."""
 MOTIONS = FORMATION, COLUMN_ACTION = 0, 1
-"""The actions: form the formation, form the column. Action ``len(MOTIONS) + k`` is k with avoidance on top."""
+"""The actions: take the formation, or the column. Action ``len(MOTIONS) + k`` is action k with avoidance on top."""
 ACTIONS_UNDER = {"set-based": len(MOTIONS), "null-space": 2 * len(MOTIONS)}
-"""A, how many actions an agent has, by the scenario's composition."""
+"""A, the number of actions of an agent, by composition."""
 _NEEDS = {
     "set-based": "decides between formation and column alone and needs the composition that avoids by itself",
     "null-space": "decides about avoidance, too, and needs the composition that leaves that to it",
 }
-"""Why a policy needs a composition."""
+"""Reasons why a policy requires its composition, for error messages."""
 INTERVAL = 1.2
 """Time for which a decision holds, in settling times."""
 
 
 class Sensed(NamedTuple):
-    """Sensed inputs of B teams at a decision, and the actions in force."""
+    """Sensed features of B teams at a decision, and the actions in force."""
 
     features: np.ndarray  # (B, N, F) float32
     last: np.ndarray  # (B, N) actions in force
-    fresh: np.ndarray  # (B,) bool, no action is in force yet
+    fresh: np.ndarray  # (B,) bool, whether no action is in force yet
 
 
 class GeneralPolicy(NamedTuple):
     """Dueling networks that all agents share, with a switching margin, a dwell time and a deadline.
 
-    The policy's values are the mean of the networks'.
+    The values of the policy are the mean over the networks.
     """
 
-    network: Policy  # of one or more networks, INPUTS wide, with A action values
-    dwell: int = 1  # decisions that an agent keeps a new order for, at least
-    deadline: float = 0.0  # time that an agent keeps for its way back to the formation [T per d_OA]; 0: none
+    network: Policy  # one or more networks with INPUTS inputs and A action values
+    dwell: int = 1  # least number of decisions for which an agent keeps a new order
+    deadline: float = 0.0  # time reserved for the way back to the formation, per distance from the slot [T per d_OA]; 0: none
 
     @property
     def actions(self) -> int:
-        """A, how many actions an agent chooses from."""
+        """A, the number of actions of an agent."""
         return self.network.columns
 
     @property
     def composition(self) -> str:
-        """The composition that it was trained under, told by its actions."""
+        """The composition under which it was trained, derived from the number of actions."""
         return next(name for name, actions in ACTIONS_UNDER.items() if actions == self.actions)
 
     def messages(self, features: np.ndarray) -> np.ndarray:
-        """(B, N, M) what each agent sends to the others: what it sensed."""
+        """(B, N, M) message of each agent to the others: the features that it sends."""
         return features[..., :SENT]
 
     def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
-        """(B, N) actions: the better one if its value leads by more than the margin and the agent :func:`may_change`, else the
-        one in force; in formation where an agent :func:`must_return`.
+        """(B, N) actions: the best one if its value leads by more than the margin and the agent :func:`may_change`, else the
+        action in force. An agent that :func:`must_return` takes the formation, with avoidance on top if the action had it.
 
         Args:
-            sensed: by each agent.
+            sensed: features of each agent, and the actions in force.
             heard: (B, N, N, M) or (B, 1, N, M), see :func:`join_inputs`; row i is what agent i has heard of each agent.
-            age: (B, N, N) or (B, 1, N) of these [T]; infinite where nothing was heard.
+            age: (B, N, N) or (B, 1, N), age of these messages [T]; infinite where nothing was heard.
         """
         inputs = join_inputs(sensed.features, heard, age)
         values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
@@ -101,7 +101,7 @@ class GeneralPolicy(NamedTuple):
 
 @compiled
 def _mean_values(values):
-    """(M, A) mean of the values (M, N, A) of N networks, added in their order."""
+    """(M, A) mean of the values (M, N, A) of N networks, summed in the order of the networks."""
     mean = values[:, 0].copy()
     for i in range(1, values.shape[1]):
         mean += values[:, i]
@@ -111,8 +111,8 @@ def _mean_values(values):
 
 @compiled
 def _keep_or_return(chosen, sensed, dwell, deadline):
-    """Replace actions ``chosen`` (B, N) by those in force where agents :func:`may_change` nothing, and by formation where they
-    :func:`must_return`.
+    """Replace actions ``chosen`` (B, N) by those in force for agents that :func:`may_change` forbids to change, and by the
+    formation for agents that :func:`must_return`.
     """
     for b in range(chosen.shape[0]):
         for i in range(chosen.shape[1]):
@@ -125,15 +125,15 @@ def _keep_or_return(chosen, sensed, dwell, deadline):
 
 @inlined
 def may_change(age: Array, fresh: Array, dwell: int) -> Array:
-    """Bool (...,): whether an agent may leave its order.
+    """Bool (...,): whether an agent may change its order.
 
-    Who may do so at once can dither between two orders close to an obstacle, where the references jump and the tracking error
-    ends in a violation; a dwell time bounds that (Hespanha and Morse 1999).
+    Without a dwell time, an agent can dither between two orders close to an obstacle; the references then jump, and the tracking
+    error leads to a violation. A dwell time limits such changes (Hespanha and Morse 1999).
 
     Args:
         age: (...,) entry ``AGE_ENTRIES`` of the agents' features.
         fresh: (...,) bool, whether no order is in force yet.
-        dwell: decisions that an order must be old, less a half, as the time of a decision is rounded to mission steps.
+        dwell: least age of an order, in decisions; half a decision less suffices, since decisions are rounded to mission steps.
     """
     least = -math.expm1(-(dwell - 0.5) * INTERVAL / COARSE) if dwell > 1 else 0.0
     result: Array = (age >= least) | fresh
@@ -144,13 +144,13 @@ def may_change(age: Array, fresh: Array, dwell: int) -> Array:
 def must_return(distance: Array, ending: Array, deadline: float) -> Array:
     """Bool (...,): whether the time left is at most ``deadline`` times an agent's distance from its slot in the formation.
 
-    The time counts in settling times, of which one is more than a d_OA takes at full speed, the distance in d_OA; 36 and more
+    Time is measured in settling times T, distance in d_OA; one T is longer than d_OA takes at full speed. Distances above 36
     count as 36.
 
     Args:
         distance: (...,) entry ``WAYS + 1`` of the agents' features, tanh(e / COARSE).
         ending: (...,) entry ``ENDING + 1``, exp(-t / COARSEST).
-        deadline: see :class:`GeneralPolicy`; positive.
+        deadline: see :class:`GeneralPolicy`; must be positive.
     """
     reach = (1.0 + distance) * ending ** (2.0 * COARSEST / (COARSE * deadline))
     result: Array = (1.0 - distance <= reach) & (reach >= 1e-6)
@@ -158,7 +158,7 @@ def must_return(distance: Array, ending: Array, deadline: float) -> Array:
 
 
 def decision_steps(scenario: Scenario, sight: Sight) -> int:
-    """Mission steps that a decision holds for."""
+    """Mission steps for which a decision holds."""
     return max(1, round(INTERVAL * sight.time / scenario.mission_step))
 
 
@@ -174,7 +174,7 @@ def action_orders(scenario: Scenario) -> np.ndarray:
 
 
 def orders_for(policy: GeneralPolicy, scenario: Scenario) -> np.ndarray:
-    """:func:`action_orders` of a scenario that a policy is to fly.
+    """:func:`action_orders` of a scenario, checked against the policy's composition.
 
     Raises:
         ConfigurationError: an order is missing, or the policy was trained for another composition.
@@ -207,11 +207,11 @@ def is_general(path: Path) -> bool:
 
 
 def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
-    """A policy and its description.
+    """Read a general policy and its description.
 
     Raises:
-        ConfigurationError: as :func:`~marlbc_mj.policies.checkpoint.read_arrays`; a checkpoint of another kind, of other inputs
-            or interval, or whose arrays are no such network.
+        ConfigurationError: as :func:`~marlbc_mj.policies.checkpoint.read_arrays`; a checkpoint of another kind, with other
+            inputs or another interval, or with arrays that do not form such a network.
     """
     arrays, description = read_arrays(path)
     if description.get("kind") != KIND:
@@ -237,7 +237,7 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
 
 
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
-    """The policy of M dueling networks, weights (M, in, out) and biases (M, 1, out) of their layers; the last gives 1 + A.
+    """The policy of M dueling networks with weights (M, in, out) and biases (M, 1, out) per layer; the last has 1 + A outputs.
 
     It has no dwell time and no deadline.
     """
@@ -245,7 +245,7 @@ def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...]
 
 
 def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
-    """One policy whose values are the mean of those of others; it has no dwell time and no deadline.
+    """A policy that averages the values of several policies; it has no dwell time and no deadline.
 
     Raises:
         ConfigurationError: no policies, or networks of different sizes.
@@ -260,7 +260,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
 
 
 def _fault(policy: GeneralPolicy) -> str:
-    """The reason why what was read is no general policy; empty if it is one."""
+    """The reason why a policy is not a valid general policy; empty if it is one."""
     weights, biases, margin = policy.network.weights, policy.network.biases, policy.network.margin
     width, count = INPUTS, len(biases[0]) if biases and biases[0].ndim else 1
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):

@@ -1,12 +1,12 @@
 """Features that an agent of any team senses, sends and pools: inputs of the general policy (project).
 
-Everything is relative and free of scale: lengths count in safe distances d_OA, times in settling times
-T = d_OA / v_max + 1 / min(Lambda, alpha), the time in which a reference covers d_OA and settles. So a larger robot, a slower one
-and a team of another size all see the same numbers. An agent needs its own position, its two slots, the path with its end and the
-obstacles around its lanes; no place on the map and no list of obstacles are among the inputs.
+All features are relative and dimensionless: lengths in units of the safe distance d_OA, times in units of the settling time
+T = d_OA / v_max + 1 / min(Lambda, alpha), in which a reference covers d_OA and settles. So larger or slower robots and teams of
+any size have the same features. An agent needs its own position, its two slots, the path with its end and the obstacles around
+its lanes. The inputs contain neither a place on the map nor a list of obstacles.
 
-A *lane* is the way of a slot along the path. Its profile is the least clearance from obstacles, beyond d_OA, within each of a
-number of time bins around now; slot and obstacle both move in straight lines, so nothing is sampled.
+A *lane* is the track of a slot along the path. Its profile is the least clearance from obstacles, beyond d_OA, in each of several
+time bins around the present. Slot and obstacle both move in straight lines, so it is computed exactly, without sampling.
 """
 
 from typing import NamedTuple
@@ -25,49 +25,49 @@ LANE_BINS = len(EDGES) - 1
 LEAST_BEYOND, MOST_BEYOND = -1.0, 3.0
 """Clearances beyond d_OA are clipped to this range [d_OA]."""
 COARSE = 5.0
-"""The coarser of the two scales of slot errors, and of ages [d_OA], [T]."""
+"""The coarse scale of slot errors [d_OA], and the finer scale of ages and of the time left [T]."""
 COARSEST = 20.0
-"""The coarsest scale of ages [T]."""
+"""The coarse scale of ages and of the time left [T]."""
 
 LANES = 2 * LANE_BINS
-"""Entries 0 to LANES - 1: the lanes of the formation's slot and of the column's."""
+"""Entries 0 to LANES - 1: lane profiles of the slot in the formation and of the slot in the column."""
 WAYS = LANES + 2
-"""Entries up to WAYS - 1 are clearances: the lanes', then those of the straight ways to both slots."""
+"""Entries LANES to WAYS - 1: clearances of the straight ways to both slots."""
 ERRORS = WAYS + 4
-"""Entries from WAYS to ERRORS - 1: distances from both slots, each on two scales."""
+"""Entries WAYS to ERRORS - 1: distances from both slots, each on two scales."""
 COLUMN_ENTRY, AGE_ENTRIES, CLEARANCE_ENTRY = ERRORS, ERRORS + 1, ERRORS + 3
-"""Entries after these: whether the agent is in the column, the age of that on two scales, and its clearance now."""
+"""Next entries: whether the agent's command is the column, the command's age on two scales, and the present clearance."""
 SENT = CLEARANCE_ENTRY + 1
-"""M, entries that an agent senses and sends."""
+"""M, number of entries that an agent sends."""
 ENDING = SENT
-"""Entries from ENDING on are not sent, as everybody knows them: how near the end of the mission is, on two scales."""
+"""Entries from ENDING on: nearness of the mission's end on two scales; not sent, since all agents know it."""
 FEATURES = ENDING + 2
-"""F, entries that an agent has of its own."""
+"""F, number of features of an agent."""
 POOLED = 2 * SENT + (AGE_ENTRIES + 2 - WAYS) + 2
-"""Entries that are pooled of what was heard: minima, means, maxima of errors and ages, share heard, age of the oldest."""
+"""Number of pooled entries: minima, means, maxima of errors, column flag and ages, share of agents heard, oldest age."""
 INPUTS = FEATURES + POOLED
-"""S, entries of a network's input."""
+"""S, number of inputs of a network."""
 INPUT_LAYOUT: dict[str, float | list[float]] = {
     **{"version": 2, "features": FEATURES, "sent": SENT, "pooled": POOLED, "edges": list(EDGES)},
     **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
 }
-"""Layout of the inputs, on which a network's weights depend; ``version`` is raised when entries change their meaning."""
+"""Layout of the inputs, for which a network's weights are valid; ``version`` increases when the meaning of entries changes."""
 
 
 class Sight(NamedTuple):
     """The data needed to compute the features of one scenario's teams."""
 
-    slots: np.ndarray  # (2, N, 2) of formation and column around the desired centroid [m]
+    slots: np.ndarray  # (2, N, 2) slots of formation and column around the desired centroid [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
-    edges: np.ndarray  # (LANE_BINS + 1,) of the lanes' time bins [s]
+    edges: np.ndarray  # (LANE_BINS + 1,) bounds of the lanes' time bins [s]
     length: float  # d_OA [m]
     time: float  # T [s]
-    end: float  # of the mission [s]
-    is_column: np.ndarray  # (C,) bool, commands that end in the column
+    end: float  # end of the mission [s]
+    is_column: np.ndarray  # (C,) bool, whether a command ends in the column
 
 
 def settling_time(scenario: Scenario) -> float:
-    """T = d_OA / v_max + 1 / min(Lambda, alpha) [s], v_max and alpha those of a set-based composition."""
+    """T = d_OA / v_max + 1 / min(Lambda, alpha) [s], with v_max and alpha of the set-based composition."""
     barrier = make_barrier(scenario)
     gains = [b.gain for b in scenario.behaviors if b.name in scenario.formation_names]  # type: ignore[attr-defined]
     return float(scenario.safe_distance / barrier.speed + 1.0 / min(*gains, barrier.rate))
@@ -77,7 +77,7 @@ def make_sight(scenario: Scenario) -> Sight:
     """The :class:`Sight` of a scenario.
 
     Raises:
-        ConfigurationError: a path that does not move, or a formation that is its own column.
+        ConfigurationError: the path is at rest, or formation and column have the same slots.
     """
     path = np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64)
     slots = np.ascontiguousarray(scenario.formations)
@@ -92,7 +92,7 @@ def make_sight(scenario: Scenario) -> Sight:
 
 
 def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
-    """(B, N, F) float32: what each agent senses by itself, see the constants of this module for the entries."""
+    """(B, N, F) float32 features that each agent senses by itself; the constants of this module define the entries."""
     features = np.empty((*observation.position.shape[:2], FEATURES), dtype=np.float32)
     arrays = observation.time, observation.position, observation.clearance, observation.age, observation.obstacles
     _fill_features(sight, sight.is_column[observation.command], *map(np.ascontiguousarray, arrays), features)
@@ -101,7 +101,7 @@ def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
 
 @compiled
 def _fill_features(sight, column, time, position, clearance, age, obstacles, features):
-    """:func:`sense_features` into ``features`` (B, N, F); ``column`` (B, N) bool, the rest as in an observation."""
+    """Fill ``features`` (B, N, F), see :func:`sense_features`; ``column`` (B, N) bool, other arguments as in an observation."""
     slot, lane = np.empty(2), np.empty(LANE_BINS)
     for b in range(position.shape[0]):
         for i in range(position.shape[1]):
@@ -128,13 +128,13 @@ def _fill_features(sight, column, time, position, clearance, age, obstacles, fea
 
 @allocation_free
 def _beyond(clearance, length):
-    """A clearance [m] as what it has beyond d_OA = ``length`` [m], clipped, in d_OA."""
+    """Clearance beyond d_OA = ``length`` [m], in units of d_OA, clipped."""
     return min(max(clearance / length - 1.0, LEAST_BEYOND), MOST_BEYOND)
 
 
 @allocation_free
 def fill_lane(slot, sight, obstacles, lane):
-    """Profile of the lane of a slot that is at ``slot`` (2,) [m] now, into ``lane`` (LANE_BINS,) [d_OA]."""
+    """Write the profile of the lane of a slot, now at ``slot`` (2,) [m], to ``lane`` (LANE_BINS,) [d_OA]."""
     for k in range(LANE_BINS):
         lane[k] = MOST_BEYOND
     first, last = sight.edges[0], sight.edges[LANE_BINS]
@@ -157,7 +157,7 @@ def fill_lane(slot, sight, obstacles, lane):
 
 @allocation_free
 def way_clearance(p, slot, length, obstacles):
-    """Least clearance on the straight way from ``p`` (2,) to ``slot`` (2,) [m] beyond d_OA = ``length`` [m], in d_OA."""
+    """Least clearance beyond d_OA = ``length`` [m] on the straight way from ``p`` (2,) to ``slot`` (2,) [m], in units of d_OA."""
     u, w = slot[0] - p[0], slot[1] - p[1]
     square, least = u * u + w * w, np.inf
     way = np.sqrt(square)
@@ -172,19 +172,20 @@ def way_clearance(p, slot, length, obstacles):
 
 @allocation_free
 def _cannot_reach(x, y, way, radius, length):
-    """Whether an obstacle that is (x, y) [m] away changes no clearance within ``way`` [m], all of which are clipped."""
+    """Whether an obstacle at offset (x, y) [m] is too far to affect clipped clearances at points within ``way`` [m]."""
     return x * x + y * y > (way + (1.0 + MOST_BEYOND) * length + radius) ** 2
 
 
 @compiled
 def pool_heard(heard, age):
-    """(B, R, POOLED) float32 of what R receivers of B teams have heard; receivers may be one that stands for all.
+    """(B, R, POOLED) float32, pooled messages of R receivers of B teams; R = 1 if all agents have heard the same.
 
-    Minima and means are over the senders heard so far; the means of clearances are shares of negative ones: of blocked lanes.
+    Minima, means and maxima are over the senders heard so far. For lanes and straight ways, the mean is the share of negative
+    clearances, that is of blocked ones.
 
     Args:
-        heard: (B, R, N, M) float32 last vectors heard of each sender.
-        age: (B, R, N) how old they are [T]; infinite where nothing was heard.
+        heard: (B, R, N, M) float32, last message heard from each sender.
+        age: (B, R, N) age of these messages [T]; infinite where nothing was heard.
     """
     pooled = np.empty((heard.shape[0], heard.shape[1], POOLED), dtype=np.float32)
     changing = AGE_ENTRIES + 2 - WAYS
@@ -205,7 +206,7 @@ def pool_heard(heard, age):
                     total[j] += entry if j >= WAYS else np.float32(entry < 0.0)
                 for j in range(changing):
                     most[j] = max(most[j], heard[b, r, s, WAYS + j])
-            if count < senders:  # an agent that was not heard counts as MOST_BEYOND in minima and as 0 in maxima
+            if count < senders:  # agents not heard count as MOST_BEYOND in minima and as 0 in maxima
                 least[:], most[:] = np.minimum(least, np.float32(MOST_BEYOND)), np.maximum(most, np.float32(0.0))
             count = max(count, 1)
             for j in range(SENT):
@@ -216,9 +217,10 @@ def pool_heard(heard, age):
 
 
 def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
-    """(B, N, S) float32 inputs of the network: an agent's features (B, N, F), and what it heard, pooled.
+    """(B, N, S) float32 inputs of the network: each agent's ``features`` (B, N, F), then its pooled messages.
 
-    ``heard`` (B, N, N, M) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, M) and (B, 1, N) where all hear all.
+    ``heard`` (B, N, N, M) and ``age`` (B, N, N) [T] as in :func:`pool_heard`, or (B, 1, N, M) and (B, 1, N) if all agents have
+    heard the same.
     """
     inputs = np.empty((*features.shape[:2], INPUTS), dtype=np.float32)
     _fill_inputs(features, np.ascontiguousarray(heard, dtype=np.float32), np.ascontiguousarray(age), inputs)
@@ -227,7 +229,7 @@ def join_inputs(features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.
 
 @compiled
 def _fill_inputs(features, heard, age, inputs):
-    """:func:`join_inputs` into ``inputs`` (B, N, S)."""
+    """Fill ``inputs`` (B, N, S), see :func:`join_inputs`."""
     pooled = pool_heard(heard, age)
     for b in range(inputs.shape[0]):
         for i in range(inputs.shape[1]):

@@ -1,7 +1,7 @@
-"""A trained team without torch: states in, actions out.
+"""The greedy policy of a trained team without torch: maps states to actions.
 
-Three laws make the greedy policy: :func:`dueling_value`, :func:`admissible` and :func:`takes_best`. They work element by element
-on numbers in compiled code, on NumPy arrays and on torch tensors, so that learning, flying and the export share them.
+It consists of three laws: :func:`dueling_value`, :func:`admissible` and :func:`takes_best`. They work element by element on
+numbers in compiled code, on NumPy arrays and on torch tensors, so that training, inference and export share them.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ if TYPE_CHECKING:
 
 
 class Policy(NamedTuple):
-    """Greedy policy of N dueling (or plain) networks with a switching margin; a checkpoint holds one."""
+    """Greedy policy of N dueling (or plain) networks with a switching margin, as stored in a checkpoint."""
 
-    weights: tuple[np.ndarray, ...]  # (N, in, out) float32 each
-    biases: tuple[np.ndarray, ...]  # (N, 1, out)
+    weights: tuple[np.ndarray, ...]  # (N, in, out) float32 per layer
+    biases: tuple[np.ndarray, ...]  # (N, 1, out) float32 per layer
     scale: np.ndarray  # (S,) divisor of the state
     dueling: bool
-    margin: float  # by which the best action's value must exceed the last one's
-    risk: float = 0.0  # largest admissible risk; 0 where the networks have no risks
+    margin: float  # lead of the best action's value over that of the last action needed for a change
+    risk: float = 0.0  # largest admissible risk; 0 if the networks have no risk outputs
 
     @property
     def columns(self) -> int:
-        """Number of action values that a network gives for a state."""
+        """Number of action values that a network computes for a state."""
         return int((self.biases[-1].shape[-1] - self.dueling) // (2 if self.risk else 1))
 
     def width(self, columns: int) -> int:
@@ -50,9 +50,9 @@ class Policy(NamedTuple):
 
 Array = TypeVar("Array", np.ndarray, "Tensor")
 FEW_OUTPUTS = 8
-"""Layers with fewer outputs are computed output by output."""
+"""Layers with fewer outputs are computed one output at a time."""
 RISK_SLACK = cast(float, np.float32(0.05))  # float32 in compiled code, as it is in torch
-"""Where every action is risky, those that exceed the least risk by no more than this stay admissible."""
+"""If every action is too risky, those that exceed the least risk by no more than this remain admissible."""
 
 
 @inlined
@@ -62,7 +62,7 @@ def dueling_value(value: Array, advantage: Array, mean: Array) -> Array:
     Args:
         value: (..., 1) V.
         advantage: (..., A) B.
-        mean: (..., 1) of the advantages.
+        mean: (..., 1) mean of the advantages.
     """
     result: Array = value + advantage - mean
     return result
@@ -70,12 +70,12 @@ def dueling_value(value: Array, advantage: Array, mean: Array) -> Array:
 
 @inlined
 def admissible(risks: Array, least: Array, limit: float) -> Array:
-    """Bool (..., A): which actions may be taken. Some always may.
+    """Bool (..., A): whether each action may be taken; at least one always may.
 
     Args:
-        risks: (..., A) of the actions.
+        risks: (..., A) risks of the actions.
         least: (..., 1) the smallest of these.
-        limit: largest risk that is taken.
+        limit: largest acceptable risk.
     """
     return (risks <= limit) | (risks <= least + RISK_SLACK)
 
@@ -85,22 +85,22 @@ def takes_best(lead: Array, fresh: Array, margin: float) -> Array:
     """Bool: whether the best action replaces the last one.
 
     Args:
-        lead: how much higher the best action's value is.
+        lead: value of the best action minus that of the last one.
         fresh: whether there is no last action.
-        margin: lead that is needed.
+        margin: lead needed for a change.
     """
     result: Array = (lead > margin) | fresh
     return result
 
 
 def greedy(values: np.ndarray, last: np.ndarray, fresh: np.ndarray, margin: float) -> np.ndarray:
-    """(B, N) actions: the best one if it :func:`takes_best`, else the last one.
+    """(B, N) actions: the best one if :func:`takes_best` holds, else the last one.
 
     Args:
-        values: (B, N, A) action values, or (B, 1, A^N) of joint actions in C order, which are chosen as a whole.
+        values: (B, N, A) action values, or (B, 1, A^N) of joint actions in C order, chosen jointly.
         last: (B, N) last actions.
         fresh: (B,) bool, whether there is no last action.
-        margin: lead in action values that is needed.
+        margin: lead in action values needed for a change.
 
     Raises:
         IndexError: a last action that is not one of the A.
@@ -132,8 +132,8 @@ def best_actions(values, last, fresh, margin):
 def action_values(state, scale, weights, biases, dueling, actions, limit):
     """(B, N, A) action values of a ``Policy``'s networks in states (B, S), all float32; -inf where an action is too risky.
 
-    ``limit`` is the largest admissible risk, 0 for networks without risks. For one team, loops take less time than one BLAS call
-    per layer and one NumPy call per operation.
+    ``limit`` is the largest admissible risk, 0 for networks without risk outputs. For one team, loops are faster than one BLAS
+    call per layer and one NumPy call per operation.
     """
     networks, last, widest = len(weights[0]), len(weights) - 1, 0
     for bias in biases:
@@ -163,7 +163,7 @@ def action_values(state, scale, weights, biases, dueling, actions, limit):
 
 @compiled
 def exclude_risky(values, logits, limit, risks):
-    """Set the ``values`` (A,) of actions that are too risky to -inf; ``risks`` (A,) becomes the sigmoid of ``logits`` (A,)."""
+    """Set ``values`` (A,) of actions that are too risky to -inf; writes the sigmoid of ``logits`` (A,) to ``risks`` (A,)."""
     one = np.float32(1.0)
     for a in range(len(values)):
         risks[a] = one / (one + np.exp(-logits[a]))
@@ -175,10 +175,10 @@ def exclude_risky(values, logits, limit, risks):
 
 @compiled
 def dense(x, weight, bias, out):
-    """Write ``x @ weight + bias`` into ``out``, summed in the order of the inputs.
+    """Write ``x @ weight + bias`` to ``out``, summed in the order of the inputs.
 
-    Four inputs at a time, of which four zeros are left out; for a few outputs, one output at a time. The sums are the same, bit
-    for bit; each way is the faster one for its layers.
+    Large layers take four inputs at a time and skip them if all four are zero; layers with few outputs take one output at a time.
+    Both results are identical to the last bit; each method is the faster one for its layers.
     """
     if len(out) < FEW_OUTPUTS:
         for o in range(len(out)):

@@ -7,10 +7,10 @@ FOLDER = Path(str(files("marlbc_mj") / "training" / "checkpoints"))
 
 
 def shipped(name: str) -> Path:
-    """Path of the checkpoint that is shipped under this name; it need not exist."""
+    """Path of the shipped checkpoint with this name; the file need not exist."""
     return FOLDER / f"{name}.safetensors"
 
 
 def called(path: Path) -> Path:
-    """What messages call a checkpoint: a shipped one by its file's name, the same on every machine; another one by its path."""
+    """Name of a checkpoint in messages: the file name of a shipped one, the same on every machine; else the path."""
     return Path(path.name) if path.parent == FOLDER else path

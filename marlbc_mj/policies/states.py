@@ -1,4 +1,4 @@
-"""The state vectors that learners see: the published one, and an extended one relative to slots and obstacles."""
+"""The state vectors of learners: the published one, and an extended one relative to slots and obstacles."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -12,29 +12,29 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import unknown
 
 RANGE = 10.0
-"""How far a feature of the extended state reaches [m]; beyond it, it saturates."""
+"""Coarser of the two scales of lengths in the extended state [m]; longer ones saturate."""
 
 CLOSE = 2.0
-"""The finer of the two scales of lengths in the extended state [m]."""
+"""Finer of the two scales of lengths in the extended state [m]."""
 
 OLD = 5.0
-"""A command that has been in force for this long is 1 in the extended state, and so is any older one [s]."""
+"""Age of a command that is 1 in the extended state [s]; greater ages saturate."""
 
-LENGTHS = 10  # an agent has
-TEAM_ENTRIES = 3  # G one-hot, behind all agents'
+LENGTHS = 10  # lengths per agent
+TEAM_ENTRIES = 3  # one-hot G, after the entries of all agents
 
 SPEED = 5.0
-"""A velocity error of this size is 1 in the extended state [m/s]."""
+"""Velocity error that is 1 in the extended state [m/s]; greater errors saturate."""
 
 
 class State(Protocol):
     """Turns observations into state vectors."""
 
     size: int  # S
-    scale: np.ndarray  # (S,) what a network divides the state by
-    low: np.ndarray  # (S,)
-    high: np.ndarray  # (S,)
-    layout: dict[str, float]  # what a policy's weights depend on; ``version`` is raised when numbers change their meaning
+    scale: np.ndarray  # (S,) divisor that a network applies to the state
+    low: np.ndarray  # (S,) least values
+    high: np.ndarray  # (S,) greatest values
+    layout: dict[str, float]  # data on which weights depend; ``version`` increases when the meaning of entries changes
 
     def __call__(self, observation: Observation) -> np.ndarray:
         """(B, S) float32 states of B teams."""
@@ -42,7 +42,7 @@ class State(Protocol):
 
 
 class PublishedState:
-    """s = (X, Pr, G) as published: positions [m] and velocities [m/s] agent by agent, commands, G. (2n+1)N+1 numbers."""
+    """s = (X, Pr, G) as published: positions [m] and velocities [m/s] per agent, commands, G; (2n+1)N+1 numbers."""
 
     def __init__(self, scenario: Scenario) -> None:
         agents = scenario.agents
@@ -53,17 +53,17 @@ class PublishedState:
         self.high = np.array([np.inf] * 4 * agents + [len(scenario.orders.commands) - 1.0] * agents + [2.0])
 
     def __call__(self, observation: Observation) -> np.ndarray:
-        """(B, 5N+1) float32; obstacles are not in it (erratum 9), nor is the age of the commands."""
+        """(B, 5N+1) float32; it contains neither obstacles (erratum 9) nor the age of the commands."""
         return observation.state().astype(np.float32)
 
 
 class ExtendedState:
-    """Everything relative and normalised: nothing in it says where on the path, so it carries over to other obstacles.
+    """Relative, normalised state. It does not depend on the place along the path, so it transfers to other obstacles.
 
-    Per agent: error to its FM and FR slots about the measured centroid; velocity minus the path's; its command one-hot, and how
-    long it has been in force, by ``OLD``; the nearest obstacle (offset of the surface, clearance beyond the safe distance), seen
-    from the agent and from its FM slot, occupied or not. Then G one-hot. Lengths appear twice, by ``RANGE`` and by ``CLOSE``,
-    clipped to [-1, 1]: a decision looks metres ahead and turns on centimetres.
+    Per agent: error to its FM and FR slots around the measured centroid; velocity minus that of the path; one-hot command and its
+    age, divided by ``OLD``; the nearest obstacle (offset of the surface, clearance beyond the safe distance), seen from the
+    agent and from its FM slot. Then one-hot G. Each length appears twice, divided by ``RANGE`` and by ``CLOSE``, clipped to
+    [-1, 1]: decisions look metres ahead but depend on centimetres.
     """
 
     def __init__(self, scenario: Scenario) -> None:
@@ -77,10 +77,10 @@ class ExtendedState:
         self.low, self.high = np.full(self.size, -1.0), np.ones(self.size)
 
     def __call__(self, observation: Observation) -> np.ndarray:
-        """(B, N (23 + C) + 3) float32 with C commands; a command that an episode began with is old.
+        """(B, N (23 + C) + 3) float32 with C commands; the age of an initial command is 1.
 
         Raises:
-            IndexError: a command that is none of the scenario's.
+            IndexError: a command that the scenario does not have.
         """
         out = np.zeros((len(observation.position), self.size), dtype=np.float32)
         _fill(observation, self.slots, self.velocity, self.safe, out)
@@ -89,8 +89,8 @@ class ExtendedState:
 
 @laws.compiled
 def nearest_surface(point, obstacles, out):
-    """Write into ``out`` (3,) [m]: offset of the nearest obstacle's surface along x and y, and the clearance, at most ``RANGE``,
-    seen from ``point`` (2,) among ``obstacles`` (K, 3). Without obstacles the offset is zero.
+    """Write to ``out`` (3,) [m] the offset from ``point`` (2,) to the nearest surface of ``obstacles`` (K, 3) along x and y, and
+    the clearance, at most ``RANGE``. Without obstacles the offset is zero.
     """
     out[2] = min(nearest_obstacle(point, obstacles, out[:2]), RANGE)
     out[:2] *= -out[2]
@@ -98,7 +98,7 @@ def nearest_surface(point, obstacles, out):
 
 @laws.compiled
 def _fill(observation, slots, path, safe, out):
-    """The extended state of every team into ``out`` (B, S), which is 0.
+    """Write the extended state of every team to ``out`` (B, S), which must be zero before.
 
     ``slots`` (2, N, 2) [m], ``path`` (2,) the desired centroid's velocity [m/s], ``safe`` d_OA [m].
     """
@@ -133,11 +133,11 @@ def _fill(observation, slots, path, safe, out):
 
 
 STATES: dict[str, Callable[[Scenario], State]] = {"published": PublishedState, "extended": ExtendedState}
-"""Factory by name."""
+"""Factory of each state, by name."""
 
 
 def make_state(name: str, scenario: Scenario) -> State:
-    """A state by name.
+    """Make a state by name.
 
     Raises:
         ConfigurationError: unknown name.

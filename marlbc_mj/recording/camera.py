@@ -1,4 +1,4 @@
-"""Where the picture is taken from: behind the team or one agent, beside or above the whole mission, or a camera of the model."""
+"""Cameras: behind the team or one agent, beside or above the whole mission, or a camera of the model."""
 
 from collections.abc import Callable
 
@@ -8,22 +8,22 @@ import numpy as np
 from marlbc_mj.recording.stage import Stage
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
-TRACK_AZIMUTH = 38.0  # from the direction of travel; the team moves into the picture [deg]
+TRACK_AZIMUTH = 38.0  # relative to the direction of travel, so that the team moves into the picture [deg]
 TRACK_ELEVATION = -33.0  # [deg]
 TRACK_FOVY = 36.0  # [deg]
-TRACK_SMOOTHING = 8.0  # position and size of the team are followed as means over this time [s]
-TRACK_AHEAD = 5.0  # how far ahead of the team it looks [m]
-TRACK_DISTANCE = 3.45  # how far away it is, in team radii
-CLOSE_RADIUS = (4.0, 7.0)  # the same of the close view, which shows the robots rather than all of the team [m]
-TRACK_RADIUS = (10.5, 60.0)  # least and largest team radius it adapts to [m]
-CHASE_RADIUS = 2.2  # of the view of one agent, in place of a team's [m]
+TRACK_SMOOTHING = 8.0  # averaging time of the team's position and size [s]
+TRACK_AHEAD = 5.0  # how far ahead of the team the camera looks [m]
+TRACK_DISTANCE = 3.45  # distance of the camera, in team radii
+CLOSE_RADIUS = (4.0, 7.0)  # least and largest team radius of the close view, which shows robots rather than the whole team [m]
+TRACK_RADIUS = (10.5, 60.0)  # least and largest team radius of the track view [m]
+CHASE_RADIUS = 2.2  # replaces the team radius in the view of one agent [m]
 WIDE_AZIMUTH, WIDE_ELEVATION, WIDE_FOVY = (
     72.0,
     -36.0,
     24.0,
-)  # of the view from the side; azimuth from the direction of travel [deg]
+)  # angles of the view from the side; azimuth relative to the direction of travel [deg]
 WIDE_MARGIN = 0.02  # share of the picture that stays free at each edge
-TOP_MARGIN = 4.0  # around everything in the log [m]
+TOP_MARGIN = 4.0  # margin of the top view around everything in the log [m]
 
 CAMERAS = {
     "track": "behind the team, and as far away as it is large",
@@ -33,10 +33,10 @@ CAMERAS = {
     "at:X,Y,R": "beside the point (X, Y) [m], at rest, and R [m] to each side of it",
     "top": "above the whole mission, as on a map",
 }
-"""What each camera shows; a model has others of its own."""
+"""What each camera shows; a model may have more cameras."""
 SPOT = "at:"
 DISTANT = ("wide", "top")
-"""Cameras from which agents are small."""
+"""Cameras in whose pictures agents are small."""
 
 Camera = Callable[[float], mujoco.MjvCamera]
 
@@ -45,9 +45,9 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
     """The camera of ``CAMERAS`` or of the model, as a function of time [s].
 
     Args:
-        name: "agent2" follows agent 2, and so on.
-        stage: what is seen.
-        aspect: width of the picture over its height.
+        name: name of the camera; "agent2" follows agent 2, and so on.
+        stage: the stage to show.
+        aspect: width of the picture divided by its height.
 
     Raises:
         ConfigurationError: unknown camera.
@@ -73,7 +73,7 @@ def make_camera(name: str, stage: Stage, aspect: float) -> Camera:
 
 
 def _track(stage: Stage, position: np.ndarray, bounds: tuple[float, float]) -> Camera:
-    """From behind and above agents at (M, A, 2) [m], turned so that the picture shows them, their trails and what lies ahead."""
+    """Camera behind and above agents at (M, A, 2) [m], turned so that it shows them, their trails and what lies ahead."""
     log = stage.log
     centroid = position.mean(axis=1, keepdims=True)
     reach = np.linalg.norm(position - centroid, axis=-1).max(axis=1, keepdims=True)
@@ -97,14 +97,14 @@ def _track(stage: Stage, position: np.ndarray, bounds: tuple[float, float]) -> C
 
 
 def _heading(centroid: np.ndarray) -> np.ndarray:
-    """(2,) unit vector of a team's way (M, 2) from first to last, along x where it stays."""
+    """Unit vector (2,) from the first to the last of a team's centroids (M, 2), or along x if the team hardly moves."""
     way = centroid[-1] - centroid[0]
     length = float(np.hypot(*way))
     return np.asarray(way / length) if length > 1.0 else np.array([1.0, 0.0])
 
 
 def _smoothed(values: np.ndarray, window: int) -> np.ndarray:
-    """Moving mean of (M, C) over ``window`` rows, the ends repeated outwards."""
+    """Moving mean of (M, C) over ``window`` rows; the first and last rows are repeated beyond the ends."""
     before, after = window // 2, window - 1 - window // 2
     padded = np.pad(values, ((before, after), (0, 0)), mode="edge")
     total = np.cumsum(np.vstack([np.zeros((1, values.shape[1])), padded]), axis=0)
@@ -112,7 +112,7 @@ def _smoothed(values: np.ndarray, window: int) -> np.ndarray:
 
 
 def _side_view(stage: Stage) -> tuple[np.ndarray, float]:
-    """Unit vectors to the right, up and ahead as the columns of (3, 3), and the azimuth [deg], of a look from the side."""
+    """Axes of the view from the side (right, up and forward as the columns of (3, 3)), and its azimuth [deg]."""
     way = _heading(stage.log.position.mean(axis=1))
     azimuth, elevation = np.arctan2(way[1], way[0]) + np.radians(WIDE_AZIMUTH), np.radians(WIDE_ELEVATION)
     right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
@@ -122,12 +122,12 @@ def _side_view(stage: Stage) -> tuple[np.ndarray, float]:
 
 
 def _wide(stage: Stage, aspect: float) -> Camera:
-    """From the side and above, at rest, and just so far away that everything in the log is in the picture."""
+    """Camera at rest, at the side and above, just far enough away to show everything in the log."""
     axes, azimuth = _side_view(stage)
     points = _corners(stage) @ axes
     half = np.tan(np.radians(0.5 * WIDE_FOVY)) * np.array([aspect, 1.0]) * (1.0 - 2.0 * WIDE_MARGIN)
     middle, distance = points.mean(axis=0), 0.0
-    for _ in range(20):  # of distance and middle: each is right for the other at the end
+    for _ in range(20):  # fixed-point iteration: distance and middle depend on each other
         offset = points - middle
         distance = float((np.abs(offset[:, :2]) / half - offset[:, 2:]).max())
         seen = offset[:, :2] / (offset[:, 2:] + distance)
@@ -136,7 +136,7 @@ def _wide(stage: Stage, aspect: float) -> Camera:
 
 
 def _beside(stage: Stage, aspect: float, x: float, y: float, reach: float) -> Camera:
-    """From the side and above, at rest, with ``reach`` [m] to the left and to the right of a point."""
+    """Camera at rest, at the side and above, that shows ``reach`` [m] to the left and to the right of a point."""
     distance = reach / (aspect * float(np.tan(np.radians(0.5 * WIDE_FOVY))))
     return _resting(stage, np.array([x, y, 0.0]), distance, _side_view(stage)[1])
 
@@ -145,7 +145,7 @@ def _spot(name: str) -> tuple[float, float, float]:
     """The three numbers of ``at:X,Y,R``.
 
     Raises:
-        ConfigurationError: there are others.
+        ConfigurationError: they are not two finite coordinates and a positive reach.
     """
     try:
         x, y, reach = (float(part) for part in name.removeprefix(SPOT).split(","))
@@ -157,7 +157,7 @@ def _spot(name: str) -> tuple[float, float, float]:
 
 
 def _resting(stage: Stage, target: np.ndarray, distance: float, azimuth: float) -> Camera:
-    """A camera that always looks at the same point."""
+    """A camera at rest that looks at ``target`` (3,)."""
     stage.model.vis.global_.fovy = WIDE_FOVY
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
@@ -167,7 +167,7 @@ def _resting(stage: Stage, target: np.ndarray, distance: float, azimuth: float) 
 
 
 def _corners(stage: Stage) -> np.ndarray:
-    """(P, 3) places of agents and corners of the obstacles' zones [m]."""
+    """Positions of agents and corners of the obstacles' zones (P, 3) [m]."""
     low, high = stage.log.zone()
     boxes = [np.column_stack([x, y]) for x in (low[:, 0], high[:, 0]) for y in (low[:, 1], high[:, 1])]
     ground = np.concatenate([stage.log.position.reshape(-1, 2), *boxes])
@@ -175,7 +175,7 @@ def _corners(stage: Stage) -> np.ndarray:
 
 
 def _fit_top(stage: Stage, aspect: float) -> None:
-    """Turn the model's top camera into a map: no perspective, and everything in the log just fits."""
+    """Turn the model's top camera into a map: orthographic, and just wide enough for everything in the log."""
     log, model = stage.log, stage.model
     everything = np.concatenate([log.position.reshape(-1, 2), *log.zone()])
     low, high = everything.min(axis=0) - TOP_MARGIN * stage.scale, everything.max(axis=0) + TOP_MARGIN * stage.scale
@@ -189,12 +189,12 @@ def _fit_top(stage: Stage, aspect: float) -> None:
 def project(
     scene: mujoco.MjvScene, points: np.ndarray, radii: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where a scene's camera shows balls.
+    """Project balls into the picture of a scene's camera.
 
     Args:
-        points: (P, 3) their middles [m].
-        radii: (P,) [m].
-        width, height: of the picture [pixels].
+        points: (P, 3) their centers [m].
+        radii: (P,) their radii [m].
+        width, height: size of the picture [pixels].
 
     Returns:
         (P, 2) their columns and rows, NaN behind the camera, and (P,) their radii, all in pixels.

@@ -15,17 +15,17 @@ from marlbc_mj.scenarios.titles import mission_title
 from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import AGENT_COLORS, LINK_COLOR, SAFE_DISTANCE_COLOR, SHIELD_COLOR, command_color, ink_on
 
-FULL = 1280, 720  # the picture that all lengths are meant for; they shrink with it
+FULL = 1280, 720  # picture size to which all lengths refer; they scale with the picture
 HEADER, FOOTER = 48, 80  # heights of the bars
-SHARP = 3  # bars are drawn this many times larger and reduced, which smooths their edges
+SHARP = 3  # bars are drawn this many times larger and then reduced, which smooths their edges
 PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
 TEAM_STATES = {2: "in formation", 1: "in column"}
-"""The team's formation in words, by G."""
+"""Texts for the team's formation, by G."""
 MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "column", "AA": "agent avoidance"}
 
 NumberPlace = Literal["inside", "on", "above"]
-"""Where agents' numbers are: inside their balls, on badges that cover them, or on badges above them."""
+"""Place of the agents' numbers: inside their balls, on badges that cover the balls, or on badges above them."""
 
 
 @lru_cache(maxsize=64)
@@ -37,10 +37,10 @@ def _font(size: int, bold: bool = False) -> ImageFont.FreeTypeFont:
 
 @dataclass(frozen=True)
 class Caption:
-    """Draws the frames of one video; the bars are kept until what they say changes.
+    """Draws the frames of one video; the bars are cached by their content.
 
     Args:
-        width, height: of the whole frame, bars included.
+        width, height: size of the whole frame, including the bars [pixels].
     """
 
     log: EpisodeLog
@@ -52,9 +52,7 @@ class Caption:
 
     @property
     def scale(self) -> float:
-        """Size of this frame's bars, 1 in a picture of 1280 x 720; text shrinks less than the picture, so that it stays
-        legible.
-        """
+        """Scale of this frame's bars, 1 at 1280 x 720; text shrinks less than the picture, so that it stays legible."""
         return float(min(self.width / FULL[0], 1.5 * self.height / FULL[1]) ** 0.6)
 
     @property
@@ -68,13 +66,13 @@ class Caption:
         return self.height - self.header - round(FOOTER * self.scale)
 
     def frame(self, picture: np.ndarray, time: float, step: int, labels: np.ndarray, radii: np.ndarray) -> Image.Image:
-        """The whole frame.
+        """Compose the whole frame.
 
         Args:
             picture: (picture_height, width, 3) uint8.
-            time, step: mission time [s] and the mission step it lies in.
-            labels: (N, 2) where the agents' numbers go, column and row in the picture.
-            radii: (N,) how large agents are there [pixels].
+            time, step: mission time [s] and the mission step that contains it.
+            labels: (N, 2) column and row of the agents' numbers in the picture.
+            radii: (N,) radii of the agents in the picture [pixels].
         """
         frame = Image.new("RGB", (self.width, self.height), PAPER)
         image = Image.fromarray(np.ascontiguousarray(picture))
@@ -108,7 +106,7 @@ class Caption:
 
 
 def _badge(image: Image.Image, labels: np.ndarray, radius: int, rims: Sequence[str], *, above: bool) -> None:
-    """Every agent's number in a disc of its color; ``above`` the place of its label, where it would hide a robot."""
+    """Draw every agent's number on a disc of its color; with ``above``, the disc is higher, so that it hides no robot."""
     side, rim = 2 * radius * SHARP, SHARP * (2 if above else max(2, round(0.25 * radius)))
     for agent, (column, row) in enumerate(labels):
         if not (0 <= column < image.width and 0 <= row < image.height):
@@ -125,7 +123,7 @@ def _badge(image: Image.Image, labels: np.ndarray, radius: int, rims: Sequence[s
 
 
 def _number(image: Image.Image, labels: np.ndarray, radii: np.ndarray) -> None:
-    """Write every agent's number on it."""
+    """Write every agent's number on its ball."""
     pen = ImageDraw.Draw(image)
     for agent, (column, row) in enumerate(labels):
         if not (0 <= column < image.width and 0 <= row < image.height):  # NaN behind the camera
@@ -137,7 +135,7 @@ def _number(image: Image.Image, labels: np.ndarray, radii: np.ndarray) -> None:
 
 
 class Pen:
-    """Writes from left to right on a bar; all lengths are pixels of a picture of 1280 x 720."""
+    """Draws on a bar from left to right; all lengths are in pixels of a picture of 1280 x 720."""
 
     def __init__(self, width: int, height: int, scale: float) -> None:
         self.scale = scale
@@ -147,7 +145,7 @@ class Pen:
         self.width = width * SHARP / scale
 
     def font(self, size: float, bold: bool = False) -> ImageFont.FreeTypeFont:
-        """The font whose size is ``size`` on the finished bar."""
+        """The font for text of ``size`` [pixels of the full picture]."""
         return _font(round(size * self.scale), bold)
 
     def length(self, text: str, size: float, bold: bool = False) -> float:
@@ -155,12 +153,12 @@ class Pen:
         return float(self.font(size, bold).getlength(text)) / self.scale
 
     def text(self, text: str, y: float, size: float, color: str, *, bold: bool = False, gap: float = 0.0) -> None:
-        """Write a text, its middle at height ``y``, and move on."""
+        """Write a text, vertically centered at ``y``, and advance."""
         self.draw.text((self.x * self.scale, y * self.scale), text, color, self.font(size, bold), "lm")
         self.x += self.length(text, size, bold) + gap
 
     def pill(self, text: str, y: float, size: float, color: str, *, width: float = 0.0, gap: float = 0.0) -> None:
-        """Write a text on a rounded colored ground at least ``width`` wide, and move on."""
+        """Write a text on a rounded colored background at least ``width`` wide, and advance."""
         width = max(width, self.length(text, size, True) + 1.4 * size)
         half = 0.82 * size
         box = [v * self.scale for v in (self.x, y - half, self.x + width, y + half)]
@@ -170,7 +168,7 @@ class Pen:
         self.x += width + gap
 
     def dot(self, y: float, radius: float, color: str, *, gap: float = 0.0) -> None:
-        """Draw a filled circle, and move on."""
+        """Draw a filled circle, and advance."""
         box = [v * self.scale for v in (self.x, y - radius, self.x + 2 * radius, y + radius)]
         self.draw.ellipse(box, color)
         self.x += 2 * radius + gap
@@ -180,14 +178,14 @@ class Pen:
         self.draw.line([0, y * self.scale, self.image.width, y * self.scale], RULE, round(self.scale))
 
     def dashes(self, y: float, color: str, *, gap: float = 0.0) -> None:
-        """Draw a short dashed line, and move on."""
+        """Draw a short dashed line, and advance."""
         for k in range(3):
             start = self.x + 10 * k
             self.draw.line([v * self.scale for v in (start, y, start + 6, y)], color, round(2 * self.scale))
         self.x += 26 + gap
 
     def stroke(self, y: float, color: str, *, gap: float = 0.0) -> None:
-        """Draw a short line, and move on."""
+        """Draw a short line, and advance."""
         self.draw.line([v * self.scale for v in (self.x, y, self.x + 26, y)], color, round(2 * self.scale))
         self.x += 26 + gap
 

@@ -1,4 +1,4 @@
-"""How pictures become a file: an H.264 MP4, an animated WebP or a GIF, as the file's ending says."""
+"""Encoding of pictures as an H.264 MP4, an animated WebP or a GIF, chosen by the file's suffix."""
 
 import subprocess
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -28,7 +28,7 @@ _MP4 = [
     "-movflags",
     "+faststart",
 ]
-"""Colors as players expect them of a high-definition picture, constant quality, and an index at the file's beginning."""
+"""The color space that players expect of high-definition video, constant quality, and an index at the file's beginning."""
 _WEBP = [
     "-vcodec",
     "libwebp_anim",
@@ -43,18 +43,18 @@ _WEBP = [
     "-loop",
     "0",
 ]
-"""Without loss: text stays sharp, and with few colors this is smaller than with loss. ``quality`` is then the effort."""
+"""Lossless: text stays sharp, and with few colors the file is smaller than a lossy one. ``quality`` is then the effort."""
 _GIF = ["-lavfi", "paletteuse=dither=none:diff_mode=rectangle", "-loop", "0"]
 
 FORMATS = (".mp4", ".webp", ".gif")
-"""Endings of a video's name."""
+"""Suffixes of a video's name."""
 COLORS = {".webp": 96, ".gif": 256}
-"""How many colors the formats for animations get; video has no palette."""
-PALETTE_FRAMES = 8  # that the palette is made of
+"""Number of colors of the animation formats; MP4 has no palette."""
+PALETTE_FRAMES = 8  # number of frames from which the palette is computed
 
 
 def check_format(path: Path) -> None:
-    """Raise ConfigurationError for a name whose ending is none of ``FORMATS``."""
+    """Raise ConfigurationError for a name without one of the suffixes in ``FORMATS``."""
     if path.suffix.lower() not in FORMATS:
         raise ConfigurationError(f"a video's name must end in {', '.join(FORMATS[:-1])} or {FORMATS[-1]}, got {path.name!r}")
 
@@ -63,16 +63,16 @@ def check_format(path: Path) -> None:
 def encoder(
     path: Path, size: tuple[int, int], fps: int, palette: np.ndarray | None = None
 ) -> Iterator[Callable[[np.ndarray], None]]:
-    """A function that takes pictures of ``size``, width and height; the video is whole when the block has ended.
+    """Provide a function that adds a picture (height, width, 3) to a video; the video is complete when the block has ended.
 
     Args:
-        path: the file, whose ending is one of ``FORMATS``.
+        path: the file, with a suffix of ``FORMATS``.
         size: width and height [pixels].
         fps: frames per second.
-        palette: (C, 3) uint8 colors of an animation, as :func:`common_palette` gives them.
+        palette: (C, 3) uint8 colors of an animation, from :func:`common_palette`.
 
     Raises:
-        SimulationError: the encoder said that it failed, whatever the file looks like.
+        SimulationError: the encoder failed, even if it left a file.
     """
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps)]
     target = {".webp": _WEBP, ".gif": _GIF}.get(path.suffix.lower(), _MP4)
@@ -91,7 +91,7 @@ def encoder(
 
 
 def common_palette(pictures: Iterable[np.ndarray], suffix: str) -> np.ndarray:
-    """(C, 3) uint8: the colors that serve pictures (height, width, 3) best, as many as the format gets."""
+    """Colors (C, 3) uint8 that suit all pictures (height, width, 3) together, as many as the format has."""
     count = COLORS[suffix.lower()]
     strip = Image.fromarray(np.concatenate(list(pictures)))
     colors = strip.quantize(count, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).getpalette() or []
@@ -99,7 +99,7 @@ def common_palette(pictures: Iterable[np.ndarray], suffix: str) -> np.ndarray:
 
 
 def _palette_image(palette: np.ndarray | None) -> Image.Image | None:
-    """A picture of 16 x 16 pixels that shows a palette's colors and has them; missing ones are repeated."""
+    """A picture of 16 x 16 pixels that has a palette and shows its colors, repeated up to 256; None without a palette."""
     if palette is None:
         return None
     image = Image.new("P", (16, 16))
@@ -109,7 +109,7 @@ def _palette_image(palette: np.ndarray | None) -> Image.Image | None:
 
 
 def _reduced(picture: np.ndarray, colors: Image.Image | None) -> np.ndarray:
-    """A picture in the colors of a palette, if there is one."""
+    """A picture in the colors of a palette, or unchanged without one."""
     if colors is None:
         return picture
     return np.asarray(Image.fromarray(picture).quantize(palette=colors, dither=Image.Dither.NONE).convert("RGB"))
@@ -117,16 +117,16 @@ def _reduced(picture: np.ndarray, colors: Image.Image | None) -> np.ndarray:
 
 @contextmanager
 def _encoding(command: Sequence[str]) -> Iterator[IO[bytes]]:
-    """The running encoder's input; its end is awaited, its errors are raised."""
+    """Run the encoder and provide its input stream; wait for it to end, and raise its errors."""
     with TemporaryFile() as errors:
-        # A group of its own: Ctrl-C is for the program, which then ends the encoder.
+        # In a session of its own, so that Ctrl-C reaches only this program, which then ends the encoder.
         process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=errors, start_new_session=True
         )
         assert process.stdin is not None
         whole = False
         try:
-            with suppress(BrokenPipeError):  # the encoder has ended, and says why
+            with suppress(BrokenPipeError):  # the encoder has ended; its error output says why
                 yield process.stdin
                 process.stdin.close()
                 whole = True
@@ -145,14 +145,14 @@ def _encoding(command: Sequence[str]) -> Iterator[IO[bytes]]:
 
 
 def _reason(said: Sequence[str]) -> str:
-    """The line of the encoder that tells the most."""
+    """The most informative line of the encoder's error output."""
     return next(
         (line for line in said if "No space left" in line or "too large" in line), said[-1] if said else "no reason given"
     )
 
 
 def poster(video: Path, time: float) -> bytes:
-    """The frame of an MP4 at ``time`` [s] as a JPEG, empty where the encoder cannot give it."""
+    """The frame of an MP4 at ``time`` [s] as a JPEG; empty if it cannot be extracted."""
     source = ["-ss", f"{time:.3f}", "-i", str(video), "-frames:v", "1", "-q:v", "4", "-f", "image2pipe", "-vcodec", "mjpeg", "-"]
     done = subprocess.run([imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *source], capture_output=True, check=False)
     return done.stdout

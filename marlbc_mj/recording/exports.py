@@ -1,4 +1,4 @@
-"""A log in other formats: a table as CSV, JSON lines or Parquet, arrays for NumPy, a recording for Rerun."""
+"""Export of a log: a table as CSV, JSON lines or Parquet, arrays for NumPy, or a recording for Rerun."""
 
 import csv
 import io
@@ -64,7 +64,7 @@ def _write_csv(log: EpisodeLog, stream: BinaryIO) -> None:
 
 
 def _write_json_lines(log: EpisodeLog, stream: BinaryIO) -> None:
-    """An object per row; a clearance without obstacles is null, since JSON has no infinity."""
+    """Write one object per row; a clearance without obstacles is null, since JSON has no infinity."""
     names = table_columns()
     for row in table_rows(log):
         cells = (None if isinstance(cell, float) and not math.isfinite(cell) else cell for cell in row)
@@ -72,7 +72,7 @@ def _write_json_lines(log: EpisodeLog, stream: BinaryIO) -> None:
 
 
 def _write_parquet(log: EpisodeLog, stream: BinaryIO) -> None:
-    """The table, with scenario, supervisor, controller and seed as metadata of its schema."""
+    """Write the table, with scenario, supervisor, controller and seed as metadata of its schema."""
     try:
         arrow: Any = import_module("pyarrow")
         parquet: Any = import_module("pyarrow.parquet")
@@ -99,4 +99,4 @@ WRITERS: dict[str, Callable[[EpisodeLog, BinaryIO], None]] = {
     ".npz": _write_npz,
     ".rrd": write_rerun,
 }
-"""By the ending of the file's name."""
+"""Export functions by file suffix."""

@@ -1,4 +1,4 @@
-"""Which OpenGL backend draws off-screen. Nothing here imports mujoco, so it can be asked before anything else."""
+"""Choice of the OpenGL backend for off-screen drawing. Nothing here imports mujoco, so it can be used before that import."""
 
 import os
 import platform
@@ -10,10 +10,10 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 ENABLED = ("", "enable", "enabled", "on", "true", "1")
 DISABLED = ("disable", "disabled", "off", "false", "0")
-SWITCHED_OFF = DISABLED[0]  # the one name that MuJoCo and dm_control both know
+SWITCHED_OFF = DISABLED[0]  # the only one of these that both MuJoCo and dm_control accept
 WINDOW = ("glx", "wgl")  # MuJoCo's other names for glfw
 BACKENDS = {"Linux": ("egl", "osmesa", "glfw"), "Darwin": ("cgl", "glfw"), "Windows": ("glfw",)}
-"""By operating system, in the order in which they are tried; the names are those of mujoco's submodules."""
+"""Backends by operating system, in the order in which they are tried; the names are those of mujoco's submodules."""
 
 HINT = (
     "install one with `apt-get install libegl1 libgl1-mesa-dri` (then MUJOCO_GL=egl) "
@@ -35,10 +35,10 @@ def switched_off() -> bool:
 
 
 def choose_gl() -> str:
-    """The backend to draw with: MUJOCO_GL's where it is set, otherwise the first that works.
+    """The backend to draw with: the one that MUJOCO_GL names, or else the first that works.
 
     Raises:
-        ConfigurationError: MUJOCO_GL is switched off, unknown or does not work here, or no backend works.
+        ConfigurationError: MUJOCO_GL switches rendering off, or names an unknown or failing backend; or no backend works.
     """
     return _choose(os.environ.get("MUJOCO_GL", "").lower().strip())
 
@@ -61,7 +61,7 @@ def _choose(wanted: str) -> str:
 
 
 def works(backend: str) -> bool:
-    """Whether a backend can make a MuJoCo drawing context, tried in a process of its own: a failed one cannot be taken back."""
+    """Whether a backend can make a MuJoCo drawing context, tried in a separate process: a failed attempt cannot be undone."""
     environment = {name: value for name, value in os.environ.items() if name != "PYOPENGL_PLATFORM"}
     probe = subprocess.run(
         [sys.executable, "-c", _PROBE, backend],

@@ -1,4 +1,4 @@
-"""Links between agents to draw at one moment; stale links are faded."""
+"""Communication links between agents to draw at one time; stale links are faded."""
 
 from typing import NamedTuple
 
@@ -7,13 +7,13 @@ import numpy as np
 from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.util.palette import LINK_COLOR, rgba
 
-HALF_LIFE = 0.5  # age at which a link is drawn half as clearly as a fresh one [s]
-CLEAREST, FAINTEST = 0.9, 0.12  # opacity of a fresh link, and of one over which nothing has come
-MOST_LINKS = 400  # that are drawn; of more, the shortest
+HALF_LIFE = 0.5  # age at which a link has half the opacity of a fresh one [s]
+CLEAREST, FAINTEST = 0.9, 0.12  # opacity of a fresh link, and least opacity
+MOST_LINKS = 400  # largest number of links drawn; if there are more, the shortest are drawn
 
 
 class DrawnLinks(NamedTuple):
-    """Links at one moment, each once."""
+    """The links to draw at one time, one per pair of agents."""
 
     ends: np.ndarray  # (L, 2) int64, the two agents
     opacity: np.ndarray  # (L,)
@@ -24,11 +24,11 @@ class DrawnLinks(NamedTuple):
 
 
 def drawn_links(position: np.ndarray, link: np.ndarray, age: np.ndarray) -> DrawnLinks:
-    """Pairs of which at least one hears the other, as clear as the older of what the two know of each other is fresh.
+    """Links of pairs in which at least one agent hears the other; the older of their ages sets the opacity.
 
     Args:
         position: (N, 2) [m].
-        link, age: (N, N) of :class:`~marlbc_mj.supervisors.communication.Hearing`, or (0, 0) where there are none.
+        link, age: (N, N) fields of :class:`~marlbc_mj.supervisors.communication.Hearing`, or (0, 0) without communication.
     """
     ends = np.argwhere(np.triu(link | link.T, 1))
     if len(ends) > MOST_LINKS:
@@ -39,5 +39,5 @@ def drawn_links(position: np.ndarray, link: np.ndarray, age: np.ndarray) -> Draw
 
 
 def links_of_log(log: EpisodeLog, step: int) -> DrawnLinks:
-    """The links of a mission step of a log."""
+    """The links to draw for a mission step of a log."""
     return drawn_links(log.position[step], log.link[step], log.age[step])

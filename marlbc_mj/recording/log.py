@@ -1,4 +1,4 @@
-"""An episode at mission rate, as it is written to and read back from a log."""
+"""An episode sampled at mission rate, as it is written to and read from a log."""
 
 from dataclasses import dataclass, field
 from typing import NamedTuple
@@ -29,14 +29,14 @@ class Course(NamedTuple):
     substep: float  # [s]
     mission_step: float  # [s]
     safe_distance: float  # [m]
-    force_limits: np.ndarray  # (N,) of the agents, finite also where the law is unlimited [N]
+    force_limits: np.ndarray  # (N,) one per agent, finite even if the law is unlimited [N]
     path_origin: tuple[float, float]  # [m]
     path_velocity: tuple[float, float]  # [m/s]
     formations: np.ndarray  # (2, N, 2) [m]
 
 
 class Substeps(NamedTuple):
-    """T substeps of an episode: the data that metrics need beyond the mission rate."""
+    """The T substeps of an episode, which metrics need in addition to the data at mission rate."""
 
     course: Course
     position: np.ndarray  # (T + 1, N, 2) [m]
@@ -48,10 +48,10 @@ class Substeps(NamedTuple):
 
 @dataclass(frozen=True)
 class EpisodeLog:
-    """M mission steps of N agents, self-contained: video and export need nothing but this.
+    """M mission steps of N agents; self-contained, so that videos and exports need no other data.
 
-    As in :class:`marlbc_mj.episode.Frame`, motion, clearance and G are those at the start of a mission step, when orders were
-    given; force is that of its first substep, and the reward what the step led to.
+    As in :class:`marlbc_mj.episode.Frame`, motion, clearance and G are those at the start of a mission step, when orders are
+    given. The force is that of its first substep, and the reward is the result of the step.
     """
 
     scenario: str
@@ -62,8 +62,8 @@ class EpisodeLog:
     safe_distance: float  # [m]
     force_limit: float  # [N]; infinite for an unlimited law
     commands: tuple[str, ...]  # names that ``command`` indexes, "FM" or "OA>FM" for example
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
-    motions: np.ndarray  # (K, 6) as marlbc_mj.core.motion has them, or (0, 6): all at rest
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; for a moving one the anchor, see marlbc_mj.core.motion
+    motions: np.ndarray  # (K, 6) columns as in marlbc_mj.core.motion, or (0, 6): all obstacles are at rest
     mjcf: str  # the assembled model
     time: np.ndarray  # (M,) start of each mission step [s]
     position: np.ndarray  # (M, N, 2) [m]
@@ -77,27 +77,28 @@ class EpisodeLog:
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,) [ms]
     pose: np.ndarray = field(default_factory=lambda: NO_POSE[None])  # (M, N, 7), see Trajectory; (M, 0, 7) without free joints
-    link: np.ndarray = field(default_factory=lambda: NO_HEARING.link)  # (M, N, N) bool, see Hearing; (M, 0, 0) without
-    age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) of what agents know of each other [s]
-    shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) by the end of each mission step, columns
-    # as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
-    substeps: Substeps | None = None  # for metrics; None in a log that has none
-    robots: tuple[str, ...] = ()  # each agent's; empty in logs that were written before this was kept
+    link: np.ndarray = field(default_factory=lambda: NO_HEARING.link)  # (M, N, N) bool, see Hearing; (M, 0, 0): no data
+    age: np.ndarray = field(default_factory=lambda: NO_HEARING.age)  # (M, N, N) age of what agents know of each other [s]
+    shield: np.ndarray = field(default_factory=lambda: NO_SHIELD_ROWS[None])  # (M, N, 7) totals at the end of each mission step,
+    # columns as in schemas.SHIELD: interventions, change [N s], breaches; (M, 0, 7) for teams without a shield
+    substeps: Substeps | None = None  # data for metrics; None if the log has none
+    robots: tuple[str, ...] = ()  # name of each agent's robot; empty in older logs, which lack this field
 
     def intervened(self, step: int) -> np.ndarray:
-        """(N,) bool: whose force or reference the shield changed in a mission step; (0,) without a shield."""
+        """Whether the shield changed an agent's force or reference in a mission step, (N,) bool; (0,) without a shield."""
         if self.shield.shape[1] == 0:
             return np.zeros(0, dtype=bool)
         before = self.shield[step - 1, :, 0] if step > 0 else 0.0
         return np.asarray(self.shield[step, :, 0] > before)
 
     def obstacles_at(self, time: float) -> np.ndarray:
-        """(K, 3) x, y, radius [m] at ``time`` [s]."""
+        """Obstacles (K, 3) x, y, radius [m] at ``time`` [s]."""
         return obstacles_at(time, self.obstacles, self.motions)
 
     def zone(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corners (K, 2) [m] of boxes around all obstacles' safe distances; of those that move, where and when
-        they are nearest to an agent.
+        """Lower and upper corners (K, 2) [m] of the boxes around all obstacles' safe distances.
+
+        A moving obstacle is placed where it comes nearest to an agent.
         """
         places = nearest_places(self.time, self.position, self.obstacles, self.motions)
         reach = places[:, 2:] + self.safe_distance
@@ -105,7 +106,7 @@ class EpisodeLog:
 
 
 def from_world(world: World, b: int = 0) -> EpisodeLog:
-    """A log of one mission step: world ``b`` as it is now."""
+    """A log of one mission step: the current state of world ``b``."""
     scenario, state = world.scenario, world.state
     return EpisodeLog(
         scenario=scenario.name,
@@ -137,13 +138,13 @@ def from_world(world: World, b: int = 0) -> EpisodeLog:
 
 
 def _counts_of(world: World, b: int) -> ShieldCounts | None:
-    """What the shield of world ``b`` did, (1, N) each."""
+    """Shield counts of world ``b`` alone, with a leading axis of length 1; None without a shield."""
     counts = shield_counts(world.state)
     return None if counts is None else ShieldCounts(*(rows[b : b + 1] for rows in counts))
 
 
 def from_trajectory(trajectory: Trajectory, controller: Controller) -> EpisodeLog:
-    """The log that a run would have written, without the file."""
+    """The log that a run would have written to a file."""
     scenario = trajectory.scenario
     every = scenario.substeps
     position = trajectory.position[:-1:every]
@@ -185,7 +186,7 @@ def _names_of(scenario: Scenario) -> tuple[str, ...]:
 
 
 def course_of(scenario: Scenario) -> Course:
-    """What metrics read of a scenario."""
+    """The fields of a scenario that metrics need."""
     return Course(*(getattr(scenario, name) for name in Course._fields))
 
 
@@ -195,24 +196,24 @@ def _substeps_of(trajectory: Trajectory) -> Substeps:
 
 
 def shield_counts_of(rows: np.ndarray) -> ShieldCounts | None:
-    """Counts of M rows (M, N, 7); None of a team without a shield. The inverse of :func:`shield_rows`."""
+    """Shield counts from rows (M, N, 7); None for a team without a shield. The inverse of :func:`shield_rows`."""
     return None if rows.shape[1] == 0 else ShieldCounts(rows[..., 0], rows[..., 1], rows[..., 2:])
 
 
 def shield_rows(counts: ShieldCounts | None, steps: int) -> np.ndarray:
-    """(M, N, 7) as EpisodeLog has them, from counts of M rows; (``steps``, 0, 7) of no shield."""
+    """Field ``shield`` (M, N, 7) of :class:`EpisodeLog` from counts of M mission steps; (``steps``, 0, 7) without a shield."""
     if counts is None:
         return np.zeros((steps, *NO_SHIELD_ROWS.shape))
     return np.concatenate([counts.interventions[..., None], counts.change[..., None], counts.breaches], axis=-1)
 
 
 def hearing_columns(hearing: Hearing | None, steps: int) -> dict[str, np.ndarray]:
-    """``link`` and ``age`` of an :class:`EpisodeLog` of ``steps`` mission steps."""
+    """Fields ``link`` and ``age`` of an :class:`EpisodeLog` with ``steps`` mission steps."""
     return (hearing or Hearing(*(np.repeat(array, steps, axis=0) for array in NO_HEARING)))._asdict()
 
 
 def _judge(trajectory: Trajectory, position: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Clearances (M, N) [m] and G (M,) at positions (M, N, 2), by the loop's own function."""
+    """Clearances (M, N) [m] and G (M,) at positions (M, N, 2), computed with the simulation loop's own functions."""
     scenario = trajectory.scenario
     clearance = np.empty(position.shape[:2])
     formation = np.empty(len(position), dtype=np.int64)

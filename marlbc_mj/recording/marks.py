@@ -1,4 +1,4 @@
-"""Flat shapes on the ground that are drawn over a model: ribbons, discs, dashed circles, trails, and ghost balls."""
+"""Shapes that are drawn in addition to a model: flat ribbons, discs, dashed circles and trails on the ground, and balls."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -10,11 +10,11 @@ import numpy as np
 from marlbc_mj.util.palette import agent_color
 
 TRAIL_WIDTH = 0.26  # [m]
-TRAIL_TOLERANCE = 0.01  # a trail's corners are left out while it stays this close to the path [m]
+TRAIL_TOLERANCE = 0.01  # largest distance of a path from its simplified trail [m]
 CIRCLE_WIDTH = 0.14  # [m]
-DASH_LENGTH = 0.6  # [m], and at least
-DASH_ANGLE = np.radians(6.0)
-SHEET = 0.01  # half the height of flat marks [m]
+DASH_LENGTH = 0.6  # intended length of a dash [m]
+DASH_ANGLE = np.radians(6.0)  # least angle of a dash, which limits their number
+SHEET = 0.01  # half the thickness of flat marks [m]
 
 Color = tuple[float, float, float, float]
 _UPRIGHT = np.eye(3).ravel()
@@ -32,7 +32,7 @@ class Mark(NamedTuple):
 
 @dataclass(frozen=True)
 class Trail:
-    """An agent's path, reduced to few straight pieces."""
+    """An agent's path, simplified to few straight pieces."""
 
     agent: int
     time: np.ndarray  # (P,) when each corner is passed [s]
@@ -41,7 +41,7 @@ class Trail:
     scale: float = 1.0
 
     def until(self, time: float, here: np.ndarray) -> list[Mark]:
-        """The path up to ``time`` [s], which ends at ``here`` (2,) [m]."""
+        """Marks of the path up to ``time`` [s], which ends at ``here`` (2,) [m]."""
         passed = int(np.searchsorted(self.time, time, side="right"))
         if passed == 0:
             return []
@@ -57,7 +57,7 @@ def add(scene: mujoco.MjvScene, mark: Mark) -> None:
 
 
 def ribbon(a: np.ndarray, b: np.ndarray, width: float, height: float, color: Color, scale: float = 1.0) -> Mark:
-    """A flat strip between two points (2,) of the ground, ``height`` [m] above it."""
+    """A flat strip between two points (2,), ``height`` [m] above the ground."""
     along = b - a
     length = float(np.hypot(*along))
     cosine, sine = along / length if length > 1e-9 else (1.0, 0.0)
@@ -78,9 +78,9 @@ def ball(center: np.ndarray, radius: float, color: Color) -> Mark:
 
 
 def dashed_circle(center: np.ndarray, radius: float, color: Color, scale: float = 1.0) -> list[Mark]:
-    """A circle of dashes around ``center`` (2,) on the ground, as many as ``DASH_LENGTH`` and ``DASH_ANGLE`` allow.
+    """A circle of dashes around ``center`` (2,) on the ground; ``DASH_LENGTH`` and ``DASH_ANGLE`` set their number.
 
-    ``scale`` is what 1 m of the marks is in a mission of small robots [m], here and below.
+    In this module, ``scale`` is the drawn length of 1 m of a mark [m]: less than 1 in a mission of small robots.
     """
     dashes = int(np.clip(np.pi * radius / (DASH_LENGTH * scale), 8, np.pi / DASH_ANGLE))
     turn = np.linspace(0.0, 2.0 * np.pi, 2 * dashes, endpoint=False)
@@ -90,7 +90,7 @@ def dashed_circle(center: np.ndarray, radius: float, color: Color, scale: float 
 
 
 def make_trail(agent: int, time: np.ndarray, path: np.ndarray, scale: float = 1.0) -> Trail:
-    """The trail of a path (M, 2) [m] that is passed at ``time`` (M,) [s]."""
+    """The trail of a path (M, 2) [m], its points passed at ``time`` (M,) [s]."""
     corners = corner_indices(path, TRAIL_TOLERANCE * scale)
     points = path[corners]
     pieces = [_trail_piece(agent, a, b, scale) for a, b in pairwise(points)]
@@ -98,7 +98,7 @@ def make_trail(agent: int, time: np.ndarray, path: np.ndarray, scale: float = 1.
 
 
 def corner_indices(path: np.ndarray, tolerance: float) -> np.ndarray:
-    """Indices of the points of a path (M, 2) that suffice to stay within ``tolerance`` [m] of it (Ramer, Douglas and Peucker)."""
+    """Indices of the points that keep a polyline within ``tolerance`` [m] of a path (M, 2) (Ramer, Douglas and Peucker)."""
     kept = {0, len(path) - 1}
     spans = [(0, len(path) - 1)]
     while spans:
@@ -122,6 +122,6 @@ def _distances(points: np.ndarray, along: np.ndarray) -> np.ndarray:
 
 
 def _trail_piece(agent: int, a: np.ndarray, b: np.ndarray, scale: float) -> Mark:
-    """One straight piece of a trail; each agent's lies a little higher, so that crossing trails do not flicker."""
+    """One straight piece of a trail; heights differ slightly between agents, so that crossing trails do not flicker."""
     height = 0.04 + 0.002 * (agent % 8)
     return ribbon(a, b, TRAIL_WIDTH * scale, height * scale, agent_color(agent), scale)

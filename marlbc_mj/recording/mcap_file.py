@@ -1,4 +1,4 @@
-"""MCAP files of strangers: opened, checked for wholeness and size before anything is unpacked, and recovered if they are torn."""
+"""Untrusted MCAP files: opened, checked for completeness and size before decompression, and recovered if they are torn."""
 
 import struct
 import zlib
@@ -22,31 +22,31 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import staged_file
 
 _END = struct.Struct("<BQQQI8s")
-"""How an MCAP ends: footer record (opcode, length, start of the summary, of its offsets, checksum of the summary), magic."""
+"""End of an MCAP: footer record (opcode, length, starts of the summary and of its offsets, checksum of the summary), magic."""
 _DATA_END_SIZE = 1 + 8 + 4  # the record before the summary: opcode, length, checksum of everything before it [bytes]
 _DAMAGE = (
     *(McapError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError, MemoryError),
     *(TypeError, AttributeError, IndexError, RecursionError, RuntimeError, EOFError),  # lz4 raises a bare RuntimeError
 )
-"""What the mcap package, decompression and decoding raise on bytes that are not what they should be."""
+"""Errors that the mcap package, decompression and decoding raise on invalid data."""
 MOST_UNPACKED, MOST_CHUNK = 2**31, 2**26
-"""Largest size of a log's decompressed chunks together, and of one [bytes]: twice what 256 agents leave in 100 s, and 60 times
-what the writer puts into one.
+"""Largest size of all decompressed chunks of a log, and of one chunk [bytes]: twice the size for 256 agents in 100 s, and 60
+times the size of the writer's chunks.
 """
 
 
 def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> int:
-    """Copy everything whole out of a torn or damaged MCAP into a new one, which any reader opens.
+    """Copy all intact records of a torn or damaged MCAP into a new one that any reader can open.
 
-    Metadata and attachments stand at the start of a log and survive with its first chunk. A chunk or an
-    attachment that fails its checksum is left out; metadata has none.
+    Metadata and attachments are at the start of a log, so they survive if its first chunk does. A chunk or an
+    attachment with a wrong checksum is left out; metadata has no checksum.
 
     Returns:
-        How many messages were saved.
+        The number of messages saved.
 
     Raises:
-        ConfigurationError: no such file, no MCAP, no whole message in it (it was torn before its first chunk ended, for
-            example), or an output that cannot or must not be written. Nothing is written then.
+        ConfigurationError: the file does not exist, is not an MCAP, or has no intact message (for example if it was torn
+            within its first chunk); or the output cannot or must not be written. Nothing is written in these cases.
     """
     with _open_file(torn) as source, staged_file(Path(out), overwrite=overwrite) as staging, open(staging, "wb") as target:
         writer = Writer(target, enable_data_crcs=True)
@@ -63,7 +63,7 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
 
 @contextmanager
 def _open_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A file that is an MCAP, whole or torn."""
+    """Open a file and check that it is an MCAP, whole or torn."""
     try:
         if Path(path).exists() and not Path(path).is_file():
             raise ConfigurationError(f"cannot read {path}: it is not a file")
@@ -78,7 +78,7 @@ def _open_file(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def open_mcap(path: str | Path) -> Iterator[McapReader]:
-    """A reader of a whole MCAP; parse errors inside the block become one line."""
+    """Open a reader of a whole MCAP; parse errors inside the block become a ConfigurationError of one line."""
     with _open_file(path) as stream:
         try:
             _check_whole(path, stream)
@@ -92,7 +92,7 @@ def open_mcap(path: str | Path) -> Iterator[McapReader]:
 
 
 def _check_whole(path: str | Path, stream: BinaryIO) -> None:
-    """Raise unless the file ends as an MCAP does and its checksums hold; the mcap package checks those of chunks only."""
+    """Raise unless the file has a valid end and correct checksums; the mcap package checks only those of chunks."""
     data = stream.read()
     stream.seek(0)
     opcode, length, summary_start, _, summary_crc, magic = _END.unpack(data[-_END.size :].rjust(_END.size, b"\0"))
@@ -107,7 +107,7 @@ def _check_whole(path: str | Path, stream: BinaryIO) -> None:
 
 
 def _check_sizes(stream: BinaryIO) -> None:
-    """Raise ValueError for chunks that are larger than any log's once they are decompressed, before one of them is."""
+    """Raise ValueError, before any decompression, if the decompressed chunks would be larger than those of any log."""
     total = 0
     for record in StreamReader(stream, emit_chunks=True).records:
         if isinstance(record, Chunk):
@@ -118,7 +118,7 @@ def _check_sizes(stream: BinaryIO) -> None:
 
 
 def _unpacked(chunk: Chunk) -> int:
-    """Size of a chunk that is no bomb [bytes]; ValueError for one that is, or says another size than its compressed data do."""
+    """Decompressed size of a chunk [bytes]; ValueError if it is too large or differs from that of the compressed data."""
     said, packed = chunk.uncompressed_size, len(chunk.data)
     if said > MOST_CHUNK:
         raise ValueError(f"a chunk of {packed} bytes says that it holds {said}; none has more than {MOST_CHUNK}")
@@ -134,7 +134,7 @@ def _unpacked(chunk: Chunk) -> int:
 
 
 def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
-    """Records of the data section up to the first that is not whole, chunks opened."""
+    """Records of the data section, including those in chunks, up to the first that cannot be read."""
     records = iter(StreamReader(source, emit_chunks=True, record_size_limit=size).records)
     while True:
         try:
@@ -144,7 +144,7 @@ def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
         if record is None or isinstance(record, DataEnd):
             return
         if isinstance(record, Chunk):
-            with suppress(*_DAMAGE):  # a bomb, or a damaged chunk between whole ones costs only itself
+            with suppress(*_DAMAGE):  # only the chunk that is damaged or too large is lost
                 _unpacked(record)
                 yield from breakup_chunk(record, validate_crc=True)
         elif not isinstance(record, Attachment) or _is_whole(record, source):
@@ -152,16 +152,16 @@ def _whole_records(source: BinaryIO, size: int) -> Iterator[McapRecord]:
 
 
 def _is_whole(attachment: Attachment, source: BinaryIO) -> bool:
-    """Whether the attachment just read from ``source`` fits its checksum, which the mcap package does not look at."""
+    """Whether the attachment just read from ``source`` matches its checksum, which the mcap package does not verify."""
     source.seek(-4, SEEK_CUR)
     stored = source.read(4)
     record = RecordBuilder()
     attachment.write(record)
-    return stored in (bytes(4), bytes(record.end()[-4:]))  # zero: none was written
+    return stored in (bytes(4), bytes(record.end()[-4:]))  # zero: no checksum was written
 
 
 def _copy(records: Iterator[McapRecord], writer: Writer) -> int:
-    """Write records under new schema and channel numbers. Returns the number of messages."""
+    """Write records with new schema and channel numbers, and return the number of messages."""
     schema_ids: dict[int, int] = {0: 0}
     channel_ids: dict[int, int] = {}
     saved = 0

@@ -1,4 +1,4 @@
-"""Off-screen drawing with whichever OpenGL backend works; unlike ``mujoco.Renderer`` it does not depend on the import order."""
+"""Off-screen drawing with the first OpenGL backend that works; unlike ``mujoco.Renderer`` independent of the import order."""
 
 from importlib import import_module
 from types import TracebackType
@@ -11,16 +11,18 @@ from marlbc_mj.recording.gl import choose_gl
 from marlbc_mj.recording.stage import Stage
 from marlbc_mj.util.errors import ConfigurationError
 
-MAX_SHAPES = 20_000  # in one picture: model and marks
-SLICES, STACKS, QUADS = 32, 12, 1  # facets of circles, of spheres and cylinders along their axis, of a box's edge
+MAX_SHAPES = 20_000  # largest number of shapes in one picture, of model and marks together
+SLICES, STACKS, QUADS = 32, 12, 1  # subdivisions around circles, along the axes of spheres and cylinders, and along box edges
 
 
 class Offscreen:
-    """Draws a stage into arrays. Use it as a context manager: an OpenGL context must be given back.
+    """Draws a stage into arrays. Use it as a context manager, which releases the OpenGL context.
 
     Args:
-        width, height: of the pictures [pixels].
-        samples: per pixel; 4 smooths edges, 0 is twice as fast.
+        stage: the stage to draw.
+        camera: the camera as a function of time.
+        width, height: size of the pictures [pixels].
+        samples: samples per pixel; 4 smooths edges, 0 is twice as fast.
 
     Raises:
         ConfigurationError: no OpenGL backend works here.
@@ -50,12 +52,12 @@ class Offscreen:
         self.close()
 
     def close(self) -> None:
-        """Give the OpenGL context back."""
+        """Release the OpenGL context."""
         self._drawing.free()
         self._context.free()
 
     def render(self, time: float) -> np.ndarray:
-        """(height, width, 3) uint8: the stage at ``time`` [s]."""
+        """Picture (height, width, 3) uint8 of the stage at ``time`` [s]."""
         stage = self.stage
         stage.pose(time)
         category = mujoco.mjtCatBit.mjCAT_ALL

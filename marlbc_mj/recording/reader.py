@@ -19,10 +19,10 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 def read_log(path: str | Path) -> EpisodeLog:
-    """An episode from its log, every number bit for bit as it was recorded.
+    """Read an episode from its log; every number is identical to the recorded one to the last bit.
 
     Raises:
-        ConfigurationError: no such file, no MCAP, a torn or damaged one, or one that is not a log of this package.
+        ConfigurationError: the file does not exist, is not an MCAP, is torn or damaged, or is not a log of this package.
     """
     with open_mcap(path) as reader:
         metadata = _marlbc_metadata(path, reader)
@@ -52,7 +52,7 @@ def read_log(path: str | Path) -> EpisodeLog:
 
 
 def _check_log(log: EpisodeLog) -> None:
-    """Raise ValueError for arrays that do not fit each other, or numbers that no episode leaves."""
+    """Raise ValueError if arrays do not fit each other, or have values that no episode produces."""
     steps, agents = log.position.shape[:2]
     shapes = {
         **dict.fromkeys(("position", "velocity", "reference", "reference_velocity", "force"), (steps, agents, 2)),
@@ -93,13 +93,13 @@ def _check_log(log: EpisodeLog) -> None:
 
 
 def log_info(path: str | Path) -> dict[str, Any]:
-    """What is in an MCAP, for people: JSON values only.
+    """Overview of the content of an MCAP, for display: JSON values only.
 
     Keys: ``file, bytes, library, start_s, duration_s, messages, chunks``, ``topics`` (by name: ``messages, schema,
     schema_encoding, message_encoding``), ``metadata`` (by record name) and ``attachments`` (``name, media_type, bytes``).
 
     Raises:
-        ConfigurationError: no such file, no MCAP, or a torn or damaged one.
+        ConfigurationError: the file does not exist, is not an MCAP, is torn or damaged, or has no summary.
     """
     with open_mcap(path) as reader:
         summary = reader.get_summary()
@@ -143,7 +143,7 @@ def _marlbc_metadata(path: str | Path, reader: McapReader) -> dict[str, str]:
 
 
 def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, Any]]]:
-    """Decoded messages of every required topic, and of those of some logs that this one has; the same number of each."""
+    """Decoded messages of every required topic, and of the optional topics in this log; all have the same number."""
     some = [
         topic
         for topic in (schemas.SUBSTEP_ROWS, schemas.POSE, schemas.COMMUNICATION, schemas.SHIELD)
@@ -162,7 +162,7 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
 
 
 def _topics_used(reader: McapReader) -> set[str]:
-    """Topics with at least one message; a team whose supervisor says nothing leaves none on its communication."""
+    """Topics with at least one message. The communication topic has none if the supervisor sends no messages."""
     summary = reader.get_summary()
     if summary is None or summary.statistics is None:
         return set()
@@ -175,7 +175,7 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
     pose, shield, steps = schemas.POSE, schemas.SHIELD, len(found["/state"])
 
     def agents(topic: str, *names: str) -> np.ndarray:
-        # Infinite numbers are left out of the JSON, and only a clearance can be.
+        # Infinite numbers are left out of the JSON, and only a clearance can be infinite.
         return np.array([[[row.get(n, np.inf) for n in names] for row in m["agents"]] for m in found[topic]])
 
     def scalar(topic: str, name: str) -> np.ndarray:
@@ -200,7 +200,7 @@ def _columns(found: dict[str, list[dict[str, Any]]]) -> dict[str, np.ndarray]:
 
 
 def _substeps(found: dict[str, list[dict[str, Any]]], metadata: dict[str, str], agents: int) -> Substeps | None:
-    """All substeps; None in a log without."""
+    """All substeps; None if the log has none."""
     if schemas.SUBSTEP_ROWS.name not in found:
         return None
     moments = [schemas.decode_substeps(row, agents) for row in found[schemas.SUBSTEP_ROWS.name]]
@@ -210,10 +210,10 @@ def _substeps(found: dict[str, list[dict[str, Any]]], metadata: dict[str, str], 
 
 
 def _course(metadata: dict[str, str], agents: int) -> Course:
-    """What metrics read of the scenario.
+    """The scenario's fields that metrics need, from the metadata.
 
     Raises:
-        ValueError: numbers that no scenario has.
+        ValueError: a number is not valid in a scenario.
     """
     numbers = {name: float(metadata[name]) for name in ("substep", "mission_step", "safe_distance", "scenario_force_limit")}
     (x, y), (vx, vy) = np.array(json.loads(metadata["path"]), dtype=np.float64).reshape(2, 2).tolist()
@@ -227,12 +227,12 @@ def _course(metadata: dict[str, str], agents: int) -> Course:
 
 
 def _shield_rows(messages: list[dict[str, Any]]) -> np.ndarray:
-    """(M, N, 7) as EpisodeLog has them; columns that an older log lacks are 0."""
+    """Field ``shield`` (M, N, 7) of EpisodeLog; columns that an older log lacks are 0."""
     return np.array([[[float(row.get(name, 0.0)) for name in schemas.SHIELD.columns] for row in m["agents"]] for m in messages])
 
 
 def _hearing(found: dict[str, list[dict[str, Any]]]) -> Hearing | None:
-    """Who heard whom, (M, N, N) each; None in a log without."""
+    """Links and ages (M, N, N) of the communication; None if the log has none."""
     if schemas.COMMUNICATION.name not in found:
         return None
     moments = [schemas.decode_hearing(message["agents"]) for message in found[schemas.COMMUNICATION.name]]

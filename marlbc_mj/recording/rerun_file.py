@@ -1,6 +1,6 @@
-"""A log as a recording of Rerun, whose viewer shows of an MCAP only what it has decoders for: plots, events and a scene in 3D.
+"""Export of a log as a recording for Rerun: plots, events and a scene in 3D.
 
-The package ``rerun-sdk`` is optional.
+Rerun's viewer shows only those parts of an MCAP for which it has decoders. The package ``rerun-sdk`` is optional.
 """
 
 from importlib import import_module
@@ -14,16 +14,17 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import agent_color
 
 TIMELINE = "mission"
-"""Name of the mission's clock."""
-HEIGHT = 1.2  # of an obstacle in the scene [m]
-RADIUS = 0.25  # of an agent, and of an obstacle that is a point [m]
+"""Name of the timeline of mission time."""
+HEIGHT = 1.2  # height of an obstacle in the scene [m]
+RADIUS = 0.25  # radius of an agent, and least radius of an obstacle [m]
 PAIRS = {"state": ("position", "velocity"), "reference": ("reference", "reference_velocity"), "force": ("force",)}
-"""Fields of a log with two axes, by the topic under which the MCAP has them."""
+"""Fields of a log with two axes, by their topic in the MCAP."""
 
 
 def write_rerun(log: EpisodeLog, stream: BinaryIO) -> None:
-    """Write a recording: ``/state``, ``/reference``, ``/force``, ``/metrics`` and ``/priorities`` by agent, ``/scene``, and where
-    agents talk ``/communication``.
+    """Write a recording: ``/state``, ``/reference``, ``/force``, ``/metrics`` and ``/priorities`` per agent, and ``/scene``.
+
+    If agents communicate, it also has ``/communication``.
 
     Raises:
         ConfigurationError: ``rerun-sdk`` is not installed.
@@ -41,7 +42,7 @@ def write_rerun(log: EpisodeLog, stream: BinaryIO) -> None:
 
 
 def _write_plots(rerun: Any, recording: Any, log: EpisodeLog) -> None:
-    """Numbers over the mission's time, a plot per agent and field."""
+    """Write numbers over mission time, one plot per agent and field."""
     for topic, fields in PAIRS.items():
         for field in fields:
             values = getattr(log, field)
@@ -54,7 +55,7 @@ def _write_plots(rerun: Any, recording: Any, log: EpisodeLog) -> None:
 
 
 def _plot(rerun: Any, recording: Any, entity: str, time: np.ndarray, values: np.ndarray, names: tuple[str, ...]) -> None:
-    """Values (M, C) under ``entity``; moments at which one is not finite are left out."""
+    """Write values (M, C) under ``entity``; times with a value that is not finite are left out."""
     finite = np.isfinite(values).all(axis=1)
     recording.log(entity, rerun.SeriesLines(names=names), static=True)
     columns = rerun.Scalars.columns(scalars=values[finite].astype(np.float64).ravel())
@@ -66,7 +67,7 @@ def _clock(rerun: Any, time: np.ndarray) -> Any:
 
 
 def _write_priorities(rerun: Any, recording: Any, log: EpisodeLog) -> None:
-    """Every agent's command as a text where it changes, and as a plot of its index."""
+    """Write every agent's command as a text whenever it changes, and as a plot of its index."""
     for i in range(log.command.shape[1]):
         entity, commands = f"priorities/agent{i + 1}", log.command[:, i]
         changed = np.flatnonzero(np.diff(commands, prepend=-1))
@@ -76,7 +77,7 @@ def _write_priorities(rerun: Any, recording: Any, log: EpisodeLog) -> None:
 
 
 def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
-    """Agents and references as balls that move, their paths, and the obstacles where they are at every moment."""
+    """Write agents and references as moving balls, the agents' paths, and the obstacles, at rest or moving."""
     steps, agents = log.position.shape[:2]
     colors = [[round(255 * part) for part in agent_color(i)] for i in range(agents)]
     for name, places, radius in (("agents", log.position, RADIUS), ("references", log.reference, 0.5 * RADIUS)):
@@ -102,7 +103,7 @@ def _write_scene(rerun: Any, recording: Any, log: EpisodeLog) -> None:
 
 
 def _write_links(rerun: Any, recording: Any, log: EpisodeLog) -> None:
-    """Who hears whom, as lines between agents that fade with the age of what they know of each other; and that age as plots."""
+    """Write links as lines that fade with the age of what agents know of each other, and plots of each agent's oldest age."""
     moments = [links_of_log(log, k) for k in range(len(log.time))]
     strips = [log.position[k][links.ends] for k, links in enumerate(moments)]
     raised = [np.pad(pair, ((0, 0), (0, 1)), constant_values=RADIUS) for step in strips for pair in step]
@@ -115,7 +116,7 @@ def _write_links(rerun: Any, recording: Any, log: EpisodeLog) -> None:
 
 
 def _upright(places: np.ndarray) -> np.ndarray:
-    """(..., 3) x, y, radius as the middles (P, 3) of cylinders that stand on the ground [m]."""
+    """Centers (P, 3) of cylinders that stand on the ground, from places (..., 3) x, y, radius [m]."""
     middles = places.reshape(-1, 3).copy()
     middles[:, 2] = 0.5 * HEIGHT
     return middles

@@ -1,4 +1,4 @@
-"""What a 3D viewer shows of an episode: Foxglove's SceneUpdate and FrameTransforms in protobuf, and a layout for them."""
+"""The 3D scene of an episode for viewers: Foxglove's SceneUpdate and FrameTransforms in protobuf, and a Foxglove layout."""
 
 from typing import Any
 
@@ -38,9 +38,9 @@ class Scene:
     """Builds the messages of one episode. The protobuf objects are made once; a mission step only changes their numbers.
 
     Args:
-        scenario: the team.
-        obstacles: (K, 3) this episode's x, y, radius [m]; of one that moves, its place without motion.
-        motions: (K, 6) as :mod:`marlbc_mj.core.motion` has them; none: all at rest.
+        scenario: gives the team and the safe distance.
+        obstacles: (K, 3) this episode's x, y, radius [m]; for a moving one the anchor, see :mod:`marlbc_mj.core.motion`.
+        motions: (K, 6) columns as in :mod:`marlbc_mj.core.motion`; None: all obstacles are at rest.
     """
 
     def __init__(self, scenario: Scenario, obstacles: np.ndarray, motions: np.ndarray | None = None) -> None:
@@ -65,16 +65,16 @@ class Scene:
     def encode(
         self, stamp: int, position: np.ndarray, reference: np.ndarray, hearing: Hearing | None = None
     ) -> tuple[bytes, bytes]:
-        """SceneUpdate and FrameTransforms of one mission step.
+        """Serialized SceneUpdate and FrameTransforms of one mission step.
 
-        Obstacles are in every SceneUpdate: after a seek a viewer gets one message per topic, and would otherwise show none of
-        them. It costs nothing, as the bytes of two messages joined are their merged message.
+        Obstacles are in every SceneUpdate: after a seek a viewer receives only one message per topic, and would otherwise
+        show no obstacles. This is cheap: the concatenated bytes of two protobuf messages are the merged message.
 
         Args:
-            stamp: [ns].
-            position: (N, 2) [m].
-            reference: (N, 2) p_r [m].
-            hearing: who hears whom, (N, N) each, where agents talk.
+            stamp: time stamp [ns].
+            position: (N, 2) positions of the agents [m].
+            reference: (N, 2) reference positions p_r [m].
+            hearing: links and ages (N, N) if agents communicate.
         """
         seconds, nanos = divmod(stamp, 1_000_000_000)
         for timestamp in self._stamps:
@@ -90,7 +90,7 @@ class Scene:
         return static + links + self._team.SerializeToString(), self._transforms.SerializeToString()
 
     def _obstacles_at(self, time: float) -> bytes:
-        """The message of all obstacles at ``time`` [s]."""
+        """Serialized message of all obstacles at ``time`` [s]."""
         now = obstacles_at(time, self._obstacles, self._motions)
         return bytes(SceneUpdate(entities=[_obstacle_entity(now, self._safe_distance)]).SerializeToString())
 
@@ -104,7 +104,7 @@ def _pose(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Pose:
 
 
 def _agent_entity(agent: int, radius: float, length: float) -> SceneEntity:
-    """A sphere for the agent, a small one for its reference at the team's length unit, a line between them."""
+    """A sphere for the agent, a small one for its reference, scaled by the team's length unit, and a line between them."""
     color = _color(agent_color(agent))
     spheres = [
         SpherePrimitive(pose=_pose(z=radius), size=Vector3(x=d, y=d, z=d), color=color)
@@ -116,7 +116,7 @@ def _agent_entity(agent: int, radius: float, length: float) -> SceneEntity:
 
 
 def _links_message(position: np.ndarray, hearing: Hearing) -> bytes:
-    """The message of the links between agents: one list of lines, a color for both ends of each."""
+    """Serialized message of the links between agents: one list of lines, with a color for both ends of each line."""
     links = drawn_links(position, hearing.link, hearing.age)
     points = [Point3(x=x, y=y, z=_LINK_HEIGHT) for pair in position[links.ends].tolist() for x, y in pair]
     colors = [_color(color) for color in np.repeat(links.colors(), 2, axis=0).tolist()]

@@ -1,8 +1,9 @@
 """The JSON topics of a log: their fields, their JSON Schemas, and the compact encoding that is written at mission rate.
 
-Only what viewers understand is used: Foxglove's schema parser takes one plain type per field (no ``["number", "null"]``) and no
-arrays of arrays, PlotJuggler refuses a channel without a schema. Hence every topic is one object with scalars and a list
-``agents`` of flat objects, and a number that is not finite is left out: JSON has neither NaN nor Infinity.
+The topics use only features that viewers support: Foxglove's schema parser accepts one plain type per field (no
+``["number", "null"]``) and no arrays of arrays, and PlotJuggler rejects a channel without a schema. Hence every topic is one
+object with scalars and a list ``agents`` of flat objects. Numbers that are not finite are left out, since JSON has neither NaN
+nor Infinity.
 """
 
 import base64
@@ -26,8 +27,8 @@ class MessageField(NamedTuple):
     """One field of a topic."""
 
     type: str  # "number", "integer" or "string"
-    description: str  # with its unit
-    required: bool = True  # False: left out where it is not finite
+    description: str  # including the unit
+    required: bool = True  # False: left out if it is not finite
 
 
 class Topic(NamedTuple):
@@ -41,7 +42,7 @@ class Topic(NamedTuple):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of an agent's fields, in the order of ``values`` in :func:`encode`."""
+        """Names of an agent's fields, in the order of the columns of ``values`` in :func:`encode`."""
         return tuple(self.agents)
 
 
@@ -147,10 +148,10 @@ SUBSTEP_ROWS = Topic(
 )
 TOPICS = (STATE_TOPIC, REFERENCE, FORCE, SUBSTEP_ROWS, PRIORITIES, WEIGHTS, METRICS)
 REQUIRED = (STATE_TOPIC, REFERENCE, FORCE, PRIORITIES, METRICS)
-"""Topics without which a log cannot be read back; the weights are there for SORLC only.
+"""Topics without which a log cannot be read.
 
-Logs have ``SUBSTEP_ROWS``, robots with a free joint ``POSE``, teams with a shield ``SHIELD``, and those whose communication is
-not ideal ``COMMUNICATION``.
+Of the others, ``SUBSTEP_ROWS`` is in every new log, ``WEIGHTS`` in logs of SORLC, ``POSE`` in those of robots with a free
+joint, ``SHIELD`` in those of teams with a shield, and ``COMMUNICATION`` in those of teams whose communication is not ideal.
 """
 
 
@@ -170,13 +171,13 @@ def _object(fields: Mapping[str, MessageField]) -> dict[str, Any]:
 
 
 def encode(topic: Topic, values: np.ndarray, **scalars: float) -> bytes:
-    """One message from an agent table ``values`` (N, columns) and the topic's scalars; numbers read back bit for bit."""
+    """One message from an agent table ``values`` (N, columns) and the topic's scalars; reading it restores every bit."""
     rows = encode_rows(topic.columns, values)
     return message([f'"{name}":{value!r}' for name, value in scalars.items()], rows)
 
 
 def encode_rows(columns: tuple[str, ...], values: np.ndarray) -> str:
-    """``{"x":1.0,...},{...}`` from (N, columns), numbers that are not finite left out."""
+    """``{"x":1.0,...},{...}`` from values (N, columns), without numbers that are not finite."""
     numbers = values.ravel().tolist()
     if math.isfinite(sum(numbers)):
         return _template(columns, len(values)) % tuple(numbers)
@@ -185,7 +186,7 @@ def encode_rows(columns: tuple[str, ...], values: np.ndarray) -> str:
 
 
 def encode_hearing(hearing: Hearing) -> bytes:
-    """A message on ``COMMUNICATION``; links and ages (N, N) read back bit for bit."""
+    """A message on ``COMMUNICATION``; reading it restores every bit of links and ages (N, N)."""
     part = components((hearing.link & hearing.link.T)[None])[0]
     rows = []
     for first, link, age in zip(part.tolist(), hearing.link, hearing.age.tolist(), strict=True):
@@ -205,7 +206,7 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
     """Links and ages (N, N) from the rows of a message on ``COMMUNICATION``.
 
     Raises:
-        ValueError: a row that :func:`encode_hearing` does not write.
+        ValueError: a row is not of the form that :func:`encode_hearing` writes.
     """
     agents = len(rows)
     link, age = np.zeros((agents, agents), dtype=np.bool_), np.empty((agents, agents))
@@ -224,12 +225,13 @@ def decode_hearing(rows: list[dict[str, Any]]) -> Hearing:
 def encode_substeps(rows: Sequence[np.ndarray], after: np.ndarray) -> bytes:
     """A message on ``SUBSTEP_ROWS``.
 
-    Its data are little-endian doubles: positions, with those at the end of the mission step behind them, velocities, references,
-    reference velocities and forces; of each, agent by agent and axis by axis, all substeps. They are sorted by their bytes, first
-    bytes first, since neighbors have most of them in common, and written in base64.
+    Its data are little-endian doubles: positions, followed by those at the end of the mission step, velocities, references,
+    reference velocities and forces. Each array is stored agent by agent and axis by axis, with all substeps in sequence. The
+    first bytes of all numbers come first, then the second bytes and so on, since neighboring numbers have most bytes in common.
+    The result is encoded in base64.
 
     Args:
-        rows: the five, (substeps, N, 2) each.
+        rows: the five arrays, (substeps, N, 2) each.
         after: position at the end of the mission step (N, 2) [m].
     """
     position, *others = rows
@@ -241,10 +243,10 @@ def encode_substeps(rows: Sequence[np.ndarray], after: np.ndarray) -> bytes:
 
 
 def decode_substeps(row: Mapping[str, Any], agents: int) -> list[np.ndarray]:
-    """What :func:`encode_substeps` packed of ``agents``: positions (substeps + 1, N, 2), then the others (substeps, N, 2).
+    """Arrays from a row of :func:`encode_substeps`: positions (substeps + 1, N, 2), then the other four (substeps, N, 2).
 
     Raises:
-        ValueError: data that it does not write.
+        ValueError: the data are not of the form that it writes, or not finite.
     """
     packed = np.frombuffer(base64.b64decode(row["data"], validate=True), np.uint8).reshape(8, -1)
     numbers = np.ascontiguousarray(packed.T).view("<f8").ravel()
@@ -263,6 +265,6 @@ def message(scalars: list[str], rows: str) -> bytes:
 
 @cache
 def _template(columns: tuple[str, ...], agents: int) -> str:
-    """A %-template is several times faster than ``json.dumps``, which matters at eight messages per mission step."""
+    """A %-template of all agents' rows; several times faster than ``json.dumps``, with eight messages per mission step."""
     row = "{" + ",".join(f'"{name}":%r' for name in columns) + "}"
     return ",".join([row] * agents)

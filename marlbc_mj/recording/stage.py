@@ -1,6 +1,6 @@
-"""A log at one time as a picture shows it: the posed model, and marks that are not part of the model.
+"""What a picture shows of a log at one time: the posed model, and marks that are not part of the model.
 
-Marks are flat shapes on the ground, added to a scene when it is drawn, so physics never pays for them.
+Marks are shapes that are added to a scene when it is drawn, so they cost the physics nothing.
 """
 
 from dataclasses import dataclass, replace
@@ -17,17 +17,17 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.palette import SAFE_DISTANCE_COLOR, SHIELD_COLOR, agent_color, command_color, rgba
 from marlbc_mj.util.text import one_line
 
-BALL = 0.8  # least drawn radius of an agent [m]: half a metre is hard to see in a mission of 100 m; less where distances are
-BALL_SHARE = 0.4  # of the safe distance, so that no drawing touches what an agent keeps clear of
+BALL = 0.8  # least drawn radius of an agent [m]: a radius of 0.5 m is hard to see in a mission of 100 m
+BALL_SHARE = 0.4  # that radius is at most this share of the safe distance, so that no ball touches an obstacle kept clear of
 HALO = 1.6  # radius of the disc under an agent, in drawn radii
-RIM = 0.14  # width of the white rim around it, in drawn radii
-LINK_WIDTH = 0.13  # of the strip between two agents that hear each other [m]
-LINK_HEIGHT = 0.5  # of that strip, in drawn radii of the first: above the trails
+RIM = 0.14  # width of the rim of that disc, in drawn radii
+LINK_WIDTH = 0.13  # width of the strip between two linked agents [m]
+LINK_HEIGHT = 0.5  # height of that strip, in drawn radii of the first agent: above the trails
 GHOST = 0.45  # radius of a reference's ghost, in drawn radii
 
 
 OUTSIDE = ("include", "plugin", "extension", "replicate", "composite", "flexcomp")
-"""Elements of MJCF that read files, load programs or multiply what stands in them; an assembled model has none of them."""
+"""MJCF elements that read files, load plugins or replicate their content; an assembled model has none of them."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +37,20 @@ class Stage:
     log: EpisodeLog
     model: mujoco.MjModel
     data: mujoco.MjData
-    joints: np.ndarray  # (N, 2) addresses of the agents' axes in qpos
-    discs: np.ndarray  # (K,) geoms of the obstacles
+    joints: np.ndarray  # (N, 2) addresses of the agents' x and y in qpos
+    discs: np.ndarray  # (K,) geom numbers of the obstacles
     radii: np.ndarray  # (N,) drawn radii of the agents [m]
     rings: list[Mark]
     trails: list[Trail]
-    scale: float = 1.0  # what 1 m of the paper's mission is here: marks and cameras shrink with small robots [m]
-    free: tuple[int | None, ...] = ()  # addresses in qpos of the agents' free joints, where the log has poses; None: slides
+    scale: float = 1.0  # length of 1 m of the paper's mission here [m]: marks and cameras shrink with small robots
+    free: tuple[int | None, ...] = ()  # addresses in qpos of the agents' free joints if the log has poses; None: slide joints
 
     def step(self, time: float) -> int:
-        """Index of the mission step that ``time`` [s] lies in, the nearest one outside the log."""
+        """Index of the mission step that contains ``time`` [s], or of the nearest one outside the log."""
         return int(np.clip(np.searchsorted(self.log.time, time + 1e-9, side="right") - 1, 0, len(self.log.time) - 1))
 
     def sample(self, values: np.ndarray, time: float) -> np.ndarray:
-        """``values`` (M, ...) at ``time`` [s], linear between mission steps and constant outside them."""
+        """``values`` (M, ...) at ``time`` [s], interpolated linearly between mission steps and constant outside the log."""
         k = self.step(time)
         after = min(k + 1, len(values) - 1)
         weight = np.clip((time - self.log.time[k]) / self.log.mission_step, 0.0, 1.0)
@@ -61,7 +61,7 @@ class Stage:
         return [self.log.commands[k] for k in self.log.command[self.step(time)]]
 
     def shielded(self, time: float) -> list[int]:
-        """Agents whose shield changes what they do in the mission step of ``time`` [s]."""
+        """Indices of the agents whose force or reference the shield changes in the mission step at ``time`` [s]."""
         return [int(i) for i in np.flatnonzero(self.log.intervened(self.step(time)))]
 
     def pose(self, time: float) -> None:
@@ -78,7 +78,7 @@ class Stage:
         mujoco.mj_forward(self.model, self.data)
 
     def draw(self, scene: mujoco.MjvScene, time: float) -> None:
-        """Add rings, trails, links, halos and references at ``time`` [s] to a scene, after its model is in it.
+        """Add rings, trails, links, halos and references at ``time`` [s] to a scene that already contains the model.
 
         Raises:
             ConfigurationError: the scene has no room for them.
@@ -91,7 +91,7 @@ class Stage:
             add(scene, mark)
 
     def middles(self) -> np.ndarray:
-        """(N, 3) where every agent's number goes [m]: on the middle of a ball, above a robot that has a pose."""
+        """Positions (N, 3) of the agents' numbers [m]: in the middle of a ball, or above a robot that has a pose."""
         heights = [
             radius if first is None else self.data.qpos[first + 2] + 1.9 * radius
             for first, radius in zip(self.free or (None,) * len(self.radii), self.radii, strict=True)
@@ -103,7 +103,7 @@ class Stage:
         return [mark for i, trail in enumerate(self.trails) for mark in trail.until(time, here[i])]
 
     def _links(self, time: float) -> list[Mark]:
-        """Links of a team with communication."""
+        """Marks of the communication links, if there are any."""
         if not self.log.link.shape[1]:
             return []
         here, links = self.sample(self.log.position, time), links_of_log(self.log, self.step(time))
@@ -113,7 +113,7 @@ class Stage:
         ]
 
     def _agents(self, time: float) -> list[Mark]:
-        """Halos in the color of the command, their rims in the shield's where it acts, and the references as ghosts."""
+        """Halos in the color of the command, with a rim in the shield's color while it acts, and the references as ghosts."""
         position, reference = (self.sample(v, time) for v in (self.log.position, self.log.reference))
         marks, unit, shielded = [], self.scale, self.shielded(time)
         for i, command in enumerate(self.commands(time)):
@@ -123,13 +123,13 @@ class Stage:
             far = bool(np.hypot(*(reference[i] - position[i])) > radius)
             if far:
                 marks.append(ribbon(position[i], reference[i], 0.1 * unit, 0.12 * unit, agent_color(i), unit))
-            if far or not self.free or self.free[i] is None:  # a robot that is on its reference is not to be hidden by it
+            if far or not self.free or self.free[i] is None:  # a reference must not hide a robot that is on it
                 marks.append(ball(reference[i], GHOST * radius, (*agent_color(i)[:3], 0.45)))
         return marks
 
 
 def make_stage(log: EpisodeLog) -> Stage:
-    """The stage of a log, its obstacles where this episode had them.
+    """The stage of a log, with the obstacles of this episode.
 
     Raises:
         ConfigurationError: the log is empty, or its model does not fit it.
@@ -165,7 +165,7 @@ def make_stage(log: EpisodeLog) -> Stage:
 
 
 def _check_self_contained(mjcf: str) -> None:
-    """Raise ValueError for a model that reads other files, which logs of this package never do, or is larger than theirs."""
+    """Raise ValueError for a model that reads files, loads plugins or replicates elements; models of this package never do."""
     if "<!DOCTYPE" in mjcf or "<!ENTITY" in mjcf:
         raise ValueError("it defines entities")
     for element in ElementTree.fromstring(mjcf).iter():
@@ -176,14 +176,14 @@ def _check_self_contained(mjcf: str) -> None:
 
 
 def restage(stage: Stage, log: EpisodeLog) -> Stage:
-    """The same model and what is drawn with it, showing another log of the same scenario."""
+    """A stage with the same model that shows another log of the same scenario."""
     _place_obstacles(stage.model, stage.data, stage.discs.tolist(), log.obstacles, stage.scale)
     trails = [make_trail(i, log.time, log.position[:, i], stage.scale) for i in range(log.position.shape[1])]
     return replace(stage, log=log, rings=_rings(log, 0.0, stage.scale), trails=trails)
 
 
 def _free_joint(model: mujoco.MjModel, prefix: str) -> int | None:
-    """Address in qpos of an agent's free joint; None where it has slides."""
+    """Address in qpos of an agent's free joint; None if it has slide joints."""
     for j in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
         if model.body(model.jnt_bodyid[j]).name.startswith(prefix):
             return int(model.jnt_qposadr[j])
@@ -191,10 +191,10 @@ def _free_joint(model: mujoco.MjModel, prefix: str) -> int | None:
 
 
 def _slides(model: mujoco.MjModel, prefix: str) -> list[int]:
-    """Addresses in qpos of an agent's slides along x and y.
+    """Addresses in qpos of an agent's slide joints along x and y.
 
     Raises:
-        KeyError: it has none.
+        KeyError: the agent lacks one of them.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -207,10 +207,10 @@ def _slides(model: mujoco.MjModel, prefix: str) -> list[int]:
 
 
 def _size(model: mujoco.MjModel, agents: int) -> tuple[float, list[float]]:
-    """Length unit of the mission and drawn radius of each robot [m], as the assembly left them; 1 and zeros for point masses.
+    """Length unit of the mission and drawn radius of each robot [m], as stored in the model; 1 and zeros for point masses.
 
     Raises:
-        ValueError: neither one radius nor one per agent.
+        ValueError: the model has neither one radius nor one per agent.
     """
     if model.nnumeric == 0:
         return 1.0, [0.0] * agents
@@ -232,30 +232,32 @@ def _place_obstacles(model: mujoco.MjModel, data: mujoco.MjData, discs: list[int
 
 
 def _rings(log: EpisodeLog, time: float, unit: float) -> list[Mark]:
-    """Safe distances around all obstacles at ``time`` [s]."""
+    """Marks of the safe distances around all obstacles at ``time`` [s]."""
     return [mark for obstacle in log.obstacles_at(time) for mark in _zone(obstacle, log.safe_distance, unit)]
 
 
 def _zone(obstacle: np.ndarray, safe_distance: float, unit: float) -> list[Mark]:
-    """Where the clearance to an obstacle (3,) is below the safe distance [m]: a tinted disc in a dashed circle."""
+    """Marks of the area in which the clearance to an obstacle (3,) is below the safe distance: a disc in a dashed circle."""
     center, radius = obstacle[:2], float(obstacle[2]) + safe_distance
     circle = dashed_circle(center, radius, rgba(SAFE_DISTANCE_COLOR), unit)
     return [flat_disc(center, radius, 0.01 * unit, rgba(SAFE_DISTANCE_COLOR, 0.1), unit), *circle]
 
 
 def _enlarge(model: mujoco.MjModel, agent: int, least: float) -> float:
-    """Draw an agent's spheres in its color and no smaller than ``least`` [m], resting on the ground; returns the largest drawn
-    radius [m].
+    """Color an agent's geoms, and enlarge its spheres, which rest on the ground, to a radius of at least ``least`` [m].
+
+    Returns:
+        The largest drawn radius [m].
     """
     largest = least
     for geom in range(model.ngeom):
         if not model.body(model.geom_bodyid[geom]).name.startswith(agent_prefix(agent)):
             continue
-        model.geom_rgba[geom] = agent_color(agent)  # also of logs that were written with other colors
+        model.geom_rgba[geom] = agent_color(agent)  # also for logs that were written with other colors
         size = model.geom_size[geom]
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_SPHERE and size[0] < least:
             model.geom_pos[geom, 2] += least - size[0]
-            model.geom_sameframe[geom] = 0  # or MuJoCo would skip the new position
+            model.geom_sameframe[geom] = 0  # otherwise MuJoCo would ignore the new position
             size[:] = least
         largest = max(largest, float(size[0]))
     return largest

@@ -18,8 +18,8 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import staged_file
 from marlbc_mj.util.text import one_line
 
-LEAST_PIXELS, MOST_PIXELS = 64, 4096  # pixels, either side
-MOST_SAMPLES = 16  # per pixel
+LEAST_PIXELS, MOST_PIXELS = 64, 4096  # limits of width and height [pixels]
+MOST_SAMPLES = 16  # largest number of samples per pixel
 _SIZES = f"size must be two even numbers of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, 1280x720 for example"
 
 
@@ -31,9 +31,9 @@ class VideoStyle:
     fps: int = 30  # frames per second of video
     size: tuple[int, int] = (1280, 720)  # width and height [pixels], even
     camera: str = "track"  # a key of camera.CAMERAS, "agent1" and so on, or a camera of the model
-    start: float | None = None  # first moment of the mission that is shown [s]; None: its beginning
-    end: float | None = None  # last one [s]; None: its end
-    samples: int = 0  # per pixel; 4 smooths edges and takes about twice as long
+    start: float | None = None  # first mission time shown [s]; None: the beginning of the log
+    end: float | None = None  # last mission time shown [s]; None: the end of the log
+    samples: int = 0  # samples per pixel; 4 smooths edges and takes about twice as long
 
 
 def render_video(
@@ -48,16 +48,16 @@ def render_video(
 
     Args:
         log: the episode.
-        path: its ending chooses the format: ``.mp4`` (H.264), or ``.webp`` and ``.gif``, which repeat for ever.
+        path: the file, whose suffix selects the format: ``.mp4`` (H.264), or ``.webp`` and ``.gif``, which repeat forever.
         style: what is shown, and how.
         overwrite: replace an existing file.
-        progress: called after every frame with how many are done and how many there are.
+        progress: called after every frame with the number of frames done and the total number.
 
     Returns:
         The number of frames.
 
     Raises:
-        ConfigurationError: an argument that cannot be used, an existing file without ``overwrite``, or no OpenGL.
+        ConfigurationError: an invalid argument, an existing file without ``overwrite``, or no usable OpenGL.
         SimulationError: the encoder failed.
     """
     path = Path(path)
@@ -76,7 +76,7 @@ def render_video(
 
 
 def _palette(log: EpisodeLog, times: np.ndarray, style: VideoStyle, suffix: str) -> np.ndarray | None:
-    """Colors of an animation, from frames that are spread over it."""
+    """Palette of an animation, from frames that are spread over it; None for an MP4."""
     if suffix.lower() not in COLORS:
         return None
     spread = times[np.unique(np.linspace(0, len(times) - 1, PALETTE_FRAMES).astype(int))]
@@ -87,10 +87,10 @@ def _palette(log: EpisodeLog, times: np.ndarray, style: VideoStyle, suffix: str)
 def render_still(
     log: EpisodeLog, time: float, *, size: tuple[int, int] = (1280, 720), camera: str = "track", samples: int = 4
 ) -> np.ndarray:
-    """(height, width, 3) uint8: the frame that a video shows at ``time`` [s]; ``size`` is width and height.
+    """Frame (height, width, 3) uint8 at ``time`` [s], as in a video but without the speed label; ``size`` is (width, height).
 
     Raises:
-        ConfigurationError: an argument that cannot be used, or no OpenGL.
+        ConfigurationError: an invalid argument, or no usable OpenGL.
     """
     frames = _frames(log, np.array([time]), size, camera=camera, samples=samples, speed=None)
     with closing(frames):
@@ -98,7 +98,7 @@ def render_still(
 
 
 def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None, end: float | None) -> np.ndarray:
-    """(F,) mission time of every frame [s].
+    """Mission time of every frame (F,) [s].
 
     Raises:
         ConfigurationError: a speed or rate that is not positive, or an empty part of the mission.
@@ -119,7 +119,7 @@ def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None,
 def _frames(
     log: EpisodeLog, times: np.ndarray, size: tuple[int, int], *, camera: str, samples: int, speed: float | None
 ) -> Generator[np.ndarray, None, None]:
-    """(height, width, 3) uint8 for every time [s]."""
+    """Draw the frame (height, width, 3) uint8 for every time [s]."""
     _check_size(*size)
     stage = make_stage(log)
     caption = Caption(log, *size, speed, numbers="above" if stage.free else "on" if camera in DISTANT else "inside")
@@ -140,12 +140,12 @@ def _encode(
     progress: Callable[[int, int], None] | None = None,
     palette: np.ndarray | None = None,
 ) -> None:
-    """Hand all pictures to the encoder, and see that it has written them.
+    """Pass all pictures to the encoder, and check that it has written them.
 
     Raises:
-        SimulationError: the encoder failed, for want of room on the disk for example.
+        SimulationError: the encoder failed, for example because the disk is full.
     """
-    first = next(pictures)  # before the encoder starts: what cannot be drawn fails here
+    first = next(pictures)  # before the encoder starts, so that errors in drawing are raised first
     with encoder(path, style.size, style.fps, palette) as add:
         for done, picture in enumerate(chain([first], pictures), 1):
             add(picture)
@@ -157,7 +157,7 @@ def parse_size(text: str) -> tuple[int, int]:
     """Width and height [pixels] from ``1280x720``.
 
     Raises:
-        ConfigurationError: the text is no size, or a video cannot have it.
+        ConfigurationError: the text is not a size, or not a valid size of a video.
     """
     sides = text.lower().split("x")
     if len(sides) != 2 or not all(side.isdecimal() and side.isascii() and len(side) < 6 for side in sides):

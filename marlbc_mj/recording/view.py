@@ -15,8 +15,8 @@ from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.recording.stage import Stage, make_stage
 from marlbc_mj.util.errors import ConfigurationError
 
-REFRESH = 1.0 / 60.0  # [s]
-JUMP = 5.0  # of an arrow key [s]
+REFRESH = 1.0 / 60.0  # time between two frames [s]
+JUMP = 5.0  # mission time that an arrow key skips [s]
 SPACE, RIGHT, LEFT, HOME = 32, 262, 263, 268  # GLFW's key codes
 KEYS = "space pause   left/right 5 s   home restart"
 NO_DISPLAY = "the viewer needs a display; render a file instead with `marlbc video`"
@@ -24,7 +24,7 @@ NO_DISPLAY = "the viewer needs a display; render a file instead with `marlbc vid
 
 @dataclass
 class Playback:
-    """The clock of a viewer: mission time that runs at ``speed``, stops at both ends and obeys keys."""
+    """The clock of a viewer: mission time that runs at ``speed``, stops at both ends and responds to keys."""
 
     first: float  # [s]
     last: float  # [s]
@@ -33,7 +33,7 @@ class Playback:
     paused: bool = False
 
     def advance(self, seconds: float) -> float:
-        """The mission time [s] after ``seconds`` on the wall's clock."""
+        """Advance by ``seconds`` of wall time, unless paused, and return the mission time [s]."""
         if not self.paused:
             self._set(self.time + self.speed * seconds)
         return self.time
@@ -55,7 +55,8 @@ def view(log: EpisodeLog, *, speed: float = 1.0) -> None:
     """Play a log in a window until it is closed; the camera moves along with the team and can be turned.
 
     Args:
-        speed: seconds of the mission per second.
+        log: the episode.
+        speed: seconds of the mission per second of wall time.
 
     Raises:
         ConfigurationError: no display, or a speed that is not positive.
@@ -80,7 +81,7 @@ def view(log: EpisodeLog, *, speed: float = 1.0) -> None:
 
 
 def check_display() -> None:
-    """Make sure that a window can be opened: MuJoCo's viewer would wait forever.
+    """Make sure that a window can be opened; otherwise MuJoCo's viewer would wait forever.
 
     Raises:
         ConfigurationError: there is no display, or it does not answer.
@@ -120,7 +121,7 @@ def _play(handle: Any, stage: Stage, playback: Playback) -> None:
 
 
 def _texts(stage: Stage, time: float) -> list[tuple[int, int, str, str]]:
-    """Time and priorities, and which keys there are."""
+    """Overlay texts: time, priorities, and the available keys."""
     commands = stage.commands(time)
     names = "\n".join(["time", *(f"agent {i + 1}" for i in range(len(commands)))])
     shielded = stage.shielded(time)

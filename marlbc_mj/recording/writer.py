@@ -1,6 +1,6 @@
 """Writing an episode to an MCAP log while it runs, so that a killed run leaves a log that can be recovered.
 
-Metadata and attachments come first, and every chunk holds whole mission steps, so a file torn anywhere is a shorter episode.
+Metadata and attachments come first, and every chunk holds whole mission steps, so a file torn anywhere holds a shorter episode.
 """
 
 import json
@@ -34,34 +34,34 @@ from marlbc_mj.util.locks import is_held, lock
 from marlbc_mj.util.provenance import config_hash, git_revision, plain_data, versions
 
 METADATA = "marlbc"
-"""Name of the metadata record with what :class:`EpisodeLog` needs besides the messages."""
+"""Name of the metadata record with the fields of :class:`EpisodeLog` that are not in messages."""
 VERSIONS = "versions"
 MODEL, CONFIG, LAYOUT = "model.xml", "config.json", "foxglove-layout.json"
 
-_versions = cache(versions)  # reading them from the packages takes as long as a tenth of an episode
+_versions = cache(versions)  # reading them from the packages takes a tenth of the time of an episode
 
 FLUSH_PERIOD = 0.5  # wall time after which a chunk is closed and handed to the operating system [s]
-CHUNK_SIZE = 1024 * 1024  # [bytes]
+CHUNK_SIZE = 1024 * 1024  # size from which on a chunk is closed earlier [bytes]
 
 
 class LogWriter:
     """Writes one episode: ``run_episode(..., on_frame=log.write)`` inside ``with LogWriter(...) as log``.
 
-    While it runs the file is ``PATH.partial``, and what has been written is handed to the operating system every half
-    second: a killed process loses less than a second. A clean end renames it to ``PATH``. After an exception inside the ``with``
-    block the episode is not whole, so the name stays ``PATH.partial``; the file is ended properly, and readable, if the disk
-    allows it.
+    During the run the file is named ``PATH.partial``. Its data are passed to the operating system every half second, so a
+    killed process loses less than a second. When the ``with`` block ends normally, the file is renamed to ``PATH``. After an
+    exception inside the block the episode is incomplete, so the name stays ``PATH.partial``; the file is still closed properly,
+    and readable, if the disk allows it.
 
     Args:
-        path: a name that ends in ``.mcap``; missing folders are made.
+        path: a name that ends in ``.mcap``; missing folders are created.
         scenario: the mission that is flown.
-        controller: the law that drives the agents.
-        names: supervisor's and controller's.
-        seed: which draw of the scenario.
-        config: all settings; attached as JSON, and hashed.
+        controller: the controller of the agents.
+        names: names of supervisor and controller.
+        seed: seed of the scenario's draw.
+        config: all settings, attached as JSON; their hash is part of the metadata.
         overwrite: replace a log, finished or partial, of the same name.
-        plan: of the World that flies; it has the model, and says whether there is a shield, which gets a topic of its own. None:
-            one without a shield is made for the log.
+        plan: plan of the world that runs. It has the model, and a shield in it adds a topic to the log. None: a plan without
+            a shield is made for the log.
 
     Raises:
         ConfigurationError: a path that cannot or must not be written, or a scenario that cannot be assembled.
@@ -99,8 +99,8 @@ class LogWriter:
         self._shielded = plan.shielded
         self._communicating = scenario.communication != IDEAL
         self._steps = 0
-        self._pending = 0  # since the last flush [bytes]
-        self._flushed = monotonic()  # when [s]
+        self._pending = 0  # size of the messages since the last flush [bytes]
+        self._flushed = monotonic()  # time of the last flush [s]
         self._stream = _create(self.path, overwrite)
         lock(self._stream.fileno())
         try:
@@ -112,14 +112,14 @@ class LogWriter:
 
     @property
     def partial(self) -> Path:
-        """Name of the file while it is written."""
+        """Name of the file while it is being written."""
         return partial_name(self.path)
 
     def write(self, frame: Frame) -> None:
         """Append one mission step.
 
         Raises:
-            SimulationError: the disk does not take it.
+            SimulationError: the file cannot be written.
         """
         stamp = round(float(frame.observation.time) * 1e9)
         try:
@@ -135,11 +135,11 @@ class LogWriter:
             raise SimulationError(f"cannot write {self.partial}: {error.strerror}") from error
 
     def close(self) -> None:
-        """End the file and give it its final name; nothing if that has been done.
+        """Finish the file and give it its final name; does nothing if the file is already closed.
 
         Raises:
-            ConfigurationError: meanwhile another file has taken the name.
-            SimulationError: the disk does not take it.
+            ConfigurationError: another file has taken the name in the meantime.
+            SimulationError: the file cannot be written.
         """
         if self._stream.closed:
             return
@@ -160,13 +160,13 @@ class LogWriter:
         if kind is None:
             self.close()
         elif not self._stream.closed:
-            with suppress(OSError):  # the exception under way says more than a full disk would
+            with suppress(OSError):  # the original exception is more informative than one about a full disk
                 self._end()
 
     def _start(self, metadata: dict[str, str], attachments: list[tuple[str, str, bytes]]) -> None:
-        """Header, metadata and attachments, on disk before the first mission step."""
-        # Chunks are zstd by default. When one is closed is decided here: between two messages of a mission step it would tear
-        # that step apart.
+        """Write header, metadata and attachments, before the first mission step."""
+        # Chunks use zstd by default. This class decides when to close a chunk: the library could do so between two messages of
+        # one mission step, which would split the step.
         self._mcap = Writer(self._stream, chunk_size=sys.maxsize, enable_data_crcs=True)
         self._mcap.start(library=f"marlbc_mj {versions()['marlbc-mj']}")
         self._mcap.add_metadata(METADATA, metadata)
@@ -177,7 +177,7 @@ class LogWriter:
         self._mcap.flush()
 
     def _register(self) -> dict[str, int]:
-        """Channel numbers by topic."""
+        """Register all channels, and return their numbers by topic."""
         channels = {}
         for name, message in ((SCENE_TOPIC, SceneUpdate), (TRANSFORMS_TOPIC, FrameTransforms)):
             channels[name] = self._mcap.register_channel(name, "protobuf", register_schema(self._mcap, message))
@@ -222,12 +222,12 @@ class LogWriter:
 
 
 def partial_name(path: Path) -> Path:
-    """Name of a log while it is written."""
+    """Name of a log while it is being written."""
     return path.with_name(path.name + ".partial")
 
 
 def _create(path: Path, overwrite: bool) -> BinaryIO:
-    """Open the partial file of a log that may be written."""
+    """Check that a log may be written, and open its partial file."""
     if path.suffix != ".mcap":
         raise ConfigurationError(f"a log's name must end in .mcap, got {path}")
     partial = partial_name(path)
@@ -270,7 +270,7 @@ def _describe(scenario: Scenario, controller: Controller, draw: Draw) -> dict[st
 
 
 def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list[tuple[str, str, bytes]]:
-    """Name, media type and content."""
+    """Name, media type and content of every attachment."""
     canonical = json.dumps(plain_data(config), sort_keys=True, separators=(",", ":"))  # what config_hash hashes
     return [
         (CONFIG, "application/json", canonical.encode()),
@@ -280,7 +280,7 @@ def _attachments(scenario: Scenario, model: str, config: dict[str, Any]) -> list
 
 
 def _weight_table(state: np.ndarray) -> np.ndarray:
-    """(N, 5) norms of w_f, w_a and w_c, and tau, from controller states (N, S)."""
+    """Norms of w_f, w_a and w_c, and both components of tau, as columns (N, 5) from controller states (N, S)."""
     weights = sorlc.weights(state)
     table = np.empty((len(state), 5))
     for k, matrix in enumerate(weights[:3]):

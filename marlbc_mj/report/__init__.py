@@ -1,4 +1,4 @@
-"""Report: tables, figures and the page, made from the results of a benchmark."""
+"""Reports: the tables, figures and pages made from the results of a benchmark."""
 
 from marlbc_mj.util.matplotlib_folder import prepare_matplotlib
 

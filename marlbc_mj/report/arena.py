@@ -1,4 +1,4 @@
-"""Figure of the paths through the arena, colored by the command in force along the way."""
+"""Figure of the agents' paths through the arena, colored by the active command."""
 
 from collections.abc import Sequence
 
@@ -18,15 +18,15 @@ from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import command_color
 from marlbc_mj.util.stretches import stretches
 
-_MARGIN = (0.16, 0.06)  # left and right, above and below everything that happens: room for the agents' numbers [in]
-_POINT = 0.35  # radius at which a point obstacle is drawn [m]
-_VIOLATION = "#1A1A1A"  # color of the casing of a path in violation
+_MARGIN = (0.16, 0.06)  # horizontal and vertical margin around everything drawn: room for the agents' numbers [in]
+_POINT = 0.35  # least drawn radius of an obstacle [m]
+_VIOLATION = "#1A1A1A"  # color of the casing around parts of a path in violation
 
 
 def trajectories(episodes: Sequence[Trajectory]) -> Figure:
-    """Paths of all agents: one episode over both columns of text, several as panels of one column's width, two per row.
+    """Draw the paths of all agents: one episode spans both text columns, several are panels of one column, two per row.
 
-    The legend is above the panels, or in the last one where their number is odd.
+    The legend is above the panels. If there are several episodes and their number is odd, it fills the empty last panel.
     """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
@@ -58,14 +58,14 @@ def trajectories(episodes: Sequence[Trajectory]) -> Figure:
 
 
 def label_of(episode: Trajectory, episodes: Sequence[Trajectory]) -> str:
-    """What tells an episode from the others of a figure: its supervisor, its controller, or both."""
+    """Label that distinguishes an episode from the others in a figure: its supervisor, its controller, or both."""
     names = [source_of(name).display for name in (episode.supervisor, episode.controller)]
     differ = [len({one.supervisor for one in episodes}) > 1, len({one.controller for one in episodes}) > 1]
     return ", ".join(name for name, kept in zip(names, differ, strict=True) if kept) or ", ".join(names)
 
 
 def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float, float, float]:
-    """x and y limits [m] around every path and every obstacle's ring of the safe distance, for a panel of ``width`` [in]."""
+    """x and y limits [m] that contain every path and every safe-distance ring, for a panel ``width`` [in] wide."""
     points = np.concatenate([e.position.reshape(-1, 2) for e in episodes])
     rings = np.concatenate([_discs(e) for e in episodes])
     reach = rings[:, 2:] + episodes[0].scenario.safe_distance
@@ -77,7 +77,7 @@ def _extent(episodes: Sequence[Trajectory], width: float) -> tuple[float, float,
 
 
 def _discs(episode: Trajectory) -> np.ndarray:
-    """(K, 3) obstacles to draw: moving ones at the place and time at which they are nearest to an agent."""
+    """Obstacles to draw (K, 3); a moving one is placed where it comes nearest to an agent."""
     every = episode.scenario.substeps
     return nearest_places(episode.time[::every], episode.position[:-1:every], episode.obstacles, episode.motions)
 
@@ -113,7 +113,7 @@ def _draw_paths(axes: Axes, episode: Trajectory, width: float) -> None:
 
 
 def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -> None:
-    """A dark casing around those parts of a path that are in violation."""
+    """Draw a dark casing around the parts of a path that violate the safe distance."""
     path = episode.position[1:, agent]
     violated = violates(episode.clearances()[:, agent], episode.scenario.safe_distance)
     every = max(1, episode.scenario.substeps // 2)
@@ -122,7 +122,7 @@ def _draw_violation(axes: Axes, episode: Trajectory, agent: int, width: float) -
 
 
 def _legend(episodes: Sequence[Trajectory]) -> list[Line2D]:
-    """What colors and lines mean."""
+    """Legend entries for the colors and lines."""
     handles = pl.command_handles(episodes[0].scenario.orders.commands)
     commands = {c for e in episodes for c in e.scenario.orders.commands if SEPARATOR in c}
     for handle in handles:

@@ -1,4 +1,4 @@
-"""Everything a benchmark reports, written into its folder."""
+"""Writes the complete report of a benchmark into its folder."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -24,12 +24,12 @@ def write_report(
     """Write summary.json, episodes.csv, tables.md, tables.tex, figures/ and index.html; returns the page's path.
 
     Args:
-        results: one per method.
-        folder: is there already.
-        config: of the run: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``, as config.json has them.
-        videos: in ``folder``; the first one is embedded in the page, the others linked.
-        figures: False leaves the figures out.
-        progress: called with what is being done, how much of it is done and how much there is.
+        results: one result per method.
+        folder: existing output folder.
+        config: content of config.json: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``.
+        videos: video files in ``folder``; the page embeds the first one and links the others.
+        figures: whether to draw the figures.
+        progress: called with the name of the stage, the amount done and the total amount.
     """
     scenario, paragraph = config["scenario"], same_actuator(results)
     tables = make_tables(results, scenario.name)

@@ -1,4 +1,4 @@
-"""Curves over time: priorities, forces, tracking errors and network weights; decimated so that every peak stays."""
+"""Curves over time: priorities, forces, tracking errors and network weights; decimation keeps every peak."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -16,24 +16,24 @@ from marlbc_mj.util.method_names import source_of
 from marlbc_mj.util.palette import METHOD_COLORS, command_color
 from marlbc_mj.util.stretches import stretches
 
-_LANE = 1.25  # distance of two agents' strips, in strip heights
-_SMALLEST_ERROR = 1e-6  # what a logarithmic axis shows of a vanishing error [m or m/s]
+_LANE = 1.25  # distance between the strips of two agents, in strip heights
+_SMALLEST_ERROR = 1e-6  # least lower limit of a logarithmic error axis [m or m/s]
 _ZOOM = 2.0  # width of the window that shows single force pulses [s]
-_PULSE = 1.0  # the same for one pulse [s]
-_AXIS_COLORS = METHOD_COLORS[:2]  # of the x and the y axis, where one agent is shown alone
+_PULSE = 1.0  # width of the window around the largest force [s]
+_AXIS_COLORS = METHOD_COLORS[:2]  # colors of the x and y components in a figure of a single agent
 _FLAT = 1e-9  # relative change below which a weight counts as constant
-_SMALLEST_NORM = 1e-6  # share of the largest below which a norm is not drawn on a logarithmic axis
+_SMALLEST_NORM = 1e-6  # norms below this share of the largest are not drawn on a logarithmic axis
 
 _SMALL: dict[str, Any] = {"textcoords": "offset points", "fontsize": 7, "va": "center_baseline", "annotation_clip": False}
-"""Options of the text beside a strip."""
+"""Options of a small text beside a strip or an axis."""
 
 
 def priorities(episodes: Sequence[Trajectory]) -> Figure:
-    """Each agent's command over time: color and height of a strip show its highest behavior.
+    """Draw each agent's command over time: the color and height of a strip show the highest-priority behavior.
 
-    Below the agents a grey strip shows how many switches the team made in each second. One episode fills one column of text;
-    several are panels, two per row, with one scale for all grey strips. The legend is above them, or in the last panel where
-    their number is odd.
+    A grey strip below the agents shows the team's switches in each second. One episode fills one text column; several are
+    panels, two per row, whose grey strips share one scale. The legend is above the panels. If there are several episodes and
+    their number is odd, it fills the empty last panel.
     """
     columns = 1 if len(episodes) == 1 else 2
     rows = -(-len(episodes) // columns)
@@ -62,21 +62,21 @@ def priorities(episodes: Sequence[Trajectory]) -> Figure:
 
 
 def switch_rate(trajectory: Trajectory) -> np.ndarray:
-    """Switches of all agents in each whole second (S,)."""
+    """Number of switches of all agents in each second of the episode (S,)."""
     step, agents = trajectory.scenario.mission_step, trajectory.scenario.agents
     at = (1 + np.flatnonzero(np.diff(trajectory.command, axis=0).ravel()) // agents) * step
     return np.bincount(at.astype(int), minlength=int(np.ceil(trajectory.scenario.duration)))
 
 
 def _draw_switch_rate(axes: Axes, trajectory: Trajectory, most: int) -> None:
-    """A bar per second below the lowest agent's strip."""
+    """Draw one bar per second below the lowest agent's strip."""
     rate = switch_rate(trajectory)
     axes.bar(np.arange(len(rate)), rate / most, width=1.0, bottom=-_LANE, align="edge", color=pl.GREY, linewidth=0)
     axes.annotate(f"{rate.max()}/s", (1, -_LANE + 0.35), xycoords=("axes fraction", "data"), xytext=(4, 0), **_SMALL)
 
 
 def _label_time(panels: np.ndarray, used: int) -> None:
-    """Label the time axis of the lowest panel in every column, of those that are ``used``."""
+    """Label the time axis of the lowest panel in every column; only the first ``used`` panels count."""
     for column in range(panels.shape[1]):
         axes = panels[(used - 1 - column) // panels.shape[1], column]
         axes.set_xlabel("time [s]")
@@ -110,16 +110,16 @@ def _draw_priorities(axes: Axes, trajectory: Trajectory) -> None:
 
 
 def _rank(trajectory: Trajectory) -> Callable[[str], int]:
-    """Sort key of the strips' heights: formation lowest, then column, then the others, so that avoidance is highest."""
+    """Sort key for the strip heights: formation is lowest, then column, then the others, so that avoidance is highest."""
     known = trajectory.scenario.formation_names
     return lambda head: known.index(head) if head in known else len(known)
 
 
 def forces(trajectory: Trajectory) -> Figure:
-    """The applied force, one row per agent: both axes over the episode, and both in the two seconds in which it changes most.
+    """Draw the applied force, one row per agent: x and y over the episode, and both in the two seconds of largest variation.
 
-    Over the episode, light bands hold every sample and dark lines are means of 500 bins, so that the mean of a
-    chattering force is visible; the limit is dashed.
+    Over the episode, light bands cover every sample and dark lines are the means of up to 500 bins, so that the mean of a
+    chattering force is visible. The limit is dashed.
     """
     agents, limits = trajectory.scenario.agents, trajectory.scenario.force_limits
     margins = pl.Margins(left=0.56, top=0.24, bottom=0.36)
@@ -160,9 +160,10 @@ def busiest(trajectory: Trajectory) -> slice:
 
 
 def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
-    """One agent's force, one column per framework, on one scale: over the episode, and around the largest force of all.
+    """Draw one agent's force, one column per framework: over the episode, and around the largest force of all frameworks.
 
-    The scale is linear up to the limit and logarithmic beyond, so that forces within it and far above it are both visible.
+    All panels share one scale. It is linear up to the limit and logarithmic beyond, so that forces within the limit and far
+    above it are both visible.
     """
     limit = float(episodes[0].scenario.force_limits[agent])
     margins = pl.Margins(left=0.56, right=0.42, top=0.42, across=0.24, between=0.42)
@@ -192,13 +193,13 @@ def control(episodes: Sequence[Trajectory], agent: int) -> Figure:
 
 
 def _force_ticks(limit: float, reach: float) -> list[float]:
-    """0, the limit, and its tenfolds up to ``reach``, both signs."""
+    """Tick positions: 0, and the limit times powers of ten up to ``reach``, with both signs."""
     sizes = [limit * 10.0**k for k in range(1 + int(np.log10(reach / limit)))]
     return [-size for size in reversed(sizes)] + [0.0, *sizes]
 
 
 def _draw_both_axes(axes: Axes, episode: Trajectory, agent: int, shown: np.ndarray) -> None:
-    """Both axes of the force where ``shown`` (T,) is true, and the limit."""
+    """Draw both components of the force at the samples that ``shown`` (T,) selects, and the limit."""
     time, force = episode.time[shown], episode.force[shown, agent]
     for axis in range(2):
         axes.plot(*pl.envelope(time, force[:, axis]), color=_AXIS_COLORS[axis], linewidth=0.8, label=f"$u_{'xy'[axis]}$")
@@ -209,7 +210,7 @@ def _draw_both_axes(axes: Axes, episode: Trajectory, agent: int, shown: np.ndarr
 
 
 def errors(trajectory: Trajectory) -> Figure:
-    """Tracking errors of every agent on logarithmic axes, cut off where they vanish; decimated to the largest of each bin."""
+    """Draw every agent's tracking errors, each bin's largest value, on logarithmic axes that cut off vanishing errors."""
     figure, panels = pl.panels(pl.SINGLE, 3.1, 2, 1, pl.Margins(left=0.56, between=0.12), sharex=True)
     pairs = (
         (trajectory.position[:-1] - trajectory.reference, r"$\|e_p\|$ [m]"),
@@ -232,18 +233,18 @@ def weight_norms(trajectory: Trajectory) -> Figure:
     """Frobenius norms of SORLC's weight matrices over time.
 
     Raises:
-        ValueError: the controller's state is not SORLC's.
+        ValueError: the controller is not SORLC with networks.
     """
     return _weight_figure(trajectory, lambda matrix: matrix, r"$\|\omega_{}\|_F$")
 
 
 def weight_errors(trajectory: Trajectory) -> Figure:
-    """Frobenius norms of the distance of SORLC's weights from their values at the end.
+    """Frobenius norms of the differences between SORLC's weights and their final values.
 
-    The publication subtracts ideal weights instead, which are unknown.
+    The publication subtracts the ideal weights instead, which are unknown.
 
     Raises:
-        ValueError: the controller's state is not SORLC's.
+        ValueError: the controller is not SORLC with networks.
     """
     return _weight_figure(trajectory, lambda matrix: matrix - matrix[-1], r"$\|\omega_{0} - \omega_{0}(T)\|_F$")
 
@@ -265,7 +266,7 @@ def _weight_figure(trajectory: Trajectory, change: Callable[[np.ndarray], np.nda
 
 
 def _scale_norms(axes: Axes, time: np.ndarray, norms: np.ndarray) -> None:
-    """Axes that show what changes: the part of the episode in which it does, and a logarithm where it spans decades."""
+    """Limit the axes to the part of the episode in which the norms change; use a log scale if they span decades."""
     last = norms[-1] if norms[-1].max() > 1e-12 * norms.max() else np.zeros_like(norms[-1])
     moving = np.flatnonzero((np.abs(norms - last) > 1e-3 * np.abs(norms - last).max()).any(axis=1))
     end = time[min(len(time) - 1, int(1.1 * moving[-1]) + 1)] if len(moving) else time[-1]
@@ -281,7 +282,7 @@ def _scale_norms(axes: Axes, time: np.ndarray, norms: np.ndarray) -> None:
 
 
 def _name_hidden(axes: Axes, hidden: np.ndarray, least: float) -> None:
-    """Say which agents (N,) are below the axis throughout."""
+    """Name the agents that are below the axis throughout; ``hidden`` is (N,) bool."""
     agents = [str(i + 1) for i in np.flatnonzero(hidden)]
     if agents:
         text = f"{'agents' if len(agents) > 1 else 'agent'} {', '.join(agents)}: < {least:.0e}"
@@ -289,10 +290,10 @@ def _name_hidden(axes: Axes, hidden: np.ndarray, least: float) -> None:
 
 
 def network_weights(trajectory: Trajectory) -> Weights:
-    """The weight matrices (M, N, 12, 2) at the start of every mission step.
+    """SORLC's weight matrices (M, N, 12, 2) at the start of every mission step.
 
     Raises:
-        ValueError: the controller's state is not SORLC's.
+        ValueError: the controller is not SORLC with networks.
     """
     if not has_weights(trajectory):
         raise ValueError(f"controller {trajectory.controller!r} has no network weights")
@@ -300,13 +301,13 @@ def network_weights(trajectory: Trajectory) -> Weights:
 
 
 def has_weights(trajectory: Trajectory) -> bool:
-    """Whether this controller's state is that of SORLC with networks."""
+    """Whether the controller is SORLC with networks, so that its state contains their weights."""
     name, state = trajectory.controller, trajectory.controller_state
     return name.startswith("sorlc") and name != "sorlc-off" and state.shape[-1] == STATE.size
 
 
 def flat_after(trajectory: Trajectory) -> float:
-    """Time from which on neither actor nor critic changes beyond rounding [s]; about the duration if they never stop."""
+    """Time after which the actor and critic weights are constant up to rounding [s]; about the duration if they never settle."""
     read, last = network_weights(trajectory), 0
     for matrix in (read.actor, read.critic):
         norms = np.linalg.norm(matrix, axis=(-2, -1))

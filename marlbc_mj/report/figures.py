@@ -1,4 +1,4 @@
-"""The figures that a run allows, numbered as in the paper where it has them, and how they are written."""
+"""The figures of a run, with the paper's numbers where it has them, and the functions that write them."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -52,20 +52,21 @@ _CONTROL = (
 
 
 class Plot(NamedTuple):
-    """One figure: its file without suffix, what it shows, how it is drawn, and the method that it belongs to."""
+    """One figure: file name without suffix, caption, drawing function, and the method that it belongs to, if any."""
 
     stem: str
     caption: str
     draw: Callable[[], Figure]
     method: str | None = None
-    narrow: bool = False  # one column of text
+    narrow: bool = False  # whether it fills only one text column
 
 
 def plots(results: Sequence[Result]) -> list[Plot]:
-    """Every figure that these results allow: the paper's, the comparison, then those of each method.
+    """All figures that these results allow: the paper's figures, the comparison, then the figures of each method.
 
-    Only on the paper's own scenario do captions have its numbers. Paths and priorities belong to a supervisor and are drawn once
-    for each, with SORLC where it ran. Tracking errors and forces are drawn for every method, weights where they keep changing.
+    Captions have the paper's figure numbers only on the paper's own scenario. Paths and priorities are drawn once per
+    supervisor, with SORLC if it ran. Tracking errors and forces are drawn for every method, and weights if they still change
+    in the second half of the episode.
     """
     ran = [result for result in results if result.metrics is not None]
     found = _paper(ran) + _comparison(ran) + _methods(ran)
@@ -80,7 +81,7 @@ def _without_number(caption: str) -> str:
 
 
 def _paper(results: Sequence[Result]) -> list[Plot]:
-    """Figures 2 to 9; those of one method only where that method ran, those of several with the ones that did."""
+    """Figures 2 to 9. A figure of one method needs that method's run; a comparison shows the methods that ran."""
     supervisors = [r.trajectory for r in one_per_supervisor(results).values() if r.trajectory]
     under, supervisor = one_per_controller(results)
     laws = {name: r.trajectory for name, r in under.items() if r.trajectory}
@@ -88,7 +89,7 @@ def _paper(results: Sequence[Result]) -> list[Plot]:
 
 
 def _supervisor_figures(episodes: Sequence[Trajectory]) -> list[Plot]:
-    """Figures 2 and 3, if there is something to compare."""
+    """Figures 2 and 3, if at least two supervisors ran."""
     if len(episodes) < 2:
         return []
     paths = f"Figure 2: paths under each supervisor, {_PATHS}"
@@ -119,7 +120,7 @@ def _controller_figures(laws: Mapping[str, Trajectory], supervisor: str) -> list
 
 
 def _framework_figures(laws: Mapping[str, Trajectory]) -> list[Plot]:
-    """Figures 8 and 9, if there is something to compare."""
+    """Figures 8 and 9, if at least two frameworks ran."""
     three = [laws[name] for name in FRAMEWORKS if name in laws]
     if len(three) < 2:
         return []
@@ -164,7 +165,7 @@ def _method(result: Result, trajectory: Trajectory, supervisor: bool) -> list[Pl
 
 
 def weights_caption(trajectory: Trajectory) -> str:
-    """The caption of a figure of weights, which says from when on they no longer change."""
+    """Caption of a figure of weights; it states when they stop changing, if that is in the first half of the episode."""
     text, flat = "Frobenius norms of the network weights.", flat_after(trajectory)
     if flat >= 0.5 * trajectory.scenario.duration:
         return text
@@ -178,7 +179,7 @@ def write_figures(results: Sequence[Result], folder: Path, progress: Callable[[i
     """Draw every figure and write it as PDF and PNG (300 dpi).
 
     Args:
-        progress: called with the number of figures done and of all of them.
+        progress: called with the number of figures done and the total number.
     """
     folder.mkdir(parents=True, exist_ok=True)
     jobs = plots(results)
@@ -191,7 +192,7 @@ def write_figures(results: Sequence[Result], folder: Path, progress: Callable[[i
 
 
 def save_figure(draw: Callable[[], Figure], stem: Path) -> list[Path]:
-    """Draw a figure in the common style and write ``stem``.pdf and .png; the same figure gives the same bytes."""
+    """Draw a figure in the common style and write ``stem``.pdf and ``stem``.png; equal figures give identical files."""
     paths = [stem.with_name(stem.name + suffix) for suffix in (".pdf", ".png")]
     with pl.style():
         figure = draw()

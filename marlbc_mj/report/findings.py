@@ -30,17 +30,17 @@ class Claim(NamedTuple):
 
     table: int
     quantity: str
-    lower: str  # our names
-    higher: str
-    holds: tuple[int, ...]
-    differs: tuple[int, ...]
+    lower: str  # our name of the method with the smaller published value
+    higher: str  # our name of the other method
+    holds: tuple[int, ...]  # agents, from 1
+    differs: tuple[int, ...]  # agents, from 1
 
 
 def claims(results: Sequence[Result]) -> list[Claim]:
-    """Every published order among methods of this run that have a number.
+    """Every published order of two methods that both have results in this run.
 
-    Those of Table 4 are left out: decision times depend on the machine and on the hour, and a count of reproduced orders must
-    not. That table stands beside the published one, see :func:`~marlbc_mj.report.paper_tables.decision_time`.
+    Table 4 is left out: decision times depend on the machine and its load, and the number of reproduced orders must not.
+    :func:`~marlbc_mj.report.paper_tables.decision_time` shows our times beside the published ones.
     """
     supervisors, (controllers, _) = paper_tables.one_per_supervisor(results), paper_tables.one_per_controller(results)
     found = _claims(supervisors, paper_tables.SWITCHES)
@@ -58,7 +58,7 @@ def _claims(chosen: Mapping[str, Result], quantity: Quantity) -> list[Claim]:
 
 
 def _pairs(table: int, label: str, ours: Mapping[str, Sequence[float]], source: Mapping[str, Sequence[float]]) -> list[Claim]:
-    """Both orders of a pair where the published one differs between agents; published ties make none."""
+    """Claims on every pair of methods: two if the published order differs between agents; published ties give none."""
     found = []
     for a, b in combinations([name for name in source if name in ours], 2):
         for low, high in ((a, b), (b, a)):
@@ -71,7 +71,7 @@ def _pairs(table: int, label: str, ours: Mapping[str, Sequence[float]], source: 
 
 
 def orderings(results: Sequence[Result]) -> Table | None:
-    """The published orders one by one; None where no two published methods ran."""
+    """Table of the published orders, one per row; None if no two published methods ran."""
     found = claims(results)
     if not found:
         return None
@@ -99,7 +99,7 @@ def _agents(agents: tuple[int, ...]) -> str:
 
 
 def same_actuator(results: Sequence[Result]) -> str:
-    """One paragraph: what the rivals cost with SORLC's actuator, and LQR; empty where SORLC or the rivals did not run."""
+    """One paragraph on the costs of LQR and of baselines with SORLC's actuator; empty if SORLC or these baselines did not run."""
     chosen, supervisor = paper_tables.one_per_controller(results)
     costs = {name: SCORES["cost_integral_sum"].read(r.metrics) for name, r in chosen.items() if r.metrics}
     limited = {n.removesuffix(LIMITED): costs[n] for n in costs if n.endswith(LIMITED) and not n.startswith("lqr")}
@@ -113,7 +113,7 @@ def same_actuator(results: Sequence[Result]) -> str:
 
 
 def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
-    """Which rivals are cheaper than SORLC with the same actuator, and which are not."""
+    """Sentences on which baselines are cheaper than SORLC with the same actuator, and which are not."""
     limit = next(iter(chosen.values())).trajectory
     force = "same actuator" if limit is None else f"same actuator of {limit.scenario.force_limit:g} N"
     said = {name: f"{display_name(name)} {grouped(cost)} ({cost / ours:.2f} times)" for name, cost in limited.items()}
@@ -127,7 +127,7 @@ def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: fl
 
 
 def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float) -> str:
-    """Cost and safety of LQR."""
+    """Sentence on the cost and safety of LQR; empty if it did not run."""
     metrics = chosen["lqr"].metrics if "lqr" in chosen else None
     if metrics is None:
         return ""
@@ -138,7 +138,7 @@ def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float
 
 
 def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: float) -> str:
-    """Whether the published conclusion still holds for the published rivals."""
+    """Sentences on whether the published conclusion still holds for the published baselines."""
     rivals = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
     reversed_for = [name for name in rivals if limited[name] < ours < costs[name]]
     before = [name for name in rivals if limited[name] < ours and costs[name] <= ours]
@@ -160,7 +160,7 @@ def _count(chosen: Mapping[str, Result]) -> str:
 
 
 def oracle_gap(results: Sequence[Result]) -> Table | None:
-    """How far every method's return is from the oracle's with the same controller; None without an oracle that ran."""
+    """Table of the gap between every method's return and the oracle's with the same controller; None if no oracle ran."""
     best = {r.controller: r.metrics["team"]["return"] for r in results if r.supervisor == "oracle" and r.metrics}
     rows = [_gap_row(r, best[r.controller]) for r in results if r.controller in best and r.supervisor != "oracle"]
     if not rows:
@@ -182,7 +182,7 @@ def oracle_gap(results: Sequence[Result]) -> Table | None:
 
 
 def _gap_row(result: Result, top: float) -> tuple[str, ...]:
-    """A method beside the oracle's return ``top``."""
+    """Row of one method, with the gap to the oracle's return ``top``."""
     metrics = result.metrics
     if metrics is None:
         return (result.display, FAILED, DASH, DASH, DASH)
@@ -192,7 +192,7 @@ def _gap_row(result: Result, top: float) -> tuple[str, ...]:
 
 
 def convergence(results: Sequence[Result]) -> Table | None:
-    """How fast the velocity error of SORLC and RLC decays at the start; None where neither ran."""
+    """Table of the time in which the initial velocity error of SORLC and RLC decays; None if neither ran."""
     chosen, supervisor = paper_tables.one_per_controller(results)
     published = paper_values.PUBLISHED_CONVERGENCE
     times = {n: convergence_time(r.trajectory) for n, r in chosen.items() if n in published and r.trajectory}
@@ -216,7 +216,7 @@ def convergence(results: Sequence[Result]) -> Table | None:
 
 
 def predictions(results: Sequence[Result]) -> Table | None:
-    """MPCMS by its prediction; None unless two of its kinds ran with one controller."""
+    """Table of the MPCMS variants, which differ in their prediction; None unless at least two of them ran."""
     kinds = [r for r in results if r.supervisor.startswith("mpcms") and r.metrics]
     if len({r.supervisor for r in kinds}) < 2:
         return None

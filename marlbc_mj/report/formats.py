@@ -1,4 +1,4 @@
-"""Numbers and text as every table shows them."""
+"""Formatting of numbers and text in all tables."""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ FAILED = "failed"
 
 
 def score_column(name: str) -> Column:
-    """The column of a score: quantity, aggregation and unit."""
+    """Column header of a score: quantity, aggregation and unit."""
     return Column(*SCORES[name][:3])
 
 
@@ -30,7 +30,7 @@ def score_interval(name: str, estimate: Estimate) -> str:
 
 
 def fixed(value: float, digits: int) -> str:
-    """A number with this many decimals and a true minus sign; a dash where it is not finite."""
+    """A number with this many decimals and a true minus sign; a dash if it is not finite."""
     return f"{value:.{digits}f}".replace("-", "−") if math.isfinite(value) else DASH
 
 
@@ -43,12 +43,12 @@ def significant(value: float, digits: int = 3) -> str:
 
 
 def grouped(value: float) -> str:
-    """A whole number with spaces between thousands."""
+    """A number rounded to an integer, with spaces between thousands."""
     return f"{value:,.0f}".replace(",", " ").replace("-", "−")
 
 
 def interval(estimate: Estimate, digits: int) -> str:
-    """``value [low, high]``; a dash where no run finished, no interval for a single run."""
+    """``value [low, high]``; a dash if no run finished, and no interval for a single run."""
     if not math.isfinite(estimate.value):
         return DASH
     value, low, high = (fixed(number, digits) for number in estimate)
@@ -69,12 +69,12 @@ def scaled(estimate: Estimate, factor: float) -> Estimate:
 
 
 def percent(estimate: Estimate) -> Estimate:
-    """A share in per cent."""
+    """An estimated share in percent."""
     return scaled(estimate, 100.0)
 
 
 def spans(numbers: Sequence[int]) -> str:
-    """Whole numbers, three and more in a row as a span: ``0, 2 to 4, 6, 7``."""
+    """Integers as text, with three or more consecutive ones as a span: ``0, 2 to 4, 6, 7``."""
     numbers = sorted(numbers)
     starts = [k for k, n in enumerate(numbers) if k == 0 or n != numbers[k - 1] + 1]
     pieces = [numbers[a:b] for a, b in zip(starts, [*starts[1:], len(numbers)], strict=True)]
@@ -82,5 +82,5 @@ def spans(numbers: Sequence[int]) -> str:
 
 
 def listed(names: list[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Names joined as ``a``, ``a and b`` or ``a, b and c``."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""

@@ -1,4 +1,4 @@
-"""leaderboard.html and leaderboard.tex: supervisors and controllers of the suite, ranked, in tables of their own."""
+"""leaderboard.html and leaderboard.tex: separate rankings of the suite's supervisors and controllers."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -20,9 +20,9 @@ from marlbc_mj.util.method_names import display_name
 
 LEADERBOARD_PAGE, LEADERBOARD_TEX = "leaderboard.html", "leaderboard.tex"
 SUPERVISOR_REFERENCE = "fsams-hysteresis"
-"""The supervisor that the chance of improvement is measured against, under the null-space composition."""
+"""The supervisor against which the probability of improvement is measured, with the null-space composition."""
 CONTROL_REFERENCE = "sorlc"
-"""The controller that the chance of improvement is measured against."""
+"""The controller against which the probability of improvement is measured."""
 CONTROL = "control"
 """The track that compares controllers."""
 _REFERENCE_NOTE = (
@@ -30,9 +30,9 @@ _REFERENCE_NOTE = (
     "begun because the method refuses the mission, counts as violated, struck and collided, too."
 )
 LEADING = 3
-"""Columns that every table begins with; in text they have their intervals."""
+"""Number of columns that every table begins with; in text, only these show their intervals."""
 MOST_COLUMNS = 12
-"""Columns of a table that still fits a printed page."""
+"""Largest number of columns that fits a printed page."""
 
 
 class Board(NamedTuple):
@@ -45,7 +45,7 @@ class Board(NamedTuple):
     rows: tuple[BoardRow, ...]
 
     def table(self) -> Table:
-        """The same as text, for LaTeX and the terminal; success on single missions is left out where it would not fit."""
+        """The board as a text table for LaTeX and the terminal; success on single missions is left out if it would not fit."""
         wide = len(self.columns) > MOST_COLUMNS
         kept = [k for k, column in enumerate(self.columns) if not (wide and column.mission)]
         heads = (Column("", "method"), *(Column("", self.columns[k].text) for k in kept))
@@ -54,12 +54,12 @@ class Board(NamedTuple):
 
 
 class Failure(NamedTuple):
-    """Why runs of a method failed on a mission."""
+    """One reason why runs of a method failed on a mission."""
 
     mission: str
     reason: str
-    runs: int
-    of: int
+    runs: int  # number of runs that failed for this reason
+    of: int  # total number of runs
 
 
 class Look(NamedTuple):
@@ -69,8 +69,8 @@ class Look(NamedTuple):
     kind: str  # ``worst`` or ``median``
     mission: str
     seed: int
-    ended: str  # in words
-    clip: str  # its address; empty: not rendered
+    ended: str  # outcome in words
+    clip: str  # path of the video; empty: not rendered
 
 
 class Detail(NamedTuple):
@@ -88,10 +88,10 @@ def write_leaderboard(
     """Write the page and the LaTeX tables; returns the tables.
 
     Args:
-        groups: every method on every mission that it flew.
-        facts: where the rows come from, as suite.json has them.
-        tracks: one line about every track, by name, in the order in which they are shown.
-        folder: where the files go, and where clips are looked for.
+        groups: the runs of every method on every mission that it flew.
+        facts: content of suite.json on the origin of the rows.
+        tracks: one-line description of every track by name, in display order.
+        folder: output folder, which is also searched for clips.
     """
     boards = make_boards(groups, tracks)
     text = render(
@@ -113,7 +113,7 @@ def write_leaderboard(
 
 
 def leading_tables(tables: Sequence[Table]) -> list[Table]:
-    """What a terminal shows: supervisors over all tracks, and controllers; all where there is neither."""
+    """Tables for the terminal: supervisors over all tracks, and controllers; all tables if there is neither."""
     shown = [table for table in tables if table.name in ("board-supervisors", "board-controllers")]
     return shown or list(tables)
 
@@ -134,7 +134,7 @@ def _share(kind: str) -> Callable[[Standing], Estimate]:
 
 
 def _median(name: str) -> Callable[[Standing], Estimate]:
-    """Mean over missions of a median, without an interval; missions on which no run finished are left out."""
+    """Read the mean over missions of a score's median, without an interval; missions on which no run finished are left out."""
 
     def read(standing: Standing) -> Estimate:
         columns = [finished(each, name) for each in standing.flown.values()]
@@ -145,7 +145,7 @@ def _median(name: str) -> Callable[[Standing], Estimate]:
 
 
 def _leading(count: int) -> list[BoardColumn]:
-    """What every table begins with."""
+    """The columns that every table begins with."""
     return [
         BoardColumn("mean rank", lambda standing: standing.rank, 2, -1, (1.0, max(2.0, float(count)))),
         BoardColumn("better than reference", lambda standing: percent(standing.improvement), 0, 1, (0.0, 100.0), unit="%"),
@@ -164,7 +164,7 @@ _SAFETY_AND_COST = (
 
 
 def _overall_board(flown: Mapping[str, Sequence[MissionRuns]]) -> Board:
-    """Supervisors over all tracks, whatever law flies each; every track has the same weight."""
+    """Supervisors over all tracks, regardless of the controller; every track has the same weight."""
     pooled = {name: [_without_controller(each) for each in own] for name, own in flown.items()}
     standings = rank_methods([each for own in pooled.values() for each in own], Method(SUPERVISOR_REFERENCE, ""), by_track=True)
     tracks = {name: {s.method: s for s in rank_methods(own)} for name, own in pooled.items()}
@@ -182,7 +182,7 @@ def _without_controller(each: MissionRuns) -> MissionRuns:
 
 
 def _on_track(own: Mapping[Method, Standing]) -> Callable[[Standing], Estimate]:
-    """The success on one track of a method."""
+    """Read a method's success on one track."""
     nothing = Estimate(np.nan, np.nan, np.nan)
     return lambda standing: percent(own[standing.method].shares["success"]) if standing.method in own else nothing
 
@@ -227,7 +227,7 @@ def _words(name: Name) -> str:
 
 
 def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What the page says of the suite and of its rows, by name."""
+    """Facts about the suite and its rows for the page, by name."""
     seeds = {run.seed for each in groups for run in each.runs}
     beside = facts.get("beside", ())
     return [
@@ -243,7 +243,7 @@ def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list
 
 
 def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[tuple[str, str]]:
-    """Every track with its missions, and of how many layouts of each there are rows."""
+    """Every track with its missions, each with the number of layouts that have rows."""
     counts: dict[tuple[str, str], int] = {}
     for each in groups:
         key = each.track, each.mission
@@ -255,7 +255,7 @@ def _missions(groups: Sequence[MissionRuns], tracks: Mapping[str, str]) -> list[
 
 
 def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
-    """Failures and layouts worth watching, method by method."""
+    """Failures and layouts worth watching of each method."""
     notable = notable_layouts(groups)
     details = []
     for method in dict.fromkeys(each.method for each in groups):

@@ -12,7 +12,7 @@ from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS
 from marlbc_mj.util.method_names import source_of
 
 WIDTH = 64
-"""Of the drawing of an interval [CSS pixels]."""
+"""Width of the drawing of an interval [CSS pixels]."""
 
 
 class IntervalMark(NamedTuple):
@@ -24,52 +24,52 @@ class IntervalMark(NamedTuple):
 
 
 class BoardCell(NamedTuple):
-    """One number of one method."""
+    """One cell: a number of one method."""
 
     text: str
-    sort: float  # what the column is sorted by; NaN comes last
-    ends: str = ""  # the interval in words
+    sort: float  # sort key; NaN comes last
+    ends: str = ""  # the interval as text
     mark: IntervalMark | None = None
     best: bool = False
-    level: bool = False  # not significantly behind the best
+    level: bool = False  # success on this mission is not significantly below the best
 
 
 class Name(NamedTuple):
-    """A method in words."""
+    """Texts that describe a method."""
 
     display: str
     citation: str
     facts: str  # composition and shield
-    key: str  # in files
+    key: str  # the method's name in files
 
 
 class BoardRow(NamedTuple):
-    """One method."""
+    """The row of one method."""
 
     name: Name
-    place: str  # by mean rank; a dash where it did not fly everything
+    place: str  # position by mean rank; a dash if the method did not fly every mission
     cells: tuple[BoardCell, ...]
 
 
 class BoardColumn(NamedTuple):
-    """What a column shows of a standing."""
+    """One column: its heading, and how to read and show its value of a standing."""
 
     head: str
     read: Callable[[Standing], Estimate]
     digits: int | None = None  # decimals; None: three significant digits
     better: int = 1  # 1: larger is better, -1: smaller is, 0: neither
-    span: tuple[float, float] | None = None  # of the drawing; None: no drawing
-    mission: str = ""  # of a column that shows the success on one mission
+    span: tuple[float, float] | None = None  # range of values in the drawing; None: no drawing
+    mission: str = ""  # the mission, if the column shows the success on a single one
     unit: str = ""
 
     @property
     def text(self) -> str:
-        """The head with its unit."""
+        """The heading with its unit."""
         return self.head + (f" [{self.unit}]" if self.unit else "")
 
 
 def shown_name(method: Method, *, by_controller: bool = False) -> Name:
-    """The supervisor's name, or the controller's."""
+    """Texts of a method under its supervisor's name, or under its controller's."""
     source = source_of(method.controller if by_controller else method.supervisor)
     composition = OWN if method.supervisor in VELOCITY_GIVERS else method.composition
     facts = [*([] if by_controller else [composition]), *(["shield"] if method.shield else [])]
@@ -79,11 +79,11 @@ def shown_name(method: Method, *, by_controller: bool = False) -> Name:
 def board_rows(
     standings: Sequence[Standing], columns: Sequence[BoardColumn], *, by_controller: bool = False
 ) -> tuple[BoardRow, ...]:
-    """All rows, in the order of the standings; the best of each column is marked."""
+    """All rows, in the order of the standings; the best of a column is marked if fewer than half of the methods share it."""
     grid = [[_cell(column, standing) for column in columns] for standing in standings]
     for k, column in enumerate(columns):
         values = [column.better * row[k].sort for row in grid if not math.isnan(row[k].sort)]
-        if column.better and 2 * values.count(max(values, default=0.0)) < len(values):  # the best of few, not one of many
+        if column.better and 2 * values.count(max(values, default=0.0)) < len(values):  # only if few share the best
             for row in grid:
                 row[k] = row[k]._replace(best=column.better * row[k].sort == max(values))
     places = [str(k) if not math.isnan(standing.rank.value) else DASH for k, standing in enumerate(standings, 1)]

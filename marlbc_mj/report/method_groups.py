@@ -1,4 +1,4 @@
-"""How methods are shown: supervisors that have one controller in a table, controllers under one supervisor in another."""
+"""Grouping of methods for tables: supervisors that share a controller, and controllers that share a supervisor."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ MethodT = TypeVar("MethodT")
 
 @dataclass(frozen=True)
 class MethodGroup(Generic[MethodT]):
-    """Methods that differ in one of their two parts."""
+    """Methods that share one of their two parts, supervisor or controller, and differ in the other."""
 
-    kind: str  # "supervisor" or "controller": what they differ in
-    other: str  # the name of the part that all of them have
-    rows: tuple[tuple[str, MethodT], ...]  # what each differs in, as people read it, and the method
+    kind: str  # "supervisor" or "controller": the part in which they differ
+    other: str  # name of the shared part
+    rows: tuple[tuple[str, MethodT], ...]  # display name of the differing part, and the method
 
     @property
     def words(self) -> str:
@@ -24,16 +24,16 @@ class MethodGroup(Generic[MethodT]):
 
     @property
     def suffix(self) -> str:
-        """For names of tables."""
+        """Suffix of table names."""
         return f"{self.kind}s-{short_name(self.other)}"
 
 
 def method_groups(items: Sequence[MethodT], names: Callable[[MethodT], tuple[str, str]]) -> list[MethodGroup[MethodT]]:
-    """Supervisors by the controller that they have; then controllers by their supervisor, where that shows what is not shown yet.
+    """Group supervisors by controller, then controllers by supervisor where that adds methods not shown yet.
 
     Args:
-        items: one per method.
-        names: supervisor and controller of an item.
+        items: one item per method.
+        names: returns the names of an item's supervisor and controller.
     """
     named = [(*names(item), item) for item in items]
     groups = [

@@ -1,4 +1,4 @@
-"""index.html: the whole report as one page that needs no other file and no network."""
+"""index.html: the whole report as one self-contained page that needs no network."""
 
 import base64
 import io
@@ -22,9 +22,9 @@ from marlbc_mj.results.summary import Result
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.titles import mission_title, robots_title
 
-LARGEST_VIDEO = 20_000_000  # beyond this the page links to it [bytes]
+LARGEST_VIDEO = 20_000_000  # from this size on the page links to a video instead of embedding it [bytes]
 POSTER_AT = 0.57
-"""Share of a video at which its poster is taken: in the gate of the case study."""
+"""Position of the poster frame, as a share of the video: in the case study, the team is in the gate."""
 _SINGLE_PIXELS = 1200  # PNGs narrower than this fill one column only
 
 
@@ -35,7 +35,7 @@ class Picture(NamedTuple):
     width: int  # [CSS pixels]
     height: int  # [CSS pixels]
     source: str  # data URL
-    narrow: bool  # one column of text
+    narrow: bool  # whether it fills only one text column
 
 
 class Link(NamedTuple):
@@ -46,16 +46,16 @@ class Link(NamedTuple):
 
 
 class EmbeddedVideo(NamedTuple):
-    """An mp4: its data URL, or for a large one a link."""
+    """An MP4: its data URL, or only a link if it is large."""
 
-    source: str
-    poster: str  # data URL of a frame, shown until it is played; empty: none
+    source: str  # data URL; empty: link only
+    poster: str  # data URL of the frame shown before playback; empty: none
     link: Link
     megabytes: int
 
 
 class MethodSection(NamedTuple):
-    """A folding section of one method."""
+    """A collapsible section of one method."""
 
     name: str
     facts: str
@@ -80,14 +80,14 @@ def write_benchmark_page(
 
     Args:
         path: the file to write.
-        results: in the order in which methods are shown.
-        config: of the run: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``.
-        tables: as :func:`marlbc_mj.report.tables.make_tables` gives them, those of all metrics first.
-        figures: folder that :func:`marlbc_mj.report.figures.write_figures` wrote to; figures that are not there are left out.
+        results: one result per method, in display order.
+        config: content of config.json: ``scenario``, ``versions``, ``git_revision``, ``seed`` and ``command``.
+        tables: result of :func:`marlbc_mj.report.tables.make_tables`, which puts the tables of all metrics first.
+        figures: folder that :func:`marlbc_mj.report.figures.write_figures` wrote to; missing figures are left out.
         paragraph: plain text, shown above the tables.
-        video: an mp4 to embed, or to link to beyond 20 MB.
+        video: an MP4 to embed, or to link to from 20 MB on.
         links: files to list, linked relative to the page.
-        awaited: how many methods there will be, for a page that is written before all have ended; 0: these are all.
+        awaited: total number of methods, for a page that is written before all have ended; 0: the results are complete.
     """
     scenario, drawn = config["scenario"], plots(results)
     failed = [(result.display, str(result.failure)) for result in results if result.metrics is None]
@@ -119,7 +119,7 @@ def write_benchmark_page(
 
 
 def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -> Path:
-    """Fill a template that extends page.html and write it; the citation, the errata and the links are added to ``values``."""
+    """Fill a template that extends page.html, and write it; ``values`` are completed with citation, errata and links."""
     text = render(
         template,
         links=[_link(link, path.parent) for link in links],
@@ -144,13 +144,13 @@ def scenario_facts(scenario: Scenario) -> list[tuple[str, str]]:
 
 
 def origin_facts(config: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Where the numbers come from, by name; ``config`` has ``git_revision`` and ``versions``."""
+    """Facts about the origin of the numbers, by name; ``config`` must have ``git_revision`` and ``versions``."""
     versions = ", ".join(f"{name} {version}" for name, version in config["versions"].items())
     return [("Revision", str(config["git_revision"])), ("Versions", versions)]
 
 
 def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
-    """Files beside the page, to be linked."""
+    """Files and folders that the page links to."""
     names = ("config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex")
     files = [folder / name for name in names if (folder / name).exists()]
     figures = [folder / "figures"] if (folder / "figures").is_dir() else []
@@ -158,7 +158,7 @@ def files_beside(folder: Path, videos: Sequence[Path] = ()) -> list[Path]:
 
 
 def picture(png: Path, caption: str) -> Picture | None:
-    """A figure's PNG at half its resolution in at most 256 colors; None where the file is missing."""
+    """A figure's PNG at half its resolution in at most 256 colors; None if the file is missing."""
     if not png.is_file():
         return None
     with Image.open(png) as source:
@@ -197,7 +197,7 @@ def _method(result: Result, own: Sequence[Plot], figures: Path) -> MethodSection
 
 
 def _video(video: Path, folder: Path, moment: float) -> EmbeddedVideo:
-    """A video whose poster is its frame at ``moment`` [s]."""
+    """A video with its frame at ``moment`` [s] as the poster."""
     size = video.stat().st_size
     if size >= LARGEST_VIDEO:
         return EmbeddedVideo("", "", _link(video, folder), round(size / 1e6))

@@ -1,4 +1,4 @@
-"""The paper's Tables 3 to 6: our numbers in rows of methods, the published ones in a row below each method that has them."""
+"""The paper's Tables 3 to 6 with our numbers, and the published ones in extra rows, or in Table 4 in extra columns."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,9 +17,9 @@ from marlbc_mj.util.text import one_line
 SAME_ORDER = "same order"
 LIMITED = "-limited"
 TOLD = ("finite-time", "fixed-time", "lqr", "terminal-sliding", "predefined-time")
-"""Controllers that are told the true drag."""
+"""Controllers that receive the true drag."""
 COST_SCALE = 1e-4
-"""The paper tabulates costs in units of 10⁴."""
+"""Factor from costs to the paper's unit, 10⁴."""
 _ORDER_NOTE = (
     "Same order: whether the methods that have both numbers are in the published order. Published ties are not counted; "
     "in brackets the pairs that differ."
@@ -44,7 +44,7 @@ INPUT_TOTAL = Quantity(6, "total ‖u‖ [N]", paper_values.PUBLISHED_INPUT_TOTA
 
 
 def one_per_supervisor(results: Sequence[Result]) -> dict[str, Result]:
-    """One result per supervisor: the one with SORLC, else its first."""
+    """One result per supervisor: the one with SORLC, or else its first."""
     chosen: dict[str, Result] = {}
     for result in results:
         if result.supervisor not in chosen or result.controller == "sorlc":
@@ -53,14 +53,14 @@ def one_per_supervisor(results: Sequence[Result]) -> dict[str, Result]:
 
 
 def one_per_controller(results: Sequence[Result]) -> tuple[dict[str, Result], str]:
-    """One result per controller, all under one supervisor (scripted, else the first), and that supervisor's name."""
+    """One result per controller, all under one supervisor (scripted, or else the first), and that supervisor's name."""
     names = [result.supervisor for result in results]
     supervisor = "scripted" if "scripted" in names or not names else names[0]
     return {result.controller: result for result in results if result.supervisor == supervisor}, supervisor
 
 
 def agent_values(chosen: Mapping[str, Result], quantity: Quantity, agent: int) -> dict[str, float]:
-    """One agent's number of every method that ran, by name."""
+    """One agent's value of a quantity for every method that ran, by name."""
     return {name: float(quantity.read(r.metrics["agents"][agent])) for name, r in chosen.items() if r.metrics}
 
 
@@ -76,7 +76,7 @@ def switches(chosen: Mapping[str, Result], published: bool) -> Table:
 
 
 def control_cost(chosen: Mapping[str, Result], supervisor: str, published: bool) -> Table:
-    """Table 5: maximum and total control cost; below, the rivals with SORLC's actuator, and LQR."""
+    """Table 5: maximum and total control cost; a second block has LQR and the baselines with SORLC's actuator."""
     return _table(
         "control-cost",
         _controller_caption("cost", supervisor, 5, published),
@@ -116,11 +116,11 @@ def _table_number(number: int, published: bool) -> str:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """Methods of this run beside the published ones: the rows of a table. Two quantities make a table of controllers."""
+    """The rows of a table that compares this run with published numbers; two quantities make it a table of controllers."""
 
     chosen: Mapping[str, Result]
     quantities: Sequence[Quantity]
-    names: Mapping[str, str]  # ours -> published; empty: published numbers are not shown
+    names: Mapping[str, str]  # our name -> published name; empty: published numbers are not shown
 
     @property
     def of_controllers(self) -> bool:
@@ -143,13 +143,13 @@ class _Comparison:
         return self.of_controllers and "sorlc" in self.sums
 
     def columns(self) -> list[Column]:
-        """One per quantity and agent, and the one relative to SORLC."""
+        """One column per quantity and agent, and the one relative to SORLC."""
         groups = [q.label if self.of_controllers else "" for q in self.quantities]
         columns = [Column(group, f"agent {i + 1}") for group in groups for i in range(self.agents)]
         return columns + ([Column("total", "over SORLC's")] if self.relative else [])
 
     def block(self, keys: Sequence[str]) -> list[tuple[str, ...]]:
-        """Rows of these methods, each with the published numbers below it where there are some."""
+        """Rows of these methods, each followed by a row of published numbers if there are any."""
         rows = []
         for key in keys:
             rows.append(self._row(key))
@@ -158,7 +158,7 @@ class _Comparison:
         return rows
 
     def order_row(self) -> tuple[str, ...] | None:
-        """Whether each column has the published order; None where no two methods can be compared."""
+        """Row that says whether each column has the published order; None if no two methods can be compared."""
         marks = [
             order_mark(agent_values(self.chosen, q, i), {n: v[i] for n, v in q.source.values.items() if i < len(v)})
             for q in self.quantities
@@ -200,7 +200,7 @@ class _Comparison:
 
 
 def _table(name: str, caption: str, kind: str, comparison: _Comparison, notes: Sequence[str]) -> Table:
-    """The methods, whether they keep the published order, and the rivals that have SORLC's actuator as a second block."""
+    """Table of the methods, the row on the published order, and a second block of baselines with SORLC's actuator."""
     second = [n for n in comparison.chosen if _same_actuator(n)] if comparison.of_controllers else []
     rows = comparison.block([n for n in comparison.chosen if n not in second])
     rules = []
@@ -223,7 +223,7 @@ def _same_actuator(controller: str) -> bool:
 
 
 def decision_time(chosen: Mapping[str, Result], published: bool) -> Table:
-    """Table 4: time for one decision, and how much of it a network or a solver takes where a supervisor reports it."""
+    """Table 4: time for one decision, and the share of a network or solver if a supervisor reports it."""
     source = paper_values.PUBLISHED_DECISION_MS.values if published else {}
     sums = {name: sum(values) for name, values in source.items() if name in chosen}
     medians = {name: r.metrics["team"]["decision_ms_median"] for name, r in chosen.items() if r.metrics}
@@ -270,7 +270,7 @@ def _beside(values: Sequence[float] | None, median: float | None) -> list[str]:
 
 
 def _missing(chosen: Mapping[str, Result], quantities: Sequence[Quantity], names: Mapping[str, str]) -> list[str]:
-    """What is published for methods that are not run here."""
+    """Note on the published numbers of methods that did not run here."""
     absent = [
         f"{published} " + ", total ".join("/".join(f"{v:g}" for v in q.source.values[name]) for q in quantities)
         for name, published in names.items()

@@ -10,16 +10,16 @@ SCENARIO = "paper"
 """The scenario that the published numbers belong to."""
 
 PAPER_SUPERVISORS = {"marlms": "MARLMS", "fsams": "FSAMS", "mpcms": "MPCMS", "rlms": "RLMS"}
-"""Name here -> name in Tables 3 and 4."""
+"""Our name -> name in Tables 3 and 4."""
 PAPER_CONTROLLERS = {"sorlc": "MARLBC", "finite-time": "finite-time", "fixed-time": "fixed-time"}
-"""Name here -> name in Tables 5 and 6, whose rows are whole frameworks; the rivals there have no force limit."""
+"""Our name -> name in Tables 5 and 6, whose rows are whole frameworks; the baselines there have no force limit."""
 
 
 class Published(NamedTuple):
-    """A published quantity: four agents for each method, by our names."""
+    """A published quantity: its values for the four agents, by our name of the method."""
 
     values: Mapping[str, tuple[float, ...]]
-    comparable: bool = True  # False where an erratum leaves only the order of methods to be compared
+    comparable: bool = True  # False if, because of an erratum, only the order of methods can be compared
 
 
 PUBLISHED_SWITCHES = Published({"marlms": (4, 2, 2, 4), "fsams": (118, 86, 86, 118), "mpcms": (4, 2, 2, 4), "rlms": (6, 4, 4, 6)})
@@ -75,10 +75,10 @@ ERRATA = {
 
 
 def order_matches(ours: Mapping[str, float], published: Mapping[str, float]) -> tuple[int, int]:
-    """How many pairs of methods are in the published order, and how many pairs there are.
+    """The number of pairs of methods that are in the published order, and the number of all pairs.
 
-    Pairs are taken among methods that have both numbers. A published tie orders nothing and is not counted; a tie of ours
-    where the published numbers differ is a mismatch.
+    Pairs consist of methods that have both numbers. A published tie has no order and is not counted; a tie of ours
+    is a mismatch if the published numbers differ.
     """
     names = [name for name in published if name in ours]
     pairs = [(a, b) for k, a in enumerate(names) for b in names[k + 1 :] if published[a] != published[b]]
@@ -87,7 +87,7 @@ def order_matches(ours: Mapping[str, float], published: Mapping[str, float]) -> 
 
 
 def order_mark(ours: Mapping[str, float], published: Mapping[str, float]) -> str:
-    """``"yes"``, ``"no (1 of 3)"`` with the number of pairs that differ, or ``"–"`` where there is no pair to compare."""
+    """``"yes"``, ``"no (1 of 3)"`` with the number of pairs that differ, or ``"–"`` if there is no pair to compare."""
     same, pairs = order_matches(ours, published)
     if not pairs:
         return "–"

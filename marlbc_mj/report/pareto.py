@@ -1,4 +1,4 @@
-"""Figure of control cost against what it buys: return, safety and formation error."""
+"""Figure of control cost against return, safety and formation error."""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -20,15 +20,15 @@ from marlbc_mj.util.palette import METHOD_COLORS
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
 
 _INK, _PAPER = "#1A1A1A", "#FFFFFF"
-_COST_UNIT = "[(SI units)² s]"  # it adds m^2, (m/s)^2 and N^2
+_COST_UNIT = "[(SI units)² s]"  # the cost adds m^2, (m/s)^2 and N^2
 _MARK = 5.0  # size of a mark [pt]
-_APART = 6.5  # marks stand at least about this far apart [pt]
+_APART = 6.5  # approximate least distance between marks [pt]
 _PANELS = {
     "return": "upper left is better",
     "violation_time_worst": "lower left is better",
     "formation_error_mean": "lower left is better",
 }
-"""Scores on the ordinates, and the corner in which better methods are."""
+"""Scores on the vertical axes, and the corner in which better methods are."""
 
 
 class Group(NamedTuple):
@@ -40,11 +40,11 @@ class Group(NamedTuple):
 
 
 def pareto(results: Sequence[Result]) -> Figure:
-    """Cost summed over agents against return, violation time and formation error; one mark per method that ran.
+    """Plot the cost summed over agents against return, violation time and formation error; one mark per method that ran.
 
-    Where the methods are supervisors with one controller and controllers under one supervisor, each of the two kinds has its own
-    row, since their ranges differ; else all share one row. A law with and without force limit has one marker, open without.
-    A mark that would cover another stands aside, and a thin line leads to its place.
+    If the methods are supervisors with one controller and controllers under one supervisor, each of the two kinds has its own
+    row, since their ranges differ. Otherwise all share one row. A control law has the same marker with and without a force
+    limit, open if without. A mark that would cover another is shifted, and a thin line leads to its true position.
     """
     ran = [result for result in results if result.metrics is not None]
     groups = _groups(ran)
@@ -75,7 +75,7 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
     def of_supervisor(result: Result) -> dict[str, Any]:
         return _style(supervisor_names.index(result.supervisor), 0, False)
 
-    def of_law(result: Result) -> dict[str, Any]:  # without color, which means a supervisor
+    def of_law(result: Result) -> dict[str, Any]:  # without color, since colors are supervisors
         k = laws.index(_law(result))
         face = _PAPER if result.controller in twins else _INK
         return {**_style(0, k, False), "markerfacecolor": face}
@@ -101,7 +101,7 @@ def _groups(ran: Sequence[Result]) -> list[Group]:
 def _draw_group(row: np.ndarray, group: Group) -> None:
     costs = [_cost(result) for result in group.results]
     limits = min(costs) / 1.6, max(costs) * 1.6
-    if limits[1] < 30 * limits[0]:  # an axis with at least two labels
+    if limits[1] < 30 * limits[0]:  # so that the axis has at least two labels
         limits = (10 ** np.floor(np.log10(limits[0])), 10 ** np.ceil(np.log10(limits[1])))
     cost = SCORES["cost_integral_sum"]
     floor = [_cost(result) for result in group.results if result.controller == "lqr"]
@@ -119,7 +119,7 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
 
 
 def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, Any]]) -> None:
-    """Marks at points (P, 2) of axes whose limits are set; one that would cover another stands aside, on a thin line."""
+    """Draw marks at points (P, 2) after the axes have their limits; shift marks that would cover others, on a thin line."""
     inch = axes.figure.dpi_scale_trans
     shifts = _asides(72.0 * inch.inverted().transform(axes.transData.transform(points)))
     for point, shift, style in zip(points, shifts, styles, strict=True):
@@ -131,7 +131,7 @@ def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, An
 
 
 def _asides(places: np.ndarray) -> np.ndarray:
-    """How far marks at places (P, 2) stand aside, (P, 2), all in pt: as little as leaves all of them ``_APART``."""
+    """Shifts (P, 2) of marks at places (P, 2), all in pt: the smallest candidates that keep marks about ``_APART`` apart."""
     rings = [(k, 6 * k) for k in range(1, 1 + len(places))]
     turns = [(_APART * k, 0.5 * np.pi + 2.0 * np.pi * j / count) for k, count in rings for j in range(count)]
     offsets = np.array([(0.0, 0.0), *((r * np.cos(angle), r * np.sin(angle)) for r, angle in turns)])
@@ -162,7 +162,7 @@ def _metrics(result: Result) -> Metrics:
 
 
 def _cost(result: Result) -> float:
-    """Cost integral summed over agents, kept off zero for the logarithmic axis."""
+    """Cost integral summed over agents, kept above zero for the logarithmic axis."""
     return max(SCORES["cost_integral_sum"].read(_metrics(result)), 1e-9)
 
 

@@ -1,4 +1,4 @@
-"""What all figures share: style, sizes, and decimation that keeps every peak."""
+"""Shared parts of all figures: style, sizes, and decimation that keeps every peak."""
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
@@ -14,11 +14,11 @@ from matplotlib.lines import Line2D
 from marlbc_mj.core.orders import SEPARATOR
 from marlbc_mj.util.palette import AGENT_COLORS, command_color
 
-SINGLE = 3.5  # width of a column [in]
-DOUBLE = 7.16  # width of two columns and the gap between them [in]
+SINGLE = 3.5  # width of a text column [in]
+DOUBLE = 7.16  # width of two text columns and the gap between them [in]
 GREY = "#6E6E6E"
 LINE_STYLES = ("-", (0, (5, 1.2)), (0, (3, 1, 1, 1)), (0, (1.2, 1)))
-BINS = 500  # per curve: more than a column in print resolves
+BINS = 500  # bins per curve: more than a printed column resolves
 
 _STYLE: Any = {
     "font.family": "sans-serif",
@@ -60,7 +60,7 @@ Share = bool | Literal["none", "all", "row", "col"]
 
 
 class Margins(NamedTuple):
-    """Room around and between panels [in]; fixed, so that a kind of figure has its axes in the same place for every method."""
+    """Space around and between panels [in]; fixed, so that a kind of figure has the same layout for every method."""
 
     left: float = 0.5
     right: float = 0.14
@@ -90,13 +90,13 @@ def panels(
 
 
 def legend_above(figure: Figure, handles: Sequence[Artist], **options: Any) -> None:
-    """One row of legend at the figure's top edge."""
+    """Add a legend at the figure's top edge, in one row by default."""
     options = {"ncols": len(handles), "columnspacing": 1.3, "borderaxespad": 0.25, "borderpad": 0.2, **options}
     figure.legend(handles=list(handles), loc="upper center", **options)
 
 
 def legend_in(axes: Axes, handles: Sequence[Artist]) -> None:
-    """A legend in a panel that shows nothing else, one entry per line."""
+    """Fill an empty panel with a legend, one entry per line."""
     axes.set_axis_off()
     axes.legend(handles=list(handles), loc="center left", borderaxespad=0.0, labelspacing=0.6)
 
@@ -111,7 +111,7 @@ def agent_line(agent: int) -> dict[str, Any]:
 
 
 def envelope(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """Decimate a curve to at most ``2 bins + 2`` of its samples: both ends, and each bin's smallest and largest in their order.
+    """Decimate a curve to at most ``2 bins + 2`` of its samples, in order: both ends, and each bin's smallest and largest.
 
     Args:
         time: (T,) abscissa.
@@ -128,14 +128,14 @@ def envelope(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np
 
 
 def bin_maxima(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray]:
-    """Decimate (T,) to the largest value of each bin, at the bin's start."""
+    """Decimate a curve (T,) to the largest value of each bin, placed at the bin's start."""
     size = -(-len(values) // bins)
     starts = np.arange(0, len(values), size)
     return time[starts], np.maximum.reduceat(values, starts)
 
 
 def bands(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Decimate (T,) to the start of each bin and its smallest, mean and largest value."""
+    """Decimate a curve (T,) to the start of each bin and its smallest, mean and largest value."""
     size = -(-len(values) // bins)
     starts = np.arange(0, len(values), size)
     counts = np.diff(np.append(starts, len(values)))
@@ -144,11 +144,11 @@ def bands(time: np.ndarray, values: np.ndarray, bins: int = BINS) -> tuple[np.nd
 
 
 def command_handles(commands: tuple[str, ...], width: float = 2.0) -> list[Line2D]:
-    """Legend entries, one per behavior that commands can begin with."""
+    """Legend entries, one per behavior that is the highest in some command."""
     heads = list(dict.fromkeys(command.split(SEPARATOR)[0] for command in commands))
     return [Line2D([], [], color=command_color(head), linewidth=width, label=head) for head in heads]
 
 
 def panel_label(axes: Axes, text: str) -> None:
-    """A title flush with the panel's left edge."""
+    """Add a title at the panel's left edge."""
     axes.set_title(text, loc="left")

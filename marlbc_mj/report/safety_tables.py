@@ -1,4 +1,4 @@
-"""Tables of many layouts, missions, compositions and shields: rates over all missions, then everything mission by mission."""
+"""Tables of many layouts, missions, compositions and shields: rates on all missions, then all scores of each mission."""
 
 import csv
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from marlbc_mj.util.method_names import display_name
 
 
 def write_cells(rows: Sequence[CellScores], path: Path) -> None:
-    """A line per cell: shares in [0, 1] and medians, intervals beside them; empty where there is no number."""
+    """Write a CSV file with one line per cell: shares in [0, 1], medians, and their intervals; missing numbers are empty."""
     columns: list[tuple[str, list[str]]] = [
         (name, [str(row.cell[k]) for row in rows]) for k, name in enumerate(MissionCell._fields)
     ]
@@ -37,7 +37,7 @@ def _number(value: float) -> str:
 
 
 def safety_tables(rows: Sequence[CellScores]) -> list[Table]:
-    """Rates of success and of violation over all missions, without a shield and with one; then one table per mission."""
+    """Tables of success and violation rates on all missions, each without and with a shield; then one table per mission."""
     overviews = [
         _overview(rows, name, shield)
         for name in ("success", "violation")
@@ -48,7 +48,7 @@ def safety_tables(rows: Sequence[CellScores]) -> list[Table]:
 
 
 def _overview(rows: Sequence[CellScores], name: str, shield: bool) -> Table:
-    """One rate of every supervisor on every mission, in per cent; a dash where nothing was flown."""
+    """One rate of every supervisor on every mission, in percent; a dash if nothing was flown."""
     missions = list(dict.fromkeys(row.cell.mission for row in rows))
     shown = {
         (row.cell.supervisor, row.cell.composition, row.cell.mission): interval(percent(getattr(row, name)), 1)

@@ -1,4 +1,4 @@
-"""The machine-readable files of many draws: summary.json and episodes.csv."""
+"""The machine-readable files of a run on many draws: summary.json and episodes.csv."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -17,9 +17,9 @@ from marlbc_mj.util.text import one_line
 
 
 def seed_summary(results: SeedResults, methods: Sequence[MethodStatistics], versions: Mapping[str, str]) -> dict[str, Any]:
-    """The content of summary.json: schema 1, with medians in place of numbers and ``<key>_ci`` beside them.
+    """The content of summary.json: schema 1, with medians as numbers and their intervals under ``<key>_ci``.
 
-    It also has what only many draws can have: rates, interquartile means and groups.
+    It also has entries that need many draws: rates, interquartile means and groups.
     """
     groups = {"supervisors": supervisor_of, "controllers": controller_of}
     content = {
@@ -52,7 +52,7 @@ def _summary_entry(statistics: MethodStatistics) -> dict[str, Any]:
 
 
 def _outcome_entry(statistics: MethodStatistics, scenario: Scenario) -> dict[str, Any]:
-    """``outcome``: how many runs there were, and the share of each way to end; beside it the rates by their older names.
+    """``outcome``, the number of runs and the rate of each outcome, and the main rates under their older names.
 
     A run that failed counts against its method in every respect.
     """
@@ -77,9 +77,9 @@ def _all_with_ci(estimates: Mapping[str, Estimate]) -> dict[str, Any]:
 
 
 def write_seed_csv(results: SeedResults, path: Path) -> Path:
-    """Write episodes.csv: a row per method, seed and agent, the team's columns repeated.
+    """Write episodes.csv: a row per method, seed and agent, with the team's columns repeated.
 
-    A failed run has its reason in each of its rows. Where nothing was drawn, it has one row without an agent.
+    Every row of a failed run has the reason. A run that failed before its draw has one row without an agent.
     """
     drawn = ("disturbance_scale", "start_x", "start_y")
     names = ("supervisor", "controller", "supervisor_name", "controller_name")

@@ -1,4 +1,4 @@
-"""The report of many draws: its files, its figure and its page."""
+"""The report of a run on many draws: its files, its figure and its page."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -29,7 +29,7 @@ FIGURE = "intervals"
 
 
 def intervals(methods: Sequence[MethodStatistics]) -> Figure:
-    """Median and 95 % interval of return, violation time and effort: one line per method, with a word where all runs failed."""
+    """Draw median and 95 % interval of return, violation time and effort, one line per method; "failed" if all runs failed."""
     names = ("return", "violation_time_worst", "effort_integral_sum")
     margins = pl.Margins(
         left=0.2 + 0.054 * max(len(s.runs.display) for s in methods), top=0.12, across=0.22
@@ -68,12 +68,12 @@ def write_seed_report(
     figures: bool = True,
     progress: Progress | None = None,
 ) -> Path:
-    """Write summary.json, episodes.csv, tables.md, tables.tex, figures/intervals.{pdf,png} and index.html; returns its path.
+    """Write summary.json, episodes.csv, tables.{md,tex}, figures/intervals.{pdf,png} and index.html; returns the page's path.
 
     Args:
-        config: of the run: ``versions``, ``git_revision`` and ``command``, as config.json has them.
-        figures: False leaves the figure out.
-        progress: called with what is being done, how much of it is done and how much there is.
+        config: content of config.json: ``versions``, ``git_revision`` and ``command``.
+        figures: whether to draw the figure.
+        progress: called with the name of the stage, the amount done and the total amount.
     """
     methods = analyse(results)
     tables = make_seed_tables(results, methods)
@@ -102,7 +102,7 @@ def write_seed_page(
     config: Mapping[str, Any],
     awaited: int = 0,
 ) -> Path:
-    """Write the page of many draws; ``awaited`` is how many methods there will be, as in :func:`write_benchmark_page`."""
+    """Write the page of a run on many draws; ``awaited`` is the total number of methods, see :func:`write_benchmark_page`."""
     scenario, draws = results.scenario, len(results.seeds)
     of_paper = scenario.name == paper_values.SCENARIO
     failed = sum(len(s.runs.failed) for s in methods)
@@ -132,7 +132,7 @@ def write_seed_page(
 
 
 class _MethodTable(NamedTuple):
-    """A folding section with every metric of every agent."""
+    """A collapsible section with every metric of every agent."""
 
     name: str
     facts: str

@@ -1,4 +1,4 @@
-"""Tables of many draws: medians, interquartile means and intervals of every method."""
+"""Tables of a run on many draws: medians, interquartile means and intervals of every method."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,13 +16,13 @@ from marlbc_mj.util.text import one_line
 _SAFETY = ("violation_time_worst", "clearance_min_worst", "agent_distance_min")
 _COSTS = ("effort_integral_sum", "cost_integral_sum", "formation_error_mean", "saturation_duty_worst")
 ENOUGH = 10
-"""Draws from which on a bootstrap interval is shown without a warning."""
+"""Number of draws from which on bootstrap intervals are shown without a warning."""
 
 
 def make_seed_tables(results: SeedResults, methods: Sequence[MethodStatistics]) -> list[Table]:
-    """All tables, the outcomes first where a scenario draws layouts.
+    """All tables; the outcomes come first if the scenario draws layouts.
 
-    The table of groups is there where two or more can be compared, the table of failures where there are some.
+    There is a table of groups if two or more can be compared, and a table of failures if there were any.
     """
     pooled = [rows if len(rows) > 1 else [] for rows in (group(results, supervisor_of), group(results, controller_of))]
     failing = [statistics.runs for statistics in methods if statistics.runs.failed]
@@ -41,7 +41,7 @@ def make_seed_tables(results: SeedResults, methods: Sequence[MethodStatistics]) 
 
 
 def caution(draws: int) -> str:
-    """What is added to a caption where there are too few draws for intervals; empty where there are enough."""
+    """Warning to append to a caption if there are too few draws for intervals; empty otherwise."""
     if draws == 1:
         return " (a single draw: no intervals)"
     return f" (only {draws} draws: intervals are too narrow)" if draws < ENOUGH else ""
@@ -78,7 +78,7 @@ def _return_table(results: SeedResults, methods: MethodGroup[MethodStatistics]) 
 
 
 def outcome_tables(results: SeedResults) -> list[Table]:
-    """Success rate of each supervisor or controller, and the rates of what prevents success."""
+    """Tables of the success rate of each supervisor or controller, and of the rates of its parts."""
     groups = method_groups(results.methods, lambda method: (method.supervisor, method.controller))
     return [_outcome_table(results, each) for each in groups]
 

@@ -1,4 +1,4 @@
-"""Pages and tables of runs that have not ended: of what has, whole at any time; the page loads itself again every few seconds."""
+"""Interim page and tables of a benchmark that is still running; complete files at any time, reloaded every few seconds."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -16,7 +16,7 @@ from marlbc_mj.results.summary import Result
 
 
 def write_so_far(results: Sequence[Result], total: int, folder: Path, config: Mapping[str, Any]) -> None:
-    """Write index.html and tables.md of the methods that have ended, of ``total``: no figures, no video."""
+    """Write index.html and tables.md of the methods that have ended, out of ``total``, without figures or video."""
     paragraph = same_actuator(results)
     tables = make_tables(results, config["scenario"].name)
     given: dict[str, Any] = {"results": results, "config": config, "tables": tables, "figures": folder, "paragraph": paragraph}
@@ -24,9 +24,9 @@ def write_so_far(results: Sequence[Result], total: int, folder: Path, config: Ma
 
 
 def write_seeds_so_far(results: SeedResults, total: int, folder: Path, config: Mapping[str, Any]) -> None:
-    """Write index.html and tables.md of the methods that have been flown on all draws, of ``total``: no figure.
+    """Write index.html and tables.md of the methods that have ended on all draws, out of ``total``, without the figure.
 
-    Until the method that others are compared with has ended, they are compared with the first that has.
+    Until the reference method has ended, the first method that has ended replaces it.
     """
     keys = [method.key for method in results.methods]
     if results.reference not in keys:
@@ -38,7 +38,7 @@ def write_seeds_so_far(results: SeedResults, total: int, folder: Path, config: M
 
 
 def _rewrite(folder: Path, tables: str, write_page: Callable[[Path], object]) -> None:
-    """Replace both files, each by a whole one."""
+    """Replace both files, each in one step, so that neither is ever incomplete."""
     (folder / "tables.md.new").write_text(tables, encoding="utf-8")
     write_page(folder / "index.html.new")
     for name in ("tables.md", "index.html"):

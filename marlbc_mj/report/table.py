@@ -31,7 +31,7 @@ _MATH = {
     "†": r"\dagger",
     "²": "^2",
 }
-"""What is set in math mode, longest first where one holds another."""
+"""Text that is set in math mode; a longer entry is matched before the shorter ones in it."""
 _TEXT = {"–": "--", "—": "---", '"': "''"} | {character: "\\" + character for character in "&%$#_{}"}
 _TEXT |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
 _TEXT |= {"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}"}
@@ -39,7 +39,7 @@ _SPECIAL = re.compile("|".join(re.escape(k) for k in (*sorted(_MATH, key=len, re
 
 
 class Column(NamedTuple):
-    """A column's header: two lines, and the unit; neighbors of one group share the first line."""
+    """A column's header: two lines and a unit; adjacent columns of one group share the first line."""
 
     group: str
     label: str
@@ -58,7 +58,7 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Cells are plain text, already formatted; the renderings escape them."""
+    """A table with formatted cells of plain text; the renderings escape them."""
 
     name: str
     caption: str
@@ -79,20 +79,20 @@ class Table:
 
     @property
     def groups(self) -> list[tuple[str, int]]:
-        """The header's first line: every group and how many columns it spans; columns without one stand alone."""
+        """The header's first line: every group and the number of columns that it spans; 1 for a column without a group."""
         keys = [(column.group, -1 if column.group else at) for at, column in enumerate(self.columns)]
         return [(name, len(list(same))) for (name, _), same in groupby(keys)]
 
 
 def table_document(table: Table) -> dict[str, Any]:
-    """A table as data: cells are the text that people read, by the heads of their columns."""
+    """A table as data; each row maps the column headings to the text of the cells."""
     heads = [column.text for column in table.columns]
     rows = [dict(zip(heads, row, strict=True)) for row in table.rows]
     return {"name": table.name, "caption": table.caption, "rows": rows, "notes": list(table.notes)}
 
 
 def write_rows(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Rows as a CSV file, with one column per key of the first."""
+    """Write rows to a CSV file, with one column per key of the first row."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
@@ -144,7 +144,7 @@ def to_latex(table: Table) -> str:
 
 
 def latex(text: str) -> str:
-    """Plain text as LaTeX: specials escaped, known symbols in math mode, anything else as its nearest ASCII."""
+    """Plain text as LaTeX: special characters escaped, known symbols in math mode, all others as their nearest ASCII."""
     parts, at = [], 0
     for match in _SPECIAL.finditer(text):
         parts += [_ascii(text[at : match.start()]), _TEXT.get(match[0]) or f"${_MATH[match[0]]}$"]
@@ -169,7 +169,7 @@ def _latex_header(table: Table) -> list[str]:
     if not table.grouped:
         return [_latex_row(column.text for column in table.columns)]
     labels = [_latex_row(column.label for column in table.columns)]
-    if any(column.unit for column in table.columns):  # a line of their own: narrow columns
+    if any(column.unit for column in table.columns):  # units have a line of their own, which keeps columns narrow
         labels.append(_latex_row(f"[{column.unit}]" if column.unit else "" for column in table.columns))
     cells, lines, at = [], [], 1
     for name, span in table.groups:
@@ -182,4 +182,4 @@ def _latex_header(table: Table) -> list[str]:
 
 def _latex_row(cells: Iterable[str]) -> str:
     text = " & ".join(map(latex, cells))
-    return ("{}" if text.startswith("[") else "") + text + r" \\"  # a bracket behind a line break would be its length
+    return ("{}" if text.startswith("[") else "") + text + r" \\"  # LaTeX would read a bracket after a line break as its length

@@ -1,4 +1,4 @@
-"""All tables of one run, in the order in which they are read, and the two documents made from them."""
+"""All tables of one run in reading order, and the two documents made from them."""
 
 from collections.abc import Sequence
 
@@ -11,11 +11,11 @@ from marlbc_mj.results.scores import switches_text
 from marlbc_mj.results.summary import Result
 
 METRICS_TABLES = "metrics-"
-"""What names of the tables of all metrics begin with."""
+"""Prefix of the names of the tables of all metrics."""
 
 
 def make_tables(results: Sequence[Result], scenario_name: str) -> list[Table]:
-    """Every table that these results fill; published numbers appear for the paper's own scenario only."""
+    """All tables for which these results have data; published numbers appear only for the paper's own scenario."""
     of_paper = scenario_name == paper_values.SCENARIO
     supervisors = paper_tables.one_per_supervisor(results)
     controllers, supervisor = paper_tables.one_per_controller(results)

@@ -1,4 +1,4 @@
-"""The pages' Jinja2 templates: plain data in, HTML out. All text is escaped; a name that is not given is an error."""
+"""The pages' Jinja2 templates. All text is escaped, and a variable that is not given is an error."""
 
 from functools import cache
 from typing import Any
@@ -21,11 +21,11 @@ def render(template: str, package: str = _HOME, **values: Any) -> str:
     """Fill a template.
 
     Args:
-        template: name of an ``.html`` file in the folder of ``package``, or else of this one.
-        package: where the template is.
+        template: name of an ``.html`` file in the folder of ``package``, or else of this package.
+        package: package that contains the template.
         values: variables of the template.
 
     Raises:
-        jinja2.UndefinedError: the template names a value that is not given.
+        jinja2.UndefinedError: the template uses a variable that is not given.
     """
     return _environment(package).get_template(template).render(values)

@@ -1,4 +1,4 @@
-"""Methods on the layouts of missions: a row per layout, as a CSV file holds it."""
+"""Results of methods on the layouts of missions, and the CSV files that hold them with one row per layout."""
 
 import csv
 import math
@@ -14,16 +14,16 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
 DIGITS = 6
-"""Significant digits of every number of a row. What is computed from rows is the same before and after a file."""
+"""Significant digits of numbers in a row. They are rounded before use, so statistics from memory and from a file are equal."""
 LAYOUT_SCORES = (
     *("return", "violation_time_worst", "clearance_min_worst", "agent_distance_min", "end_error_worst"),
     *("effort_integral_sum", "cost_integral_sum", "rms_position_error_rms", "intervention_share_mean"),
 )
-"""Names of the scores that a row keeps."""
+"""Names of the scores in a row."""
 
 
 class Method(NamedTuple):
-    """What flies a mission: who decides, which law drives, how orders are composed, and whether there is a shield."""
+    """A method: its supervisor, its controller, how orders are composed, and whether there is a shield."""
 
     supervisor: str
     controller: str
@@ -38,18 +38,18 @@ class Method(NamedTuple):
 
 
 class LayoutRun(NamedTuple):
-    """One method on one layout. Numbers are NaN where the run failed, which counts against its method in every respect."""
+    """One run of a method on one layout. A failed run has NaN for its numbers and counts as the worst outcome."""
 
     seed: int
-    failure: str  # why the run could not be finished; empty: it was
+    failure: str  # why the run failed; empty if it finished
     reached: bool
     violated: bool
     struck: bool
     collided: bool
-    intervened: bool  # whether a shield changed a force
-    switches: float  # of all agents together
-    decision_ms: float  # median of a mission step, all agents [ms]
-    scores: tuple[float, ...]  # LAYOUT_SCORES, in SI units
+    intervened: bool  # whether a shield changed a force or a reference
+    switches: float  # sum over agents
+    decision_ms: float  # median time for the decisions of all agents in one mission step [ms]
+    scores: tuple[float, ...]  # in the order of LAYOUT_SCORES, in SI units
 
     @property
     def success(self) -> bool:
@@ -58,16 +58,16 @@ class LayoutRun(NamedTuple):
 
     @property
     def unfinished(self) -> bool:
-        """Whether there is no flight to judge: the method refused the mission, or the run failed."""
+        """Whether there is no complete episode: the method refused the mission, or the run failed."""
         return bool(self.failure)
 
     def score(self, name: str) -> float:
-        """One of :data:`LAYOUT_SCORES` by name."""
+        """The score of this name, one of :data:`LAYOUT_SCORES`."""
         return self.scores[LAYOUT_SCORES.index(name)]
 
 
 class MissionRuns(NamedTuple):
-    """One method on the layouts of one mission."""
+    """The runs of one method on the layouts of one mission."""
 
     track: str
     mission: str
@@ -76,13 +76,13 @@ class MissionRuns(NamedTuple):
 
     @property
     def failures(self) -> dict[str, int]:
-        """How many runs failed, by reason."""
+        """Number of failed runs by reason."""
         reasons = [run.failure for run in self.runs if run.failure]
         return {reason: reasons.count(reason) for reason in dict.fromkeys(reasons)}
 
 
 def layout_run(seed: int, metrics: Metrics | None, scenario: Scenario, failure: str | None = None) -> LayoutRun:
-    """The row of an episode, from its metrics, or from the reason why there are none."""
+    """The row of an episode, from its metrics or, if it failed, from the reason."""
     ended = FAILED_MISSION if metrics is None else outcome(metrics, scenario)
     if metrics is None:
         numbers = [math.nan] * (2 + len(LAYOUT_SCORES))
@@ -127,10 +127,10 @@ def _text(value: float) -> str:
 
 
 def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
-    """What :func:`write_layout_rows` wrote, in its order.
+    """Read a file that :func:`write_layout_rows` wrote; methods and missions keep its order.
 
     Raises:
-        ConfigurationError: the file cannot be read, or is another kind of file; names the row.
+        ConfigurationError: the file cannot be read, is of another kind, or has an invalid line, which the message names.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -150,7 +150,7 @@ def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
 
 
 def _parsed(row: Sequence[str]) -> tuple[str, Method, LayoutRun]:
-    """Mission, method and run of one line; ValueError for one that is torn."""
+    """Mission, method and run of one line; raises ValueError if the line is damaged."""
     cells = dict(zip(_HEADER, row, strict=True))
     method = Method(cells["supervisor"], cells["controller"], cells["composition"], bool(int(cells["shield"])))
     flags = {name: bool(int(cells[name])) for name in _FLAGS}

@@ -1,4 +1,4 @@
-"""Results on many layouts: the few numbers kept per layout, and the scores made from them.
+"""Results on many layouts: the few numbers kept per layout, and the scores computed from them.
 
 A *cell* is one supervisor on one mission, under one composition, with a shield or without.
 """
@@ -16,7 +16,7 @@ from marlbc_mj.scenarios import Scenario
 
 
 class MissionCell(NamedTuple):
-    """One supervisor on one mission."""
+    """One supervisor on one mission, under one composition, with a shield or without."""
 
     mission: str
     composition: str
@@ -25,19 +25,19 @@ class MissionCell(NamedTuple):
 
 
 class LayoutMark(NamedTuple):
-    """The numbers kept of one layout."""
+    """The numbers kept from a run on one layout."""
 
     seed: int
     outcome: MissionOutcome
     intervened: bool
     total: float = np.nan  # return
-    switches: int = 0  # of all agents
-    effort: float = np.nan  # of all agents [N s]
+    switches: int = 0  # sum over agents
+    effort: float = np.nan  # sum over agents [N s]
     failure: str = ""
 
 
 def mark(run: SeedRun, scenario: Scenario) -> LayoutMark:
-    """The numbers kept of one layout."""
+    """The numbers kept from a run."""
     ended, metrics = outcome(run.metrics, scenario), run.metrics
     if metrics is None:
         return LayoutMark(run.seed, ended, False, failure=str(run.failure))
@@ -52,15 +52,15 @@ def mark(run: SeedRun, scenario: Scenario) -> LayoutMark:
 
 
 class Marks(NamedTuple):
-    """The result of a job."""
+    """The results of one job on one cell."""
 
     cell: MissionCell
     layouts: tuple[LayoutMark, ...]
-    decision_ms: float  # median of the first layout flown alone: what one team takes for a decision [ms]
+    decision_ms: float  # median over mission steps of the decision time, from the first layout run alone [ms]
 
 
 class CellScores(NamedTuple):
-    """What a table says of a cell. Rates count a failure against the supervisor, medians leave it out."""
+    """The scores of a cell for tables. Rates count a failed run against the supervisor; medians leave it out."""
 
     cell: MissionCell
     layouts: int
@@ -72,14 +72,14 @@ class CellScores(NamedTuple):
     collided: Estimate
     intervention: Estimate
     total: Estimate  # median return
-    switches: float  # median, of all agents
-    effort: float  # median, of all agents [N s]
+    switches: float  # median of the sum over agents
+    effort: float  # median of the sum over agents [N s]
     decision_ms: float
-    reason: str  # of the first failure
+    reason: str  # reason of the first failure
 
     @classmethod
     def of(cls, cell: MissionCell, parts: Sequence[Marks]) -> "CellScores":
-        """From the jobs of one cell."""
+        """The scores of a cell from the results of its jobs."""
         layouts = [layout for part in parts for layout in part.layouts]
         flown = [layout for layout in layouts if not layout.failure]
         ended = [layout.outcome for layout in layouts]
@@ -103,7 +103,7 @@ class CellScores(NamedTuple):
 
     @property
     def refused(self) -> bool:
-        """Whether no layout was flown to its end."""
+        """Whether the runs on all layouts failed."""
         return self.failed == self.layouts
 
 

@@ -1,4 +1,4 @@
-"""The metrics of an episode: named scalars of its trajectory. Changing a definition changes every published number."""
+"""The metrics of an episode: named scalars from its trajectory. Changing a definition changes every published number."""
 
 from dataclasses import dataclass
 from typing import TypedDict
@@ -17,33 +17,33 @@ from marlbc_mj.util.errors import ConfigurationError
 class AgentMetrics(TypedDict):
     """The metrics of one agent."""
 
-    switches: int  # mission steps at which its command differs from the one before
-    clearance_min: float  # over all substeps [m]
+    switches: int  # number of mission steps with another command than the step before
+    clearance_min: float  # least clearance over all substeps [m]
     violation_time: float  # time with d <= d_OA [s]
-    force_max_inf: float  # max |u|_inf, which the paper's "max |u|" must mean (erratum 15) [N]
+    force_max_inf: float  # max |u|_inf, which must be the paper's "max |u|" (erratum 15) [N]
     force_max_2: float  # max |u|_2 [N]
     effort_integral: float  # integral of |u| dt [N s]
-    effort_sum: float  # effort_integral over the mission step: a sum over samples (erratum 16) [N]
+    effort_sum: float  # effort_integral / mission_step, a sum over samples (erratum 16) [N]
     cost_max: float  # max of |e_p|^2 + |e_v|^2 + |u|^2
-    cost_integral: float  # its integral
-    cost_sum: float  # cost_integral over the mission step
+    cost_integral: float  # integral of the same quantity
+    cost_sum: float  # cost_integral / mission_step
     saturation_duty: float  # share of time with an axis at the force limit
     rms_position_error: float  # [m]
     rms_velocity_error: float  # [m/s]
-    intervention_share: float  # share of substeps in which the shield changed the force; 0 without a shield
-    force_change_integral: float  # integral of |u - wish| dt [N s]
-    assumption_breaches: int  # substeps in which an assumption of the shield did not hold, one for each that did not
+    intervention_share: float  # share of substeps with a force, or reference velocity, changed by the shield; 0 without a shield
+    force_change_integral: float  # integral of |u - wish| dt; a shield of references sums m |v_r - wish| over mission steps [N s]
+    assumption_breaches: int  # violated assumptions of the shield, summed over substeps
 
 
 TeamMetrics = TypedDict(
     "TeamMetrics",
     {
         "return": float,  # sum of rewards over the episode
-        "decision_ms_median": float,  # all agents, one mission step [ms]
+        "decision_ms_median": float,  # decision time of all agents in one mission step [ms]
         "decision_ms_p99": float,
-        "agent_distance_min": float,  # least distance between two agents; no behavior of the paper guards it [m]
-        "end_error": float,  # greatest distance of an agent from its FM slot around the desired centroid, at the end [m]
-        "formation_error": float,  # mean distance from the FM slot, relative to the centroid [m]
+        "agent_distance_min": float,  # least distance between two agents, which no behavior of the paper controls [m]
+        "end_error": float,  # greatest final distance of an agent from its FM slot around the desired centroid [m]
+        "formation_error": float,  # mean distance from the FM slot, relative to the team's centroid [m]
     },
 )
 
@@ -57,7 +57,7 @@ class Metrics(TypedDict):
 
 @dataclass(frozen=True)
 class _Flown:
-    """The data of an episode that metrics need: T substeps, M mission steps, N agents; fields as in :class:`Trajectory`."""
+    """The data of an episode that metrics need, for T substeps, M mission steps and N agents; see :class:`Trajectory`."""
 
     course: Course
     position: np.ndarray  # (T + 1, N, 2)
@@ -69,16 +69,16 @@ class _Flown:
     reward: np.ndarray  # (M,)
     decision_ms: np.ndarray  # (M,)
     shield: ShieldCounts | None  # (M, N) each
-    clearance: np.ndarray  # (T, N) at the end of every substep
+    clearance: np.ndarray  # (T, N) at the end of every substep [m]
 
 
 def measure(episode: Trajectory | EpisodeLog) -> Metrics:
-    """All metrics of one episode, from its trajectory or, equal to the last bit, from its log.
+    """All metrics of one episode, from its trajectory or its log; both give results identical to the last bit.
 
-    Errors and force are those at the start of each substep, weighted by its length; clearance is that at its end.
+    Errors and forces are sampled at the start of each substep and weighted by its length; clearances are sampled at its end.
 
     Raises:
-        ConfigurationError: something else than an episode, or a log that holds mission steps only.
+        ConfigurationError: the argument is not an episode, or is a log that holds mission steps only.
     """
     if isinstance(episode, Trajectory):
         flown = _of_trajectory(episode)
@@ -155,7 +155,7 @@ def _agent(flown: _Flown, agent: int) -> AgentMetrics:
 
 
 def _shield_totals(flown: _Flown, agent: int) -> tuple[float, float, int]:
-    """Interventions [substeps], change of the force [N s] and breaches [substeps] over the episode; nothing without a shield."""
+    """Interventions [substeps], force change [N s] and breaches [substeps] over the episode; zeros without a shield."""
     counts = flown.shield
     if counts is None:
         return 0.0, 0.0, 0
@@ -178,10 +178,11 @@ def _team(flown: _Flown) -> TeamMetrics:
 def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: float = 0.02) -> np.ndarray:
     """Time after which the velocity error's norm stays below ``share`` of its largest value in the first ``window`` [s].
 
-    The paper's Figs. 6c and 7c: 0.7 s for SORLC, 3.4 s for RLC. The window ends before the case study's first switch.
+    The paper's Figs. 6c and 7c give 0.7 s for SORLC and 3.4 s for RLC. The default window ends before the case study's first
+    switch.
 
     Returns:
-        (N,) [s]; NaN for an agent whose error is above that share at the window's end.
+        (N,) times [s]; NaN for an agent with an error above that share at the window's end.
     """
     inside = trajectory.time < window
     error = np.linalg.norm(trajectory.velocity[:-1][inside] - trajectory.reference_velocity[inside], axis=-1)
@@ -193,12 +194,12 @@ def convergence_time(trajectory: Trajectory, *, window: float = 15.0, share: flo
 def slot_error(positions: np.ndarray, course: Course | Scenario, time: float) -> np.ndarray:
     """(..., N) distance [m] of agents at ``positions`` (..., N, 2) [m] from their slots at ``time`` [s].
 
-    The slots are those of the first formation around the desired centroid. At the end it says whether a mission was accomplished.
+    The slots are those of the first formation around the desired centroid. The final value decides whether a mission succeeds.
     """
     return np.asarray(np.linalg.norm(positions - desired_centroid(course, time) - course.formations[0], axis=-1))
 
 
 def _slot_distance(positions: np.ndarray, course: Course) -> np.ndarray:
-    """(T, N) distance of every agent from its first formation's slot, relative to the centroid [m]."""
+    """(T, N) distance of every agent from its slot in the first formation, relative to the team's centroid [m]."""
     centred = positions - positions.mean(axis=1, keepdims=True)
     return np.asarray(np.linalg.norm(centred - course.formations[0], axis=-1))

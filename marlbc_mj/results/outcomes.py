@@ -12,23 +12,23 @@ from marlbc_mj.scenarios import Scenario
 class MissionOutcome(NamedTuple):
     """The outcome of one episode."""
 
-    reached: bool  # at the end every agent is within the formation tolerance of its slot around the desired centroid
+    reached: bool  # every agent ends within the formation tolerance of its slot around the desired centroid
     violated: bool  # an agent came within the safe distance of an obstacle
     struck: bool  # an agent's body touched an obstacle: a clearance of at most the robot's radius
-    collided: bool  # two agents' bodies touched: a distance of at most twice the radius
+    collided: bool  # two agents' bodies touched: a distance of at most twice the team's largest radius
 
     @property
     def success(self) -> bool:
-        """The end was reached in formation, without a violation and without a collision of either kind."""
+        """Whether the team ended in formation, without a violation or a collision of either kind."""
         return self.reached and not (self.violated or self.struck or self.collided)
 
 
 FAILED_MISSION = MissionOutcome(False, True, True, True)
-"""The outcome of a run that could not be finished: it counts against its method in every respect."""
+"""The outcome of a run that failed: the worst in every respect."""
 
 
 def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
-    """The outcome of an episode, from its metrics; None stands for a run that failed."""
+    """The outcome of an episode from its metrics, or from None if the run failed."""
     if metrics is None:
         return FAILED_MISSION
     team, fleet = metrics["team"], scenario.fleet
@@ -41,12 +41,12 @@ def outcome(metrics: Metrics | None, scenario: Scenario) -> MissionOutcome:
 
 
 def intervened(metrics: Metrics | None) -> bool:
-    """Whether a shield changed what the team would have done; never where there was none, or where the run failed."""
+    """Whether a shield changed any force or reference; False without a shield or if the run failed."""
     return metrics is not None and any(agent["intervention_share"] > 0.0 for agent in metrics["agents"])
 
 
 def outcome_rates(runs: Sequence[Metrics | None], scenario: Scenario) -> dict[str, Estimate]:
-    """Share of ``runs`` that ended in each way, with Wilson's interval; None among them stands for a run that failed.
+    """Share of ``runs`` with each outcome, with Wilson's interval; None in ``runs`` is a failed run.
 
     ``intervention`` is the share of runs in which a shield acted at least once.
     """

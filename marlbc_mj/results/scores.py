@@ -1,6 +1,6 @@
-"""One number for a team's whole episode: every score once, with its aggregation over agents in its name.
+"""Scores: one number each for a team's whole episode, with the aggregation over agents in the name.
 
-Whatever shows a score (terminal, tables, pages, figures, files) takes heading, unit and number from here.
+Everything that shows a score (terminal, tables, pages, figures, files) takes its heading, unit and value from here.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ import numpy as np
 from marlbc_mj.results.metrics import AgentMetrics, Metrics
 
 WORST, SUM, MEAN, RMS, TEAM, PAIR = "worst agent", "sum", "mean", "RMS", "team", "closest pair"
-"""How agents are aggregated, as headings say it. Sum, mean and RMS are over all agents."""
+"""Words for the aggregation over agents in headings. Sum, mean and RMS are over all agents."""
 
 _Read = Callable[[AgentMetrics], float]
 
@@ -19,11 +19,11 @@ _Read = Callable[[AgentMetrics], float]
 class Score(NamedTuple):
     """One number per episode: what it measures, how it aggregates agents, and how it is shown."""
 
-    quantity: str  # first line of a heading
-    aggregation: str  # second line
-    unit: str  # in which it is shown; empty: it has none
-    digits: int  # decimals where it is shown
-    read: Callable[[Metrics], float]  # in SI units
+    quantity: str  # first line of the heading
+    aggregation: str  # second line of the heading
+    unit: str  # displayed unit; empty if it has none
+    digits: int  # displayed decimals
+    read: Callable[[Metrics], float]  # returns the score in SI units
     factor: float = 1.0  # from SI units to ``unit``
 
     @property
@@ -67,7 +67,7 @@ SCORES = {
     "rms_position_error_rms": Score("‖e_p‖", RMS, "m", 3, _rms(lambda a: a["rms_position_error"])),
     "rms_velocity_error_rms": Score("‖e_v‖", RMS, "m/s", 2, _rms(lambda a: a["rms_velocity_error"])),
 }
-"""Every score by name: the metric of :data:`AgentMetrics` or :data:`TeamMetrics`, then its aggregation.
+"""Every score by name: a metric of :data:`AgentMetrics` or :data:`TeamMetrics`, followed by its aggregation if it needs one.
 
 ``worst`` is the agent with the longest violation, the least clearance, the greatest end error or the most time at the limit.
 """
@@ -79,5 +79,5 @@ def team_scores(metrics: Metrics) -> dict[str, float]:
 
 
 def switches_text(metrics: Metrics) -> str:
-    """Switches of each agent: ``4/2/2/4``."""
+    """Number of switches of each agent, for example ``4/2/2/4``."""
     return "/".join(str(agent["switches"]) for agent in metrics["agents"])

@@ -1,4 +1,4 @@
-"""Statistics of many draws: estimates with intervals for every method, and for groups of methods."""
+"""Statistics over many draws: estimates with intervals for every method and for groups of methods."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,27 +20,27 @@ class MethodStatistics:
     """Statistics of one method for tables, files and the figure; estimates are over the runs that finished."""
 
     runs: MethodRuns
-    agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS
+    agents: tuple[Mapping[str, Estimate], ...]  # medians of AGENT_KEYS, per agent
     team: Mapping[str, Estimate]  # medians of TEAM_KEYS
-    medians: Mapping[str, Estimate]  # of SCORES
-    iqms: Mapping[str, Estimate]  # of SCORES
+    medians: Mapping[str, Estimate]  # medians of SCORES
+    iqms: Mapping[str, Estimate]  # interquartile means of SCORES
     violation: Estimate  # rate of runs with a violation or a failure, Wilson's interval
-    improvement: Estimate  # probability that its return exceeds the reference's on the same draw; a failure loses
+    improvement: Estimate  # probability of a higher return than the reference method on the same draw; a failed run loses
 
 
 @dataclass(frozen=True)
 class GroupStatistics:
-    """One supervisor over all its controllers, or the reverse: each method is a stratum, and draws are common to all of them."""
+    """A supervisor with all its controllers, or the reverse: each method is a stratum, and all methods share the draws."""
 
     name: str
     methods: int
-    draws: int  # on which all of them finished
-    iqms: Mapping[str, Estimate]  # of _GROUP_SCORES
+    draws: int  # number of draws on which all methods finished
+    iqms: Mapping[str, Estimate]  # interquartile means of _GROUP_SCORES
     violation: Estimate  # rate of runs with a violation or a failure
 
 
 def analyse(results: SeedResults) -> list[MethodStatistics]:
-    """Statistics of every method, in their order."""
+    """Statistics of every method, in the order of ``results.methods``."""
     reference = next(method for method in results.methods if method.key == results.reference)
     against = reference.values(SCORES["return"].read, failure=-np.inf)
     return [_method_statistics(method, results.scenario.agents, against) for method in results.methods]
@@ -70,7 +70,7 @@ def _team_metric(key: str) -> Callable[[Metrics], Any]:
 
 
 def group(results: SeedResults, by: Callable[[MethodRuns], str]) -> list[GroupStatistics]:
-    """Statistics of every supervisor or controller (``by``) that has more than one method."""
+    """Statistics of every supervisor or controller (selected by ``by``) with more than one method."""
     names = dict.fromkeys(map(by, results.methods))
     members = {name: [method for method in results.methods if by(method) == name] for name in names}
     return [_group_statistics(name, methods) for name, methods in members.items() if len(methods) > 1]

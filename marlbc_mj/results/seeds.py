@@ -1,4 +1,4 @@
-"""Every method on the same draws around a scenario, as scalars only, so that memory stays small."""
+"""Results of all methods on the same draws around a scenario, as scalars only to save memory."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,31 +14,31 @@ from marlbc_mj.util.method_names import display_method
 
 
 class Instance(NamedTuple):
-    """What a seed drew: one instance of the scenario, the same for every method."""
+    """The instance of a scenario that a seed draws, the same for every method."""
 
     starts: np.ndarray  # (N, 2) [m]
     obstacles: np.ndarray  # (K, 3) x, y, radius [m]
-    disturbance_scale: float  # the scenario's, times the draw
+    disturbance_scale: float  # the scenario's scale times the drawn factor
 
 
 @dataclass(frozen=True)
 class SeedRun:
-    """One episode's scalars, or the reason why there are none."""
+    """The metrics of one episode, or the reason why it failed."""
 
     seed: int
-    instance: Instance | None  # None where the controller cannot run in this scenario
+    instance: Instance | None  # None if the run could not start, for example because the controller cannot run here
     metrics: Metrics | None = None
     failure: str | None = None
 
     @property
     def violated(self) -> bool:
-        """Whether any agent came within the safe distance; a run that failed counts as one that did."""
+        """Whether any agent came within the safe distance of an obstacle; a failed run counts as a violation."""
         return self.metrics is None or any(agent["violation_time"] > 0.0 for agent in self.metrics["agents"])
 
 
 @dataclass(frozen=True)
 class MethodRuns:
-    """One method on every seed, in the order of the seeds."""
+    """The runs of one method on all seeds, in the order of the seeds."""
 
     supervisor: str
     controller: str
@@ -60,30 +60,30 @@ class MethodRuns:
         return tuple(run for run in self.runs if run.metrics is None)
 
     def values(self, read: Callable[[Metrics], float], failure: float | None = None) -> np.ndarray:
-        """One scalar of every run; a failed run is left out, or is ``failure`` where that is given."""
+        """One scalar per run; a failed run is left out, or counts as ``failure`` if that is given."""
         numbers = (failure if run.metrics is None else float(read(run.metrics)) for run in self.runs)
         return np.array([number for number in numbers if number is not None], dtype=float)
 
 
 @dataclass(frozen=True)
 class SeedResults:
-    """The whole matrix."""
+    """The results of all methods on all seeds."""
 
-    scenario: Scenario  # with the perturbation that was drawn from
+    scenario: Scenario  # including the perturbation that seeds draw from
     seeds: tuple[int, ...]
     methods: tuple[MethodRuns, ...]
-    reference: str  # the method that others are compared with
+    reference: str  # key of the method that others are compared with
 
 
 MOST_SEEDS = 10_000_000
-"""More seeds than one run's memory holds results for."""
+"""Largest number of seeds in one run; memory does not hold results of more."""
 
 
 def seed_range(count: int, first: int = 0) -> tuple[int, ...]:
-    """``count`` seeds from ``first`` on.
+    """``count`` consecutive seeds, starting with ``first``.
 
     Raises:
-        ConfigurationError: fewer than one or more than :data:`MOST_SEEDS`, or a negative seed.
+        ConfigurationError: fewer than one or more than :data:`MOST_SEEDS` seeds, or a negative seed.
     """
     if count < 1:
         raise ConfigurationError(f"seeds must be at least 1, got {count}")

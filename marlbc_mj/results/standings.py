@@ -1,7 +1,7 @@
-"""How methods compare on missions whose layouts are common to all: mean rank, chance of improvement, and who is best where.
+"""Comparison of methods on the same layouts: mean rank, probability of improvement, and the best methods on each mission.
 
-After Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021), whose definition of the
-probability of improvement this is. Layouts are drawn with replacement, the same ones for all methods, within each mission.
+The probability of improvement is defined as in Agarwal et al., "Deep reinforcement learning at the edge of the statistical
+precipice" (2021). Bootstrap samples draw layouts with replacement within each mission, the same ones for all methods.
 """
 
 from collections import defaultdict
@@ -15,48 +15,48 @@ from marlbc_mj.results.statistics import LEVEL, RESAMPLES, Estimate, bootstrap, 
 from marlbc_mj.util.errors import ConfigurationError
 
 WORTH_OF_SUCCESS = 1e12
-"""Value of success in a merit: more than any return or cost."""
+"""Weight of success in a merit, larger than any return or cost."""
 Merit = Callable[[LayoutRun], float]
-"""One number of a run, by whose order runs are compared: larger is better."""
+"""Maps a run to the number by which runs are compared: larger is better."""
 
 
 def by_return(run: LayoutRun) -> float:
-    """Success comes first, then the return; a run that failed comes last."""
+    """Merit by success, then by return; a failed run is last."""
     return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success + run.score("return")
 
 
 def by_cost(run: LayoutRun) -> float:
-    """Success comes first, then a small control cost; a run that failed comes last."""
+    """Merit by success, then by low control cost; a failed run is last."""
     return -np.inf if run.failure else WORTH_OF_SUCCESS * run.success - run.score("cost_integral_sum")
 
 
 OUTCOMES = ("success", "reached", "violated", "struck", "collided", "intervened", "unfinished")
-"""Outcomes of a run by name."""
+"""Names of the outcomes of a run."""
 
 
 class MissionSummary(NamedTuple):
-    """One method on one mission."""
+    """Summary of one method on one mission."""
 
     runs: int
-    shares: Mapping[str, Estimate]  # of outcomes, with Wilson's interval
+    shares: Mapping[str, Estimate]  # share of each outcome, with Wilson's interval
     medians: Mapping[str, Estimate]  # over the runs that finished
-    failures: Mapping[str, int]  # reason: number of runs
+    failures: Mapping[str, int]  # number of failed runs by reason
 
 
 class Standing(NamedTuple):
-    """One method among others on a group of missions."""
+    """The standing of one method among others on a group of missions."""
 
     method: Method
-    rank: Estimate  # mean over missions of the mean rank over layouts: 1 is best; NaN where it did not fly all missions
+    rank: Estimate  # mean over missions of the mean rank over layouts, 1 is best; NaN if it did not run all missions
     improvement: Estimate  # P(better than the reference), mean over missions
     shares: Mapping[str, Estimate]  # mean over missions of the share of each outcome
-    flown: Mapping[str, MissionRuns]  # by mission
-    best: frozenset[str]  # missions on which no other method succeeds more often
-    level: frozenset[str]  # missions on which nobody succeeds significantly more often: the best and those level with it
+    flown: Mapping[str, MissionRuns]  # its runs by mission
+    best: frozenset[str]  # missions on which it succeeds, and no other method succeeds more often
+    level: frozenset[str]  # missions on which it is best or the best method does not succeed significantly more often
 
 
 def summarize(each: MissionRuns) -> MissionSummary:
-    """Shares, medians and failures."""
+    """Summarize the runs of one method on one mission."""
     runs = each.runs
     shares = {kind: share_of(each, kind) for kind in OUTCOMES}
     medians = {name: median_interval(finished(each, name)) for name in (*LAYOUT_SCORES, "switches", "decision_ms")}
@@ -69,17 +69,17 @@ def share_of(each: MissionRuns, kind: str) -> Estimate:
 
 
 def finished(each: MissionRuns, name: str) -> np.ndarray:
-    """(n,) a score, the switches or the decision time of the runs that finished."""
+    """(n,) values of a score, of ``switches`` or of ``decision_ms`` from the runs that finished."""
     read = LayoutRun.score if name in LAYOUT_SCORES else getattr
     return np.array([read(run, name) for run in each.runs if not run.failure], dtype=float)
 
 
 def median_interval(values: np.ndarray) -> Estimate:
-    """Median, and the order statistics between which the true one lies with a probability of at least 95 %.
+    """Median, and the order statistics that enclose the true median with a probability of at least 95 %.
 
-    The interval of the sign test: exact for any distribution; where there are too few values, from the least to the greatest.
+    This is the interval of the sign test, exact for any distribution. With too few values it spans all of them.
     """
-    from scipy.stats import binom  # here, as it takes longer to import than most commands take to answer
+    from scipy.stats import binom  # imported here because the import takes longer than most commands
 
     count, ordered = len(values), np.sort(values)
     if count == 0:
@@ -93,13 +93,13 @@ def median_interval(values: np.ndarray) -> Estimate:
 def rank_methods(
     group: Sequence[MissionRuns], reference: Method | None = None, *, merit: Merit = by_return, by_track: bool = False
 ) -> list[Standing]:
-    """Standings of all methods, the best mean rank first; those that did not fly all missions come last, without a rank.
+    """Standings of all methods, sorted by mean rank; methods that did not run all missions come last, without a rank.
 
     Args:
-        group: every method on every mission.
-        reference: the method that the chance of improvement is measured against; None, or one that is not there: the best.
-        merit: by which two runs on one layout are compared.
-        by_track: every track has the same weight, instead of every mission.
+        group: the runs of every method on every mission.
+        reference: the method that the probability of improvement refers to; None or an absent method: the best one.
+        merit: function by which two runs on one layout are compared.
+        by_track: whether every track has the same weight, instead of every mission.
     """
     table: dict[Method, dict[str, MissionRuns]] = defaultdict(dict)
     for each in group:
@@ -118,7 +118,7 @@ def _ranked(
     reference: Method | None,
     merit: Merit,
 ) -> list[Standing]:
-    """Standings of methods that flew all missions, in their order."""
+    """Standings of methods that ran all missions, in the order of ``methods``."""
     matrices = {name: _matrix([table[method][name] for method in methods], merit) for name in weights}
     ranks = _weighted(matrices, weights, lambda matrix: _ranks(matrix.merit))
     shares = {kind: _weighted(matrices, weights, _share(k)) for k, kind in enumerate(OUTCOMES)}
@@ -143,15 +143,15 @@ def _unranked(method: Method, flown: Mapping[str, MissionRuns]) -> Standing:
 
 
 class _Matrix(NamedTuple):
-    """K methods on the n layouts of one mission that all of them flew."""
+    """The results of K methods on the n layouts of one mission that all of them ran."""
 
     merit: np.ndarray  # (K, n)
-    outcomes: np.ndarray  # (OUTCOMES, K, n) bool
-    drawn: np.ndarray  # (R, n) weight of every layout in every bootstrap sample; rows sum to 1
+    outcomes: np.ndarray  # (number of OUTCOMES, K, n) bool
+    drawn: np.ndarray  # (R, n) weights of the layouts in R bootstrap samples; rows sum to 1
 
 
 def _weights(tracks: Mapping[str, str], by_track: bool) -> dict[str, float]:
-    """Weight of each mission; they sum to 1."""
+    """Weight of each mission; the weights sum to 1."""
     names = list(tracks.values())
     raw = {mission: 1.0 / names.count(track) if by_track else 1.0 for mission, track in tracks.items()}
     return {mission: weight / sum(raw.values()) for mission, weight in raw.items()}
@@ -177,8 +177,8 @@ def _draws(n: int) -> np.ndarray:
 
 
 def _ranks(merit: np.ndarray) -> np.ndarray:
-    """(K, n) rank of every method on every layout, 1 for the best; those that are equal share the mean of their ranks."""
-    from scipy.stats import rankdata  # here, as it takes longer to import than most commands take to answer
+    """(K, n) rank of every method on every layout, 1 for the best; methods with equal merit share the mean of their ranks."""
+    from scipy.stats import rankdata  # imported here because the import takes longer than most commands
 
     return np.asarray(rankdata(-merit, axis=0))
 
@@ -190,7 +190,7 @@ def _share(kind: int) -> Callable[[_Matrix], np.ndarray]:
 def _weighted(
     matrices: Mapping[str, _Matrix], weights: Mapping[str, float], values: Callable[[_Matrix], np.ndarray]
 ) -> list[Estimate]:
-    """For each of K methods the weighted mean over missions of its mean (K, n) value over layouts, with its interval."""
+    """For each of K methods, the mean of ``values`` (K, n) over layouts, averaged over missions by weight, with its interval."""
     totals, samples = [], []
     for name, matrix in matrices.items():
         value = values(matrix)
@@ -214,11 +214,11 @@ def _improvement(matrices: Mapping[str, _Matrix], weights: Mapping[str, float], 
 
 
 def improvement(x: np.ndarray, y: np.ndarray, drawn: np.ndarray) -> tuple[float, np.ndarray]:
-    """P(X > Y) + P(X = Y) / 2 over all pairs of runs (Mann and Whitney's U by n²), and its bootstrap samples.
+    """P(X > Y) + P(X = Y) / 2 over all pairs of runs (Mann and Whitney's U divided by n²), and its bootstrap samples.
 
     Args:
         x: (n,) merits of one method.
-        y: (n,) merits of the other on the same layouts.
+        y: (n,) merits of the other method on the same layouts.
         drawn: (R, n) weights of the layouts in R samples.
 
     Returns:
@@ -235,7 +235,10 @@ def improvement(x: np.ndarray, y: np.ndarray, drawn: np.ndarray) -> tuple[float,
 
 
 def _places(matrices: Mapping[str, _Matrix], k: int) -> tuple[frozenset[str], frozenset[str]]:
-    """Missions on which method k succeeds most often, and those where it is not significantly behind (paired bootstrap)."""
+    """Missions on which method k is best by success, and those on which it is best or not significantly :func:`behind`.
+
+    Missions on which no method succeeds are in neither set.
+    """
     best, level = set(), set()
     for name, matrix in matrices.items():
         success = matrix.outcomes[OUTCOMES.index("success")]
@@ -251,13 +254,13 @@ def _places(matrices: Mapping[str, _Matrix], k: int) -> tuple[frozenset[str], fr
 
 
 def behind(x: np.ndarray, y: np.ndarray) -> bool:
-    """Whether x (n,) succeeds significantly less often than y on the same layouts: the 95 % interval of y - x is above 0."""
+    """Whether x (n,) succeeds significantly less often than y on the same layouts: the 95 % interval of y - x exceeds 0."""
     gap = bootstrap([np.asarray(y, dtype=float) - np.asarray(x, dtype=float)], mean)
     return bool(gap.value > 0.0 and (np.isnan(gap.low) or gap.low > 0.0))
 
 
 class Notable(NamedTuple):
-    """One layout of a method that is worth watching."""
+    """A run of a method that is worth watching."""
 
     track: str
     mission: str
@@ -267,14 +270,14 @@ class Notable(NamedTuple):
 
     @property
     def clip(self) -> str:
-        """Path of its video, relative to the page."""
+        """Path of the run's video, relative to the page."""
         return f"clips/{self.track}-{self.method.key}-{self.kind}.mp4"
 
 
 def notable_layouts(group: Sequence[MissionRuns]) -> list[Notable]:
-    """The worst and the median layout of every method in every track, by success and then by return.
+    """The worst and the median run of every method in every track, by success and then by return.
 
-    They are chosen among the runs that were finished: there is nothing to see of a method that could not start.
+    Only finished runs are considered, because a failed run may have nothing to show.
     """
     found = []
     for track, method in dict.fromkeys((each.track, each.method) for each in group):

@@ -1,7 +1,7 @@
 """Statistics of few runs, after Agarwal et al., "Deep reinforcement learning at the edge of the statistical precipice" (2021).
 
 Medians and interquartile means with percentile-bootstrap intervals, the probability of improvement, and rates with Wilson's
-interval. A bootstrap interval of few runs (below about ten) is too narrow: read it as a lower bound of the spread.
+interval. A bootstrap interval from few runs (below about ten) is too narrow: read it as a lower bound on the spread.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,11 +15,11 @@ LEVEL = 0.95
 RESAMPLES = 2000
 
 Statistic = Callable[[np.ndarray], np.ndarray]
-"""Maps (..., n) to (...): every statistic works on the last axis."""
+"""Maps (..., n) to (...); every statistic is taken over the last axis."""
 
 
 class Estimate(NamedTuple):
-    """A value and the interval around it; NaN where there are too few runs."""
+    """A value and the interval around it; NaN if there are too few runs."""
 
     value: float
     low: float
@@ -27,17 +27,17 @@ class Estimate(NamedTuple):
 
 
 def mean(values: np.ndarray) -> np.ndarray:
-    """Arithmetic mean of the last axis."""
+    """Arithmetic mean over the last axis."""
     return np.asarray(np.mean(values, axis=-1))
 
 
 def median(values: np.ndarray) -> np.ndarray:
-    """Median of the last axis; the mean of the middle two where their number is even."""
+    """Median over the last axis; the mean of the middle two for an even number of values."""
     return np.asarray(np.median(values, axis=-1))
 
 
 def iqm(values: np.ndarray) -> np.ndarray:
-    """Interquartile mean of the last axis: the mean of what is left without the floor(n / 4) smallest and largest."""
+    """Interquartile mean over the last axis: the mean without the floor(n / 4) smallest and largest values."""
     values = np.sort(values, axis=-1)
     count = values.shape[-1]
     cut = count // 4
@@ -56,15 +56,15 @@ def bootstrap(
     """The statistic of all strata together, and its stratified percentile-bootstrap interval.
 
     Runs are drawn with replacement within each stratum, so that every stratum keeps its weight. With one stratum this is the
-    ordinary bootstrap. Each call has its own random stream, so that no interval depends on which others are computed.
+    ordinary bootstrap. Each call has its own random stream, so no interval depends on which others are computed.
 
     Args:
         strata: (n_k,) values of each stratum.
-        statistic: of the last axis of the concatenated strata.
+        statistic: function of the concatenated strata, over the last axis.
         level: probability with which the interval should cover the true value.
         resamples: number of bootstrap samples.
-        joint: the k-th runs of all strata belong to one perturbation draw and are drawn together. Independent draws would make
-            the interval too narrow then.
+        joint: whether the k-th runs of all strata share a perturbation draw and are resampled together. Resampling them
+            independently would make the interval too narrow.
         seed: random seed of this call's stream.
 
     Raises:
@@ -81,7 +81,7 @@ def bootstrap(
     picks += [picks[0] if joint else rng.integers(len(stratum), size=(resamples, len(stratum))) for stratum in strata[1:]]
     drawn = [np.asarray(stratum, dtype=float)[pick] for stratum, pick in zip(strata, picks, strict=True)]
     samples = np.sort(statistic(np.concatenate(drawn, axis=-1)))
-    cut = round(resamples * (1.0 - level) / 2.0)  # order statistics without interpolation, which infinities would not survive
+    cut = round(resamples * (1.0 - level) / 2.0)  # no interpolation between order statistics, because values may be infinite
     return Estimate(value, float(samples[cut]), float(samples[-1 - cut]))
 
 
@@ -104,8 +104,8 @@ def _check_level(level: float) -> None:
 def paired_improvement(x: np.ndarray, y: np.ndarray, *, level: float = LEVEL, resamples: int = RESAMPLES) -> Estimate:
     """P(X > Y) + P(X = Y) / 2 over pairs (x_k, y_k) of one draw each, with its bootstrap interval over draws.
 
-    The probability of improvement of Agarwal et al. for methods that see the same draws: what a draw does to both cancels, as in
-    a sign test. Larger is better; -inf stands for a run that failed. 0.5 means no difference.
+    The probability of improvement of Agarwal et al. for methods on the same draws: the common effect of a draw cancels, as in a
+    sign test. Larger x and y are better, and -inf marks a failed run. A value of 0.5 means no difference.
 
     Raises:
         ConfigurationError: samples of different sizes.
@@ -121,24 +121,24 @@ def _wins(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def rate(events: Sequence[bool] | np.ndarray, *, level: float = LEVEL) -> Estimate:
-    """Share of runs in which something happened, a violation for example, with Wilson's score interval; NaN without runs."""
+    """Share of runs with an event, for example a violation, and Wilson's score interval; NaN without runs."""
     return wilson(int(np.count_nonzero(events)), len(events), level=level)
 
 
 def wilson(successes: int, trials: int, *, level: float = LEVEL) -> Estimate:
     """k / n and Wilson's interval, (k + z²/2 ± z sqrt(k (n - k) / n + z²/4)) / (n + z²).
 
-    Unlike a bootstrap interval it has a width at 0 and 1.
+    Unlike a bootstrap interval, it has a nonzero width at 0 and 1.
 
     Raises:
-        ConfigurationError: counts that are not 0 <= k <= n, or a level outside (0, 1).
+        ConfigurationError: counts without 0 <= k <= n, or a level outside (0, 1).
     """
     _check_level(level)
     if not 0 <= successes <= trials:
         raise ConfigurationError(f"need 0 <= successes <= trials, got {successes} of {trials}")
     if trials == 0:
         return Estimate(np.nan, np.nan, np.nan)
-    from scipy.stats import binomtest  # here, as it takes longer to import than most commands take to answer
+    from scipy.stats import binomtest  # imported here because the import takes longer than most commands
 
     interval = binomtest(successes, trials).proportion_ci(level, method="wilson")
     return Estimate(successes / trials, float(interval.low), float(interval.high))

@@ -1,4 +1,4 @@
-"""The result of one method, and the two machine-readable files made from results: summary.json and episodes.csv."""
+"""The result of one method, and the two machine-readable files of results: summary.json and episodes.csv."""
 
 import csv
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ TEAM_KEYS = tuple(TeamMetrics.__annotations__)
 
 @dataclass(frozen=True)
 class Result:
-    """One method's episode, or the reason why there is none: a failed method is reported, never dropped.
+    """One method's episode, or the reason why it failed; a failed method is reported, never dropped.
 
     Raises:
         ConfigurationError: neither metrics nor a failure, or both.
@@ -32,7 +32,7 @@ class Result:
     trajectory: Trajectory | None = None
     metrics: Metrics | None = None
     failure: str | None = None
-    solver_share: float | None = None  # of the decision time, in a network or solver; None: the supervisor does not report it
+    solver_share: float | None = None  # share of the decision time spent in a network or solver; None if not reported
 
     def __post_init__(self) -> None:
         if (self.metrics is None) == (self.failure is None):
@@ -60,17 +60,17 @@ class Result:
 
 
 def method_key(supervisor: str, controller: str) -> str:
-    """The name of a method in summaries and files: ``scripted+sorlc``; of what a user's file has, without its folder."""
+    """The name of a method in summaries and files: ``scripted+sorlc``; names from a user's file omit its folder."""
     return f"{short_name(supervisor)}+{short_name(controller)}"
 
 
 def summary(results: Sequence[Result], scenario_name: str, versions: Mapping[str, str]) -> dict[str, Any]:
-    """The content of summary.json, schema 1: for each method its agents, its team and the scores made from them.
+    """The content of summary.json, schema 1: for each method the metrics of agents and team, and the scores.
 
-    Numbers that are not finite become null; a failed method has its reason instead.
+    Numbers that are not finite become null; a failed method has only the reason.
 
     Raises:
-        ConfigurationError: two results of one method.
+        ConfigurationError: two results of the same method.
     """
     methods: dict[str, Any] = {}
     for result in results:
@@ -88,7 +88,7 @@ def _entry(result: Result) -> dict[str, Any]:
 
 
 def write_csv(results: Sequence[Result], path: Path) -> Path:
-    """Write episodes.csv: a row per method and agent, the team's columns repeated; for a failed method one row without agent."""
+    """Write episodes.csv: one row per method and agent, with the team's columns repeated, or one row for a failed method."""
     header = (
         "supervisor",
         "controller",
@@ -118,5 +118,5 @@ def _csv_rows(result: Result) -> list[dict[str, Any]]:
 
 
 def json_numbers(value: Any) -> Any:
-    """Nested containers as JSON data; a number that is not finite becomes None, as JSON has no infinity."""
+    """Convert nested containers to JSON data; a number that is not finite becomes None, because JSON has no infinity."""
     return plain_data(value, not_finite=lambda _: None)

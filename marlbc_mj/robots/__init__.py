@@ -1,4 +1,4 @@
-"""Robots: one MJCF file and one Python file each, by name, or by the path of a user's."""
+"""Robots by name, each with an MJCF file and a Python file, or from the path of a user's file."""
 
 from collections.abc import Callable, Sequence
 from functools import cache
@@ -20,14 +20,14 @@ ROBOTS: dict[str, tuple[Callable[[], Robot], str]] = {
     "diff_drive": (diff_drive, DIFF_DRIVE),
     "crazyflie": (crazyflie, CRAZYFLIE),
 }
-"""Factory and one line of description by name."""
+"""Factory and one-line description of each robot, by name."""
 
 _make = cache(lambda factory: factory())
 _loaded: dict[str, tuple[Stamp, Robot]] = {}
 
 
 def _load(name: str) -> Robot:
-    """The robot of a user's file; loaded again after an edit, or when the name means another file."""
+    """The robot of a user's file; it is loaded again after an edit or when the name resolves to another file."""
     stamp = stamp_of(name)
     if name not in _loaded or _loaded[name][0] != stamp:
         _loaded[name] = stamp, load(name)
@@ -35,10 +35,10 @@ def _load(name: str) -> Robot:
 
 
 def make_robot(name: str) -> Robot:
-    """A robot by name, or from the path of a user's ``.py`` or ``.xml``.
+    """A robot by name, or from the path of a user's ``.py`` or ``.xml`` file.
 
     Raises:
-        ConfigurationError: unknown name, a file that cannot be used, or an optional package that is missing.
+        ConfigurationError: an unknown name, an unusable file, or a missing optional package.
     """
     if name in ROBOTS:
         robot: Robot = _make(ROBOTS[name][0])
@@ -49,10 +49,10 @@ def make_robot(name: str) -> Robot:
 
 
 def make_fleet(names: Sequence[str]) -> RobotFleet:
-    """The robots of a team, from the name of each agent's.
+    """The robots of a team, from the names of all agents' robots.
 
     Raises:
-        ConfigurationError: as :func:`make_robot`, or robots that cannot be in one world.
+        ConfigurationError: as :func:`make_robot`, or robots that cannot share a world.
     """
     fleet = RobotFleet(tuple(map(make_robot, names)))
     fleet.check_ground()
@@ -60,10 +60,10 @@ def make_fleet(names: Sequence[str]) -> RobotFleet:
 
 
 def register(robot: Robot) -> Robot:
-    """Register a user's robot under a name that scenarios can use, for this process.
+    """Register a user's robot under its name, so that scenarios in this process can use it.
 
     Raises:
-        ConfigurationError: the name is taken.
+        ConfigurationError: another robot has that name.
     """
     if robot.name in ROBOTS and _make(ROBOTS[robot.name][0]) != robot:
         raise ConfigurationError(f"a robot named {robot.name!r} exists; names that are taken: {', '.join(ROBOTS)}")

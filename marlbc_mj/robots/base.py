@@ -1,4 +1,4 @@
-"""What a robot is: its MJCF file, where its planar motion is, its two laws, and the scale of its missions."""
+"""The definition of a robot: its MJCF file, the joints of its planar motion, its two laws, and the scale of its missions."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -17,7 +17,7 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
 MODELS = Path(str(files("marlbc_mj") / "models"))
-"""Folder of the MJCF files; in the repository a link to ``models/``."""
+"""Folder of the MJCF files; in the repository it is a link to ``models/``."""
 
 
 def _names(law: laws.Law) -> tuple[laws.Names, laws.Names]:
@@ -27,53 +27,53 @@ def _names(law: laws.Law) -> tuple[laws.Names, laws.Names]:
 
 
 def _as_it_is(spec: mujoco.MjSpec) -> None:
-    """A file that needs no change."""
+    """Leave the MJCF unchanged."""
 
 
 @dataclass(frozen=True)
 class Robot:
-    """How a body's planar position and velocity are found, and how a planar force drives it. Names are those inside the MJCF.
+    """How a robot's planar position and velocity are read, and how a planar force drives it. Names are those inside the MJCF.
 
-    A robot without laws is *direct*: its two ``motors`` push along x and y with the scenario's force limit, and p, v are its
-    joints' own; gears, reversed or offset slides and forms of limits are taken into account.
+    A robot without laws is *direct*: its two ``motors`` push along x and y with the scenario's force limit, and p and v are its
+    joints' coordinates and velocities. Gears, reversed or offset slides and all kinds of limits are taken into account.
 
-    Every other robot has a ``drive`` that turns the force into controls before each substep and a ``reading`` of p, v and the
-    force that its actuators really gave, after it.
+    Every other robot has two laws: before each substep ``drive`` turns the force into controls; after it ``reading`` returns p, v
+    and the force that the actuators really applied.
 
-    ``mass`` and what follows it are the scale of a robot's missions, see :meth:`scale`. A robot with no mass of its own takes the
+    ``mass`` and the fields after it set the scale of a robot's missions, see :meth:`scale`. A robot without a mass takes the
     scenario's, as the paper's point mass does.
 
     Raises:
-        ConfigurationError: a number that cannot be, or one law without the other.
+        ConfigurationError: an invalid value, or one law without the other.
     """
 
     name: str
     mjcf: Path
     description: str
-    joints: tuple[str, ...]  # two slide joints along x and y, or one free joint: unknown dynamics push here
-    body: str  # carries the mass; its geoms take the agent's color
-    radius: float  # of the smallest circle that it fits in, seen from above [m]
-    motors: tuple[str, ...] = ()  # direct robots: the actuators of x and y
-    drive: laws.Law | None = None  # as laws.DRIVE
-    reading: laws.Law | None = None  # as laws.READING
+    joints: tuple[str, ...]  # two slide joints along x and y, or one free joint; unknown dynamics act on them
+    body: str  # body with the mass; its geoms take the agent's color
+    radius: float  # radius of the enclosing circle, seen from above [m]
+    motors: tuple[str, ...] = ()  # actuators along x and y of a direct robot
+    drive: laws.Law | None = None  # law of kind laws.DRIVE
+    reading: laws.Law | None = None  # law of kind laws.READING
     params: laws.Numbers = field(default_factory=dict)  # gains of both laws, by name
-    state: laws.Numbers = field(default_factory=dict)  # what the laws remember, by name; what is left out starts at 0
-    report: tuple[str, ...] = ()  # names in the state that diagnostics show, "saturated" for example
-    mass: float | None = None  # what a planar force accelerates, wheels and rotors included [kg]
+    state: laws.Numbers = field(default_factory=dict)  # initial state of the laws, by name; missing entries start at 0
+    report: tuple[str, ...] = ()  # state entries shown in diagnostics, for example "saturated"
+    mass: float | None = None  # effective mass for a planar force, including wheels and rotors [kg]
     force_limit: float = np.inf  # per axis [N]
-    speed_limit: float = np.inf  # of references [m/s]
-    acceleration_limit: float = np.inf  # of references [m/s^2]
-    gains: tuple[float, float] = (100.0, 100.0)  # that track a step without overshoot, per unit mass [1/s^2, 1/s]
-    length: float = 1.0  # what 1 m of the paper's mission is for this robot [m]
-    substep: float = np.inf  # largest that its contacts and inner loops take [s]
-    height: float = 0.0  # that it flies at [m]
-    contact: bool = False  # obstacles and other agents are solid
-    force_error: float | None = None  # bound of what moves it besides u and f, in every direction [N]; None: not known
-    slip: float = 0.0  # by which its velocity may lag behind its force, in contact with the ground [m/s]
-    friction: float = 0.0  # Coulomb friction that only slows it down, and that force_error leaves out [N]
-    tube: float | None = None  # measured: how far it may be from its reference with its own gains [m]; None: not known
-    ground: bool = False  # stands on the arena's ground by its own geoms' contact; else its MJCF has a floor, or it flies
-    prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in what the MJCF leaves open
+    speed_limit: float = np.inf  # speed limit of references [m/s]
+    acceleration_limit: float = np.inf  # acceleration limit of references [m/s^2]
+    gains: tuple[float, float] = (100.0, 100.0)  # PD gains per unit mass that track a step without overshoot [1/s^2, 1/s]
+    length: float = 1.0  # length unit: 1 m of the paper's mission at this robot's scale [m]
+    substep: float = np.inf  # largest substep for its contacts and inner loops [s]
+    height: float = 0.0  # flight height [m]; 0 for a ground robot
+    contact: bool = False  # whether it collides with obstacles and other agents
+    force_error: float | None = None  # bound on forces other than u and f, in every direction [N]; None: unknown
+    slip: float = 0.0  # how far its velocity may lag behind its force through contact with the ground [m/s]
+    friction: float = 0.0  # bound on friction against the motion, which force_error does not include [N]
+    tube: float | None = None  # measured largest distance from its reference with its own gains [m]; None: unknown
+    ground: bool = False  # whether its geoms touch the arena's ground; if not, its MJCF has a floor or it flies
+    prepare: Callable[[mujoco.MjSpec], None] = _as_it_is  # fills in values that the MJCF leaves open
 
     def __post_init__(self) -> None:
         self._check_kinds()
@@ -92,7 +92,7 @@ class Robot:
             raise ConfigurationError(f"robot {self.name!r}: joints must name two slides or one free joint, got {self.joints}")
 
     def _check_kinds(self) -> None:
-        """Raise ConfigurationError for a field of the wrong kind; names lose their slashes, as those of the MJCF do."""
+        """Raise ConfigurationError for a field of the wrong type; replace slashes in names as in the MJCF."""
         if not isinstance(self.mjcf, Path):
             raise ConfigurationError(f"robot {self.name!r}: mjcf must be a pathlib.Path, got {self.mjcf!r}; write Path(...)")
         if not isinstance(self.body, str):
@@ -111,19 +111,19 @@ class Robot:
 
     @property
     def direct(self) -> bool:
-        """Whether the planar force goes to the motors as it is."""
+        """Whether the planar force is the motors' control, without a drive in between."""
         return self.drive is None
 
     def params_row(self) -> np.ndarray:
-        """(P,) gains as the loop hands them to both laws; empty for a direct robot.
+        """(P,) gains that the loop passes to both laws; empty for a direct robot.
 
         Raises:
-            ConfigurationError: a name that is missing or unknown.
+            ConfigurationError: a missing or unknown name.
         """
         return np.zeros(0) if self.drive is None else laws.pack_gains(self.drive, self.params)
 
     def state_row(self) -> np.ndarray:
-        """(S,) state of both laws at the start, in the loop's order; empty for a direct robot.
+        """(S,) initial state of both laws, in the loop's order; empty for a direct robot.
 
         Raises:
             ConfigurationError: an unknown name.
@@ -132,25 +132,25 @@ class Robot:
 
     @property
     def diagnostics(self) -> dict[str, int]:
-        """Where in the state each number is that ``report`` names."""
+        """Index in the state of each entry named in ``report``."""
         return {} if self.drive is None else {name: laws.interface(self.drive).state.at(name) for name in self.report}
 
     @property
     def shipped(self) -> bool:
-        """Whether its MJCF comes with this package and is taken as it is."""
+        """Whether its MJCF comes with this package; such a file is used as it is."""
         return self.mjcf.is_relative_to(MODELS)
 
     def spec(self) -> mujoco.MjSpec:
-        """The MJCF, ready to be attached: a copy of what is read once. A user's file is brought into standard form.
+        """A copy of the MJCF, ready to be attached; the file is read once. A user's file is converted to standard form.
 
         Raises:
-            ConfigurationError: the file cannot be read, is no MJCF, or lacks what the robot names.
+            ConfigurationError: the file cannot be read, is not MJCF, or lacks a body, joint or motor that the robot names.
         """
         return self._prepared.copy()
 
     @cached_property
     def _prepared(self) -> mujoco.MjSpec:
-        """The MJCF of a shipped robot, or a user's in standard form; of a direct robot with planar forces for controls."""
+        """The MJCF of a shipped robot, or a user's in standard form; a direct robot's controls are then its planar forces."""
         if self.shipped:
             return self._as_shipped()
         with quiet():
@@ -167,7 +167,7 @@ class Robot:
         return spec
 
     def _as_shipped(self) -> mujoco.MjSpec:
-        """The MJCF as its file has it."""
+        """The MJCF from its file, after ``prepare``."""
         try:
             spec = mujoco.MjSpec.from_file(str(self.mjcf))
         except (ValueError, FileNotFoundError) as error:
@@ -176,7 +176,7 @@ class Robot:
         return spec
 
     def _check_names(self, spec: mujoco.MjSpec) -> None:
-        """Raise ConfigurationError for a body, joint or motor that the MJCF does not have."""
+        """Raise ConfigurationError if the MJCF lacks a named body, joint or motor."""
         there = {
             "body": ((self.body,), [body.name for body in spec.bodies[1:]]),
             "joints": (self.joints, [joint.name for joint in spec.joints]),
@@ -191,7 +191,7 @@ class Robot:
                     )
 
     def __getstate__(self) -> dict[str, Any]:
-        """The fields alone: what was read from the file is read again."""
+        """Pickle the fields only; the MJCF is read again when needed."""
         return {name: value for name, value in vars(self).items() if name != "_prepared"}
 
     def scale(self) -> dict[str, Any]:
@@ -209,7 +209,7 @@ class Robot:
         }
 
     def check(self, scenario: Any) -> None:
-        """Raise ConfigurationError where a scenario asks of this robot what it is not."""
+        """Raise ConfigurationError if a scenario's mass, force limit or substep does not fit this robot."""
         if self.mass is not None and not np.isclose(scenario.mass, self.mass, rtol=1e-9, atol=0.0):
             raise ConfigurationError(
                 f"scenario {scenario.name!r}: mass {scenario.mass:g} kg, but robot {self.name!r} has {self.mass:g} kg; "
@@ -219,7 +219,7 @@ class Robot:
             self.check_limit(scenario, name)
 
     def check_limit(self, scenario: Any, name: str) -> None:
-        """Raise ConfigurationError for a field of a scenario that is larger than this robot's of the same name."""
+        """Raise ConfigurationError if a scenario's field exceeds this robot's field of the same name."""
         value, most = getattr(scenario, name), getattr(self, name)
         if value > most * (1 + 1e-9):
             raise ConfigurationError(

@@ -1,8 +1,9 @@
 """A Crazyflie 2.x (cf2x_L250) at a held height, with the measured parameters of the optional package drone-models (MIT).
 
-Mass, inertia, arm, thrust limits and torque per thrust are its ``data/params.toml``; the attitude's response is its identified
-model of the vehicle with its firmware (``so_rpy``), the lag of the thrust that of ``so_rpy_rotor``. The package's own MJCF is not
-used: it has another mass and inertia than those measured, no limits, no free joint, and meshes that a log could not carry along.
+Mass, inertia, arm length, thrust limits and torque per thrust come from the package's ``data/params.toml``. The attitude response
+is its identified model of the vehicle with firmware (``so_rpy``); the thrust lag is that of ``so_rpy_rotor``. The package's MJCF
+is not used: its mass and inertia differ from the measured ones, and it has no limits, no free joint, and meshes that do not fit
+in a log.
 """
 
 import tomllib
@@ -23,7 +24,7 @@ _MJCF = MODELS / "robots" / "crazyflie.xml"
 
 
 def _measured(model: str) -> dict[str, Any]:
-    """A drone's parameters from one of the package's files; the package itself is not imported.
+    """The drone's parameters from one of the package's files, without importing the package.
 
     Raises:
         ConfigurationError: the package is not installed.
@@ -38,7 +39,7 @@ def _measured(model: str) -> dict[str, Any]:
 
 
 def _prepare(spec: mujoco.MjSpec) -> None:
-    """Fill in mass, inertia, places of the rotors, their limits and torques."""
+    """Fill in mass, inertia, and the positions, limits and torques of the rotors."""
     drone = _measured("data")
     body = spec.body("body")
     body.mass, body.inertia = drone["mass"], [drone["J"][k][k] for k in range(3)]
@@ -51,7 +52,7 @@ def _prepare(spec: mujoco.MjSpec) -> None:
 
 
 def crazyflie() -> Robot:
-    """Its force limit is 0.3 of its weight per axis: 23 degrees of tilt where both axes are at it.
+    """The Crazyflie. Its force limit per axis is 0.3 of its weight: a tilt of 23 degrees with both axes at the limit.
 
     Raises:
         ConfigurationError: the optional package is missing.
@@ -81,7 +82,7 @@ def crazyflie() -> Robot:
         length=0.2,
         substep=0.0025,
         contact=True,
-        tube=0.15,  # 0.12 m measured, see studies/shield_robots
+        tube=0.15,  # measured: 0.12 m, see studies/shield_robots
         prepare=_prepare,
         height=params["height"],
     )

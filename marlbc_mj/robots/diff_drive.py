@@ -1,7 +1,8 @@
-"""Two driven wheels and a caster: a point ahead of the axle follows second-order laws as if it were a point mass.
+"""A differential drive with a caster: a point ahead of the axle follows second-order laws as if it were a point mass.
 
-The point p = c + l (cos t, sin t) has p'' = R(t) (u' - l w^2, l w' + u w) for the axle's speed u and turn rate w: p'' gives u',
-w' and the wheels' torques (d'Andrea-Novel, Campion, Bastin 1995). Mass d ahead: m u' = F + m d w^2, I w' = M - m d u w.
+The point p = c + l (cos t, sin t) has p'' = R(t) (u' - l w^2, l w' + u w) for the axle's speed u and turn rate w. So p'' gives
+u', w' and the wheels' torques (d'Andrea-Novel, Campion, Bastin 1995). With the center of mass d ahead of the axle,
+m u' = F + m d w^2 and I w' = M - m d u w.
 """
 
 import mujoco
@@ -12,17 +13,17 @@ from marlbc_mj.robots.base import MODELS, Robot
 from marlbc_mj.robots.wheels import heading, inertia
 
 DIFF_DRIVE = "6.6 kg base on two driven wheels and a caster, led by a point 0.15 m ahead of its axle"
-_WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, how far ahead the point is [m]
+_WHEEL, TRACK, AHEAD = 0.06, 0.17, 0.15  # radius of a wheel, half the track, distance from the axle to the point [m]
 _MJCF = MODELS / "robots" / "diff_drive.xml"
 
 
 _GAINS = (
     "wheel",  # r, radius of a wheel [m]
     "half_track",  # b [m]
-    "ahead",  # l, of the point in front of the axle [m]
+    "ahead",  # l, distance from the axle to the point ahead [m]
     "mass",  # m, spinning wheels included [kg]
     "inertia",  # I about z, spinning wheels included [kg m^2]
-    "offset",  # m d [kg m]
+    "offset",  # m d, d from the axle to the center of mass [kg m]
     "torque_limit",  # [N m]
 )
 _STATE = (
@@ -30,7 +31,7 @@ _STATE = (
     "speed",
     "turn_rate",
     "saturated",
-)  # t [rad], u [m/s], w [rad/s], substeps in which a torque was at its limit
+)  # t [rad], u [m/s], w [rad/s], substeps with a torque at its limit (each wheel counts 0.5)
 
 
 @laws.drive(gains=_GAINS, state=_STATE)
@@ -51,7 +52,7 @@ def diff_drive_drive(gains, state, qpos, qvel, force, h, ctrl_out):
 
 @laws.reading(gains=_GAINS, state=_STATE)
 def diff_drive_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
-    """p, v of the point ahead; force = m p'' for the torques given, at the motion that the drive saw."""
+    """p, v of the point ahead; force = m p'' for the applied torques, with heading and rates that the drive used."""
     r, b, ahead, mass, turn, offset = gains.wheel, gains.half_track, gains.ahead, gains.mass, gains.inertia, gains.offset
     t, w = heading(qpos[3:7]), qvel[5]
     p_out[0], p_out[1] = qpos[0] + ahead * np.cos(t), qpos[1] + ahead * np.sin(t)
@@ -65,7 +66,7 @@ def diff_drive_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, f
 
 
 def diff_drive() -> Robot:
-    """Inertias are read from the MJCF; spinning wheels add 2 I / r^2 to the mass and 2 I (b / r)^2 to the turning inertia."""
+    """The differential drive. Inertias come from the MJCF; wheel spin adds 2 I / r^2 to m and 2 I (b / r)^2 to yaw inertia."""
     own = inertia(mujoco.MjSpec.from_file(str(_MJCF)))
     mass, turn = own.mass + 2.0 * own.wheel / _WHEEL**2, own.turn + 2.0 * own.wheel * (TRACK / _WHEEL) ** 2
     return Robot(
@@ -95,5 +96,5 @@ def diff_drive() -> Robot:
         length=0.6,
         substep=0.0025,
         contact=True,
-        tube=0.3,  # 0.23 m measured, see studies/shield_robots
+        tube=0.3,  # measured: 0.23 m, see studies/shield_robots
     )

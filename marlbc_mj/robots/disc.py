@@ -1,4 +1,4 @@
-"""A massive disc that slides on the ground: contact with agents and obstacles, Coulomb friction with the ground."""
+"""A massive disc that slides on the ground with Coulomb friction and collides with agents and obstacles."""
 
 from marlbc_mj.robots.base import MODELS, Robot
 
@@ -6,7 +6,7 @@ DISC = "4 kg puck that slides under Coulomb friction and collides with agents an
 
 
 def disc() -> Robot:
-    """Direct: its motors push the free joint along x and y of the ground; friction brakes with up to 0.15 m g = 5.9 N."""
+    """The disc, a direct robot: motors push its free joint along x and y; friction brakes with up to 0.15 m g = 5.9 N."""
     return Robot(
         name="disc",
         mjcf=MODELS / "robots" / "disc.xml",
@@ -23,6 +23,6 @@ def disc() -> Robot:
         length=0.5,
         substep=0.0025,
         contact=True,
-        force_error=8.0,  # 7.3 N seen where forces jump: it rocks on its edge
-        friction=40.0,  # 5.9 N, and several times as much while it rocks
+        force_error=8.0,  # up to 7.3 N occur when the force jumps and the disc rocks on its edge
+        friction=40.0,  # 5.9 N when flat, several times as much while it rocks
     )

@@ -1,6 +1,6 @@
-"""Checks of a stranger's MJCF: regular files in its own folder, of sizes and counts that a robot can have.
+"""Checks of an untrusted MJCF: it may use only regular files in its own folder, of plausible sizes and counts.
 
-MuJoCo opens includes, models and assets while it parses, so the text is read here first, without opening any of them blindly.
+MuJoCo opens includes, models and assets while it parses, so the text and every file that it names are checked here first.
 """
 
 import re
@@ -13,9 +13,9 @@ from xml.etree import ElementTree
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import one_line
 
-_MOST_BYTES = 64_000_000  # of one file
+_MOST_BYTES = 64_000_000  # size of one file
 _MOST_FILES = 2_000
-_MOST_COPIES = 10_000  # that nested replicates, or a composite or flexcomp, may make
+_MOST_COPIES = 10_000  # copies that nested replicate, composite or flexcomp elements may make
 _MOST = {
     "nrow": 4096,
     "ncol": 4096,
@@ -33,7 +33,7 @@ _MOST = {
     "nuserdata": 100_000,
     "nkey": 10_000,
 }
-"""Largest value of an attribute; of those that start with ``nuser_``: _MOST_USER."""
+"""Largest value of each attribute; _MOST_USER is that of attributes that start with ``nuser_``."""
 _MOST_USER = 1_000
 _MOST_MEMORY = 2**30  # bytes, of ``<size memory="...">``
 _UNITS = {"K": 2**10, "M": 2**20, "G": 2**30, "T": 2**40, "P": 2**50, "E": 2**60}
@@ -48,10 +48,11 @@ class _Source(NamedTuple):
 
 
 def check_files(path: Path) -> None:
-    """Check an MJCF, all that it includes and every file that it names, before MuJoCo reads any of them.
+    """Check an MJCF, its includes and every file that it names, before MuJoCo reads any of them.
 
     Raises:
-        ConfigurationError: a file outside the MJCF's folder, missing, no regular file or too large; or a number beyond _MOST.
+        ConfigurationError: a file that is outside the MJCF's folder, missing, not regular or too large; or a number above its
+            limit.
     """
     folder, named = path.resolve().parent, 0
     for source in _sources(path, folder):
@@ -67,7 +68,7 @@ def check_files(path: Path) -> None:
 
 
 def _sources(path: Path, folder: Path) -> Iterator[_Source]:
-    """The MJCF itself, then what it includes or attaches, each once."""
+    """The MJCF itself, then every file that it includes or attaches, each once."""
     waiting, seen = [path.resolve()], set[Path]()
     while waiting:
         here = waiting.pop()
@@ -102,10 +103,10 @@ _TOKEN = re.compile(r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<!|<(?:[^>"']|"
 
 
 def _strict(text: str) -> str:
-    """XML as MuJoCo's parser takes it in words that Python's takes: comments may hold ``--``, values ``<`` and ``&``.
+    """Rewrite XML that MuJoCo's parser accepts so that Python's does too: ``--`` in comments, ``<`` and ``&`` in values.
 
     Raises:
-        ValueError: a part that is neither a tag, a comment nor text; a document type, for example.
+        ValueError: a part that is neither a tag, a comment nor text, for example a document type.
     """
     out, at = [], 0
     for token in _TOKEN.finditer(text):
@@ -114,7 +115,7 @@ def _strict(text: str) -> str:
             break
         at = token.end()
         if part.startswith(("<!", "<?")) or not part.startswith("<"):
-            continue  # nothing of an MJCF is in texts between tags
+            continue  # MJCF has no content in text between tags
         out.append("<" + re.sub("&(?!#?\\w+;)", "&amp;", part[1:].replace("<", "&lt;")))
     if at != len(text):
         raise ValueError(f"no tag, comment or text from character {at} on")
@@ -122,10 +123,10 @@ def _strict(text: str) -> str:
 
 
 def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:
-    """The file that is meant; every place where MuJoCo might look for it is checked.
+    """The path of a file named in an MJCF; every place where MuJoCo might look for it is checked.
 
     Raises:
-        ConfigurationError: one of them is outside the folder, or none is there.
+        ConfigurationError: the file is outside the folder, missing, not regular or too large.
     """
     options = list(source.root.iter("compiler"))
     inside = [element.get(key, "") for element in options for key in _DIRECTORIES if element.get(key)]
@@ -156,7 +157,7 @@ def _check_numbers(path: Path, element: ElementTree.Element) -> None:
 
 
 def _number(text: str) -> float:
-    """The number in an attribute; 0 for what is none, which MuJoCo refuses itself."""
+    """The number in an attribute; 0 for other text, which MuJoCo itself rejects."""
     try:
         return float(text)
     except ValueError:
@@ -164,7 +165,7 @@ def _number(text: str) -> float:
 
 
 def _check_copies(path: Path, root: ElementTree.Element) -> None:
-    """Raise ConfigurationError where nested elements with a count multiply beyond _MOST_COPIES."""
+    """Raise ConfigurationError if the counts of nested elements multiply to more than _MOST_COPIES."""
     waiting = [(root, 1.0)]
     while waiting:
         element, copies = waiting.pop()

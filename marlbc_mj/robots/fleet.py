@@ -1,4 +1,4 @@
-"""The robots of one team, agent by agent: what they have in common, and whose scale counts where they differ."""
+"""The robots of one team, one per agent, and the numbers that apply to the whole team if they differ."""
 
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,7 +14,7 @@ class AgentGroup(NamedTuple):
     """Adjacent agents with the same robot."""
 
     first: int
-    end: int  # behind the last of them
+    end: int  # one past the last agent
     robot: Robot
 
 
@@ -22,25 +22,25 @@ class AgentGroup(NamedTuple):
 class RobotFleet:
     """The robots of a team, one per agent, in the order of the agents; they may differ.
 
-    Where one number is wanted for the whole team, that of the robot counts that is hardest to please: the greatest size and
-    length unit, the smallest speed, acceleration and substep.
+    A single number for the whole team is the most restrictive one: the greatest size and length unit, the smallest speed,
+    acceleration and substep.
     """
 
     robots: tuple[Robot, ...]
 
     @property
     def mixed(self) -> bool:
-        """Whether two of them differ."""
+        """Whether any two robots differ."""
         return any(robot is not self.robots[0] for robot in self.robots)
 
     @property
     def kinds(self) -> tuple[Robot, ...]:
-        """Each different robot once, in the order in which they occur."""
+        """Each distinct robot once, in order of first occurrence."""
         return tuple({id(robot): robot for robot in self.robots}.values())
 
     @property
     def groups(self) -> tuple[AgentGroup, ...]:
-        """Adjacent agents with the same robot; agents keep their numbers, so a kind may have several groups."""
+        """Groups of adjacent agents with the same robot; agents keep their numbers, so a robot may have several groups."""
         found, first = [], 0
         for _, members in groupby(self.robots, key=id):
             same = list(members)
@@ -55,7 +55,7 @@ class RobotFleet:
 
     @property
     def words(self) -> str:
-        """The robots in messages: ``'disc'``, or ``'disc' and 'omni'``."""
+        """Names of the robots for messages: ``'disc'``, or ``'disc' and 'omni'``."""
         first, *others = [repr(robot.name) for robot in self.kinds]
         return f"{', '.join([first, *others[:-1]])} and {others[-1]}" if others else first
 
@@ -71,17 +71,17 @@ class RobotFleet:
 
     @property
     def length(self) -> float:
-        """Greatest length unit: what 1 m of the paper's mission is for the team [m]."""
+        """Greatest length unit: 1 m of the paper's mission at the team's scale [m]."""
         return max(robot.length for robot in self.robots)
 
     @property
     def height(self) -> float:
-        """Greatest height [m]; 0 where nobody flies."""
+        """Greatest flight height [m]; 0 if no robot flies."""
         return max(robot.height for robot in self.robots)
 
     @property
     def contact(self) -> bool:
-        """Whether obstacles are solid: to any of them."""
+        """Whether obstacles are solid to any of the robots."""
         return self.solid is not None
 
     @property
@@ -91,36 +91,36 @@ class RobotFleet:
 
     @property
     def floating(self) -> bool:
-        """Whether any moves on a free joint, so that it has a pose."""
+        """Whether any robot has a free joint, and so a pose."""
         return any(len(robot.joints) == 1 for robot in self.robots)
 
     @property
     def massive(self) -> bool:
-        """Whether any has a mass of its own."""
+        """Whether any robot has a mass of its own."""
         return any(robot.mass is not None for robot in self.robots)
 
     def least(self, name: str) -> float:
-        """Smallest value of a robot's field."""
+        """Smallest value of a field over all robots."""
         return min(float(getattr(robot, name)) for robot in self.robots)
 
     def masses(self, own: float) -> np.ndarray:
-        """(N,) masses [kg]; those without a mass have their scenario's ``own``."""
+        """(N,) masses [kg]; robots without a mass take ``own``, the scenario's mass."""
         return np.array([own if robot.mass is None else robot.mass for robot in self.robots], dtype=np.float64)
 
     def unit_forces(self, own: float) -> np.ndarray:
-        """(N,) what a controller's output of 1 is [N]: the scenario's ``own`` in a team of one robot, else each robot's mass."""
+        """(N,) forces for a controller's output of 1 [N]: each robot's mass in a mixed team, else ``own``, the scenario's."""
         return self.masses(own) if self.mixed else np.full(len(self.robots), own, dtype=np.float64)
 
     def force_limits(self, limit: float) -> np.ndarray:
-        """(N,) force limits per axis [N]: the scenario's, and no more than each robot has."""
+        """(N,) force limits per axis [N]: the scenario's ``limit``, capped by each robot's own."""
         return np.array([min(limit, robot.force_limit) for robot in self.robots], dtype=np.float64)
 
     def scale(self) -> dict[str, Any]:
         """The fields of a :class:`~marlbc_mj.scenarios.Scenario` that these robots set.
 
-        In a mixed team every agent has its robot's own mass, force limit and force unit. The scenario's ``force_limit`` is the
-        greatest of them; ``speed_limit``, ``acceleration_limit`` and ``substep`` are the smallest. The scenario's ``mass`` and
-        ``unit_force`` stand for robots that have none. What is unlimited is left out.
+        In a mixed team every agent uses its robot's own mass, force limit and force unit. The scenario's ``force_limit`` is the
+        greatest force limit; ``speed_limit``, ``acceleration_limit`` and ``substep`` are the smallest ones. The scenario's
+        ``mass`` and ``unit_force`` apply to robots without a mass. Infinite limits are omitted.
         """
         first = self.robots[0]
         if not self.mixed:
@@ -132,7 +132,7 @@ class RobotFleet:
         return {"robot": names[0], "robots": names, **finite}
 
     def check(self, scenario: Any) -> None:
-        """Raise ConfigurationError where a scenario asks of these robots what they are not."""
+        """Raise ConfigurationError if a scenario does not fit these robots; for a mixed team only the substep is checked."""
         if not self.mixed:
             self.robots[0].check(scenario)
             return
@@ -140,7 +140,7 @@ class RobotFleet:
             robot.check_limit(scenario, "substep")
 
     def check_ground(self) -> None:
-        """Raise ConfigurationError where one stands on the arena's ground and another on a floor of its own file."""
+        """Raise ConfigurationError if one robot stands on the arena's ground and another on a floor in its own MJCF."""
         standing = [robot.name for robot in self.kinds if robot.ground]
         others = [robot.name for robot in self.kinds if robot.contact and not robot.ground and not robot.height]
         if standing and others:

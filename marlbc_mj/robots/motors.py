@@ -1,4 +1,4 @@
-"""The motors that push a base along x and y, found by their effect, with every limit between control and base."""
+"""Finds the motors that push a base along x and y by their effect, with all limits between control and base."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,19 +14,19 @@ class Motor(NamedTuple):
 
     name: str
     scale: float  # planar force per actuator force [N/N]
-    low: float  # of the planar force, by every limit on the way [N]
-    high: float
+    low: float  # least planar force that all limits allow [N]
+    high: float  # greatest planar force that all limits allow [N]
 
 
 class Reason(NamedTuple):
-    """An actuator along x or y whose force is not its control, and why."""
+    """An actuator along x or y that is not a plain motor, and why."""
 
     name: str
     why: str
 
 
 def posed(model: mujoco.MjModel, turn: float = 0.0) -> mujoco.MjData:
-    """The model at its reference pose; with a ``turn`` [rad or m] every joint is moved by that much."""
+    """Data of the model at its reference pose, with every joint moved by ``turn`` [rad or m]."""
     data = mujoco.MjData(model)
     if turn:
         mujoco.mj_integratePos(model, data.qpos, np.full(model.nv, turn), 1.0)
@@ -35,17 +35,18 @@ def posed(model: mujoco.MjModel, turn: float = 0.0) -> mujoco.MjData:
 
 
 def effects(model: mujoco.MjModel, data: mujoco.MjData) -> np.ndarray:
-    """(actuators, nv): generalized force of each actuator at force 1."""
+    """(actuators, nv) generalized forces of each actuator at unit force."""
     effect = np.zeros((model.nu, model.nv))
     mujoco.mju_sparse2dense(effect, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
     return effect
 
 
 def find_motors(model: mujoco.MjModel, dofs: tuple[int, int]) -> tuple[Motor, Motor] | Reason | None:
-    """The motors of x and y, however the robot is turned.
+    """The motors that push along x and y in every pose of the robot.
 
-    A reason where an axis has none but an actuator that is no plain motor, or one beside its motor that acts at control 0; None
-    where nothing pushes along an axis.
+    Returns:
+        The two motors; a reason if none of the actuators of an axis is a plain motor, or if one beside the motor acts at control
+        0; None if no actuator pushes along an axis.
     """
     upright, turned = effects(model, posed(model)), effects(model, posed(model, 0.4))
     found: list[Motor] = []
@@ -64,7 +65,7 @@ def find_motors(model: mujoco.MjModel, dofs: tuple[int, int]) -> tuple[Motor, Mo
 
 
 def _pushes(effect: np.ndarray, turned: np.ndarray, dof: int) -> bool:
-    """Whether an actuator acts on one degree of freedom alone, and alike in both poses."""
+    """Whether an actuator acts on one degree of freedom only, with the same effect in both poses."""
     others = np.delete(effect, dof)
     return bool(
         abs(effect[dof]) > 1e-9 and np.allclose(others, 0.0, atol=1e-8 * abs(effect[dof])) and np.allclose(effect, turned)
@@ -95,7 +96,7 @@ def no_motor(model: mujoco.MjModel, u: int) -> str | None:
 
 
 def _motor(model: mujoco.MjModel, u: int, dof: int, effect: float) -> Motor:
-    """Every limit between control and base: ctrlrange, forcerange, and actuatorfrcrange of tendon and joint."""
+    """A motor with all limits between control and base: ctrlrange, forcerange, and actuatorfrcrange of tendon and joint."""
     gain = float(model.actuator_gainprm[u, 0])
     limits = np.array([-np.inf, np.inf])
     if model.actuator_ctrllimited[u]:
@@ -116,7 +117,7 @@ def _on_tendon(model: mujoco.MjModel, u: int) -> bool:
 
 
 def largest_force(motors: tuple[Motor, Motor]) -> float:
-    """The largest force that both motors can give in every direction [N].
+    """The largest force that both motors can apply in both directions along their axes [N].
 
     Raises:
         ConfigurationError: a motor without a limit, or one that cannot push both ways.
@@ -135,7 +136,7 @@ def check_motors(model: mujoco.MjModel, dofs: tuple[int, int], motors: Sequence[
     """The motors that a direct robot names.
 
     Raises:
-        ConfigurationError: one is no plain motor, or does not push along its axis alone.
+        ConfigurationError: an actuator is not a plain motor, or does not push along its axis only.
     """
     upright, turned = effects(model, posed(model)), effects(model, posed(model, 0.4))
     found: list[Motor] = []

@@ -1,7 +1,7 @@
 """A rotorcraft at a held height: planar force -> tilt and thrust -> rotors, with the attitude loop inside.
 
-The attitude follows the closed-loop response phi'' = -a phi - b phi' + a phi_wanted of each axis, as far as the rotors' limits
-allow. Rotors get their shares of thrust and moments, so any arrangement works; :mod:`marlbc_mj.robots.rotors` has the shares.
+The attitude of each axis follows the closed-loop response phi'' = -a phi - b phi' + a phi_wanted within the rotors' limits. Each
+rotor has a share of thrust and moments, so any arrangement works; :mod:`marlbc_mj.robots.rotors` computes the shares.
 """
 
 import numpy as np
@@ -9,7 +9,7 @@ import numpy as np
 from marlbc_mj.core import laws
 
 MOST_ROTORS = 32
-MOST_TILT = np.radians(32.0)  # that is asked for
+MOST_TILT = np.radians(32.0)  # largest commanded roll and pitch [rad]
 _GAINS = {
     "mass": (),  # [kg]
     "gravity": (),  # [m/s^2]
@@ -20,25 +20,25 @@ _GAINS = {
     "stiffness": 3,  # a of roll, pitch and yaw [1/s^2]
     "damping": 3,  # b of roll, pitch and yaw [1/s]
     "thrust_lag": (),  # [s]
-    "thrust_share": MOST_ROTORS,  # control of each rotor per thrust [1/N]
-    "moment_share": (MOST_ROTORS, 3),  # and per moment about x, y and z [1/(N m)]
-    "least": MOST_ROTORS,  # control of each rotor
-    "most": MOST_ROTORS,
-    "lift": MOST_ROTORS,  # thrust of each rotor per force of its actuator
+    "thrust_share": MOST_ROTORS,  # control of each rotor per unit of thrust [1/N]
+    "moment_share": (MOST_ROTORS, 3),  # control of each rotor per unit of moment about x, y and z [1/(N m)]
+    "least": MOST_ROTORS,  # least control of each rotor
+    "most": MOST_ROTORS,  # greatest control of each rotor
+    "lift": MOST_ROTORS,  # thrust of each rotor per unit of actuator force
 }
 _STATE = {
     "axis": 3,  # b, the body's z axis in the world
     "thrust": (),  # [N]
-    "saturated": (),  # substeps in which a rotor was at its limit
-    "height_error": (),  # worst [m]
-    "tilt": (),  # worst [rad]
+    "saturated": (),  # number of substeps with a rotor at its limit
+    "height_error": (),  # largest so far [m]
+    "tilt": (),  # largest so far [rad]
 }
 REPORT = ("saturated", "height_error", "tilt")
 
 
 @laws.drive(gains=_GAINS, state=_STATE)
 def rotor_drive(gains, state, qpos, qvel, force, h, ctrl_out):
-    """Tilt and thrust that give the planar force and hold the height, then the rotors' shares of thrust and moments."""
+    """Tilt and thrust that produce the planar force and hold the height, then each rotor's share of thrust and moments."""
     w, x, y, z = qpos[3], qpos[4], qpos[5], qpos[6]
     b = state.axis
     b[0], b[1], b[2] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
@@ -59,9 +59,9 @@ def rotor_drive(gains, state, qpos, qvel, force, h, ctrl_out):
 
 @laws.allocation_free
 def allot(gains, thrust, roll, pitch, yaw, qvel, ctrl_out):
-    """Controls of the rotors for a thrust [N] and the moments that take away the missing roll, pitch and yaw [rad].
+    """Controls of the rotors for a thrust [N] and for moments that reduce the errors in roll, pitch and yaw [rad].
 
-    Returns 1 where a rotor is at its limit, else 0.
+    Returns 1 if any control was clipped to its limit, else 0.
     """
     a, b, inertia, saturated = gains.stiffness, gains.damping, gains.inertia, 0.0
     moment_x = inertia[0] * (a[0] * roll - b[0] * qvel[3])
@@ -79,7 +79,7 @@ def allot(gains, thrust, roll, pitch, yaw, qvel, ctrl_out):
 
 @laws.reading(gains=_GAINS, state=_STATE)
 def rotor_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
-    """p, v of the body; the planar part of the rotors' thrust along the axis that the drive saw."""
+    """p, v of the body; the planar part of the rotors' thrust along the body axis that the drive used."""
     thrust = 0.0
     for k in range(actuator_force.shape[0]):
         thrust += gains.lift[k] * actuator_force[k]

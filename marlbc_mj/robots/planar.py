@@ -1,7 +1,8 @@
-"""The planar motion of an MJCF and the actuators that push it, found by their effect, not by names or order.
+"""Finds the planar motion of an MJCF and the actuators that push it by their effect, not by names or order.
 
-A direct robot gets its planar force as control, and its p and v are its joints' own. :func:`straighten` brings any base on two
-slides and any motors, whatever their gear, sense, reference and place, into this form without a change of the motion.
+The controls of a direct robot are its planar force, and its p and v are its joints' coordinates and velocities.
+:func:`straighten` converts motors and a base on two slides to this form, whatever their gear, sense, reference and place, without
+changing the motion.
 """
 
 from collections.abc import Sequence
@@ -22,7 +23,7 @@ _PARALLEL = 1e-6
 
 
 class Base(NamedTuple):
-    """The part that moves in the plane: the body that carries the rest, and its joints along x and y, or its free joint."""
+    """The body that moves in the plane and carries the rest, and its joints along x and y or its free joint."""
 
     body: int
     joints: tuple[str, ...]
@@ -30,10 +31,10 @@ class Base(NamedTuple):
 
 
 def find_base(model: mujoco.MjModel, root: int) -> Base:
-    """The base of a model whose body ``root`` is the first that moves; slides may be on bodies that carry one another.
+    """The base of a model with ``root`` as its first moving body; the two slides may be on nested bodies.
 
     Raises:
-        ConfigurationError: there is neither a free joint nor a pair of slides along x and y.
+        ConfigurationError: there is neither a free joint nor a pair of slides along x and y, or a joint turns the slides.
     """
     first = model.body_jntadr[root]
     if model.jnt_type[first] == _FREE:
@@ -58,13 +59,13 @@ def find_base(model: mujoco.MjModel, root: int) -> Base:
 
 
 def _along(direction: np.ndarray) -> int | None:
-    """0 for the x axis, 1 for y, in either sense; None for any other direction."""
+    """0 for a direction along +x or -x, 1 for +y or -y, None for any other."""
     at = int(np.argmax(np.abs(direction)))
     return at if at < 2 and abs(abs(direction[at]) - 1.0) < _PARALLEL else None
 
 
 def _refuse_turning_slides(model: mujoco.MjModel, slides: Sequence[int]) -> None:
-    """Raise ConfigurationError where a joint before the slides turns them."""
+    """Raise ConfigurationError if a joint before the slides turns them."""
     last = max(slides)
     tree = model.body_rootid[model.jnt_bodyid]
     for j in range(last):
@@ -75,10 +76,10 @@ def _refuse_turning_slides(model: mujoco.MjModel, slides: Sequence[int]) -> None
 
 
 def slides_first(spec: mujoco.MjSpec) -> list[str]:
-    """Move vertical hinges behind the slides of the same body, so that a base turns about itself; their names.
+    """Move vertical hinges behind the slides of the same body, so that the base turns about itself; returns their names.
 
-    In a file, a yaw hinge before the slides turns about the place where the base started, and the slides with it. In a team's
-    world an agent starts anywhere.
+    A yaw hinge before the slides turns them too, about the place where the base starts in its file. In a team's world an agent
+    may start anywhere.
     """
     moved: list[str] = []
     axes = posed(spec.copy().compile())
@@ -98,7 +99,7 @@ def _before_slide(rest: Sequence[Any]) -> bool:
 
 
 def _reorder(joints: Sequence[Any], order: Sequence[int]) -> None:
-    """Joint k gets what joint ``order[k]`` was, its name included: actuators and others find it by that."""
+    """Give joint k all attributes of joint ``order[k]``, including the name by which actuators and others refer to it."""
     names = [name for name in dir(joints[0]) if not name.startswith("_") and name not in _FIXED]
     was = [{name: _copied(getattr(joint, name)) for name in names} for joint in joints]
     for k, joint in enumerate(joints):
@@ -116,7 +117,7 @@ def _copied(value: Any) -> Any:
 
 
 def moved_masses(model: mujoco.MjModel, base: Base) -> tuple[float, float]:
-    """The masses that a force along x and one along y accelerate: all that the joint carries, and its own ``armature`` [kg]."""
+    """Effective masses along x and y [kg]: everything that the joint carries, plus its ``armature``."""
     matrix = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, posed(model), matrix)
     along_x, along_y = (float(matrix[dof, dof]) for dof in base.dofs)
@@ -127,10 +128,10 @@ def moved_masses(model: mujoco.MjModel, base: Base) -> tuple[float, float]:
 
 
 def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: tuple[str, ...]) -> None:
-    """Slides along +x and +y that read where the body is in the world, and motors whose control is the planar force.
+    """Change slides to point along +x and +y and to read the body's world position, and motors to take the planar force.
 
     Raises:
-        ConfigurationError: joints or motors that are not what their place in the robot says.
+        ConfigurationError: a joint or motor that is not along its axis, or that cannot be converted.
     """
     model = spec.copy().compile()
     data = posed(model)
@@ -156,7 +157,7 @@ def straighten(spec: mujoco.MjSpec, body: str, joints: tuple[str, ...], motors: 
 
 
 def check_slides(spec: mujoco.MjSpec, joints: Sequence[str]) -> None:
-    """Raise ConfigurationError unless two joints slide along +x and +y, however the robot turns: unknown dynamics push there."""
+    """Raise ConfigurationError unless two joints always slide along +x and +y, where unknown dynamics act on them."""
     model = spec.copy().compile()
     _refuse_turning_slides(model, [model.joint(name).id for name in joints])
     directions = posed(model).xaxis
@@ -175,7 +176,7 @@ def _limit(actuator: Any, low: float, high: float) -> None:
 
 
 def base_of(model: mujoco.MjModel, body: str, joints: Sequence[str]) -> Base:
-    """The base that a robot names."""
+    """The base given by the names of a body and its joints."""
     first = [int(model.jnt_dofadr[model.joint(name).id]) for name in joints]
     return Base(model.body(body).id, tuple(joints), (first[0], first[-1] if len(first) == 2 else first[0] + 1))
 
@@ -183,7 +184,7 @@ def base_of(model: mujoco.MjModel, body: str, joints: Sequence[str]) -> Base:
 def _straighten_slide(
     spec: mujoco.MjSpec, model: mujoco.MjModel, data: mujoco.MjData, name: str, axis: int, place: float
 ) -> None:
-    """Let a slide point along +x or +y and read ``place`` where the body is there."""
+    """Make a slide point along +x or +y and read ``place`` at the reference pose."""
     joint, k = spec.joint(name), model.joint(name).id
     direction = data.xaxis[k]
     if _along(direction) != axis or model.jnt_type[k] != _SLIDE:
@@ -209,7 +210,7 @@ def _straighten_slide(
 
 
 def _refuse_followers(model: mujoco.MjModel, k: int, name: str) -> None:
-    """Raise ConfigurationError where something else counts by the coordinate of a joint that is to change."""
+    """Raise ConfigurationError if a tendon, equality or servo depends on the coordinate of a joint that must change."""
     wrapped = (model.wrap_type == mujoco.mjtWrap.mjWRAP_JOINT) & (model.wrap_objid == k)
     coupled = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & ((model.eq_obj1id == k) | (model.eq_obj2id == k))
     if wrapped.any() or coupled.any():

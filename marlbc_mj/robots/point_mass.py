@@ -1,10 +1,10 @@
-"""The paper's plant (1): a mass on two slide joints, one motor per axis; of any mass, force and size."""
+"""The paper's plant (1): a mass on two slide joints with one motor per axis, for any mass, force and size."""
 
 from marlbc_mj.robots.base import MODELS, Robot
 
 
 def point_mass() -> Robot:
-    """Direct: forces are its motors', p and v its joints'."""
+    """The point mass, a direct robot: its motors apply the force, its joints give p and v."""
     return Robot(
         name="point_mass",
         mjcf=MODELS / "point_mass.xml",

@@ -1,4 +1,4 @@
-"""The numbers of a rotorcraft's laws, read from its MJCF: shares of the rotors are the pseudo-inverse of their effect."""
+"""Gains of a rotorcraft's laws from its MJCF; the rotors' shares are the pseudo-inverse of their effects."""
 
 from typing import Any, NamedTuple
 
@@ -9,11 +9,11 @@ from marlbc_mj.robots.motors import effects, no_motor
 from marlbc_mj.robots.multirotor import MOST_ROTORS
 from marlbc_mj.util.errors import ConfigurationError
 
-HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # of the height [1/s^2, 1/s]
+HEIGHT_STIFFNESS, HEIGHT_DAMPING = 16.0, 8.0  # gains of the height loop [1/s^2, 1/s]
 
 
 class Attitude(NamedTuple):
-    """Closed-loop response of roll, pitch and yaw, and the lag of the thrust."""
+    """Closed-loop response of roll, pitch and yaw, and the thrust lag."""
 
     stiffness: tuple[float, float, float]  # a [1/s^2]
     damping: tuple[float, float, float]  # b [1/s]
@@ -32,7 +32,7 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
     """Gains and state of the two laws for a robot at rest, and its mass.
 
     Raises:
-        ConfigurationError: the rotors cannot give thrust and moments about x and y, or are too many.
+        ConfigurationError: the rotors cannot give thrust and moments about x and y, are too many, or are not plain motors.
     """
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -52,7 +52,7 @@ def rotor_numbers(spec: mujoco.MjSpec, body: str, attitude: Attitude) -> RotorNu
 
 
 def agility(params: dict[str, Any]) -> float:
-    """Angular acceleration about x and y that the rotors can give in either sense while they hold the weight [rad/s^2]."""
+    """Angular acceleration about x and y that the rotors can give in either sense while hovering [rad/s^2]."""
     shares, least, most = (np.array(params[name]) for name in ("moment_share", "least", "most"))
     hover = params["mass"] * params["gravity"] * np.array(params["thrust_share"])
     room, turning = np.minimum(most - hover, hover - least), np.abs(shares[:, :2])
@@ -61,7 +61,7 @@ def agility(params: dict[str, Any]) -> float:
 
 
 def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, Any]:
-    """The gains that are one number or row per rotor, padded with zeros to MOST_ROTORS."""
+    """The gains with one number or row per rotor, padded with zeros to MOST_ROTORS."""
     if model.nu > MOST_ROTORS:
         raise ConfigurationError(f"{name}: at most {MOST_ROTORS} rotors, got {model.nu}")
     for u in range(model.nu):
@@ -72,7 +72,7 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
     rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
     if np.linalg.matrix_rank(rotors[:3], tol=1e-9) < 3:
         raise ConfigurationError(f"{name}: {model.nu} actuators cannot give a thrust and moments about x and y")
-    turning = np.linalg.matrix_rank(rotors, tol=1e-9) == 4  # else the heading is left to itself
+    turning = np.linalg.matrix_rank(rotors, tol=1e-9) == 4  # if not, the heading is not controlled
     shares = np.linalg.pinv(rotors) if turning else np.pad(np.linalg.pinv(rotors[:3]), ((0, 0), (0, 1)))
     least, most = _control_limits(model)
     lift = rotors[0] / model.actuator_gainprm[:, 0]
@@ -82,7 +82,7 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
 
 
 def _control_limits(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Least and most control (rotors,) that ``ctrlrange`` and ``forcerange`` let through."""
+    """(rotors,) least and greatest controls within ``ctrlrange`` and ``forcerange``."""
     limits = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, (-np.inf, np.inf))
     by_force = np.sort(model.actuator_forcerange / model.actuator_gainprm[:, :1], axis=1)
     by_force = np.where(model.actuator_forcelimited[:, None], by_force, (-np.inf, np.inf))

@@ -1,7 +1,8 @@
-"""A user's MJCF in the form that a team's world takes: one text, complete in itself, in which everything that matters is named.
+"""Converts a user's MJCF to standard form: one self-contained text in which bodies, joints and actuators have names.
 
-What plain MuJoCo loads is loaded; what the text means is not changed. Files that it uses become part of it, frames are resolved,
-keyframes, lights, skins and custom texts are left out, and names get no slash, which dm_control keeps for itself.
+Any file that plain MuJoCo loads is accepted within the limits of :mod:`marlbc_mj.robots.files`. The meaning of the model does
+not change, except that large meshes become boxes. Files that it uses are embedded, frames are resolved, and keyframes, lights,
+skins, custom texts and tuples are removed. Slashes in names, which dm_control reserves, are replaced.
 """
 
 import signal
@@ -24,14 +25,14 @@ from marlbc_mj.util.modules import beside
 from marlbc_mj.util.text import one_line
 
 _LIMITS = Limits(seconds=60.0, cpu=5, memory=8 * 2**30)
-"""Of compiling a robot and two steps."""
+"""Limits on compiling a robot and simulating two steps."""
 
 
 def standard_text(path: Path) -> str:
     """The MJCF of a user's file in standard form; it is read again after a change in its folder.
 
     Raises:
-        ConfigurationError: what is wrong with the file, in one line.
+        ConfigurationError: the file cannot be used; the message gives the reason in one line.
     """
     try:
         path.stat()
@@ -67,12 +68,12 @@ def _blame(error: Exception) -> str:
 
 
 def _try_out(path: Path) -> None:
-    """Compile and step the file in a process of its own, which may crash, hang or run out of memory.
+    """Compile and step the file in a separate process, which may crash, hang or run out of memory.
 
     Raises:
-        ConfigurationError: it does.
+        ConfigurationError: the process does so, or cannot be run.
     """
-    if not sys.executable:  # Python is embedded in another program
+    if not sys.executable:  # Python is embedded in another program and cannot be started
         return
     try:
         status, said = try_out(path, _LIMITS)
@@ -94,7 +95,7 @@ def _try_out(path: Path) -> None:
 
 @contextmanager
 def quiet() -> Iterator[list[str]]:
-    """Keep MuJoCo's warnings while it reads, instead of having them on stderr and in a file of the current folder."""
+    """Collect MuJoCo's warnings in a list instead of printing them to stderr and writing them to a file in the current folder."""
     said: list[str] = []
     mujoco.set_mju_user_warning(said.append)
     try:
@@ -106,7 +107,7 @@ def quiet() -> Iterator[list[str]]:
 
 
 def _tidy(text: str) -> str:
-    """Resolve frames, name what has no name, and replace slashes in names."""
+    """Resolve frames, name unnamed elements, and replace slashes in names."""
     root = ElementTree.fromstring(text)
     for parent in [element for element in root.iter() if element.tag != "frame"]:
         _resolve_frames(parent)
@@ -119,12 +120,12 @@ def _tidy(text: str) -> str:
 
 
 def plain_name(name: str) -> str:
-    """A name without the slash that dm_control keeps for itself."""
+    """A name with slashes, which dm_control reserves, replaced by underscores."""
     return name.replace("/", "_")
 
 
 def _resolve_frames(parent: ElementTree.Element) -> None:
-    """Put the content of every frame below ``parent`` in its place, posed accordingly."""
+    """Replace every frame below ``parent`` by its content, with poses changed accordingly."""
     while any(child.tag == "frame" for child in parent):
         for frame in [child for child in parent if child.tag == "frame"]:
             place = list(parent).index(frame)
@@ -143,7 +144,7 @@ def _written(numbers: np.ndarray) -> str:
 
 
 def _pose(frame: ElementTree.Element, child: ElementTree.Element) -> None:
-    """Express an element of a frame in what the frame is in: MuJoCo writes positions and quaternions only."""
+    """Express an element's pose in the parent of its frame; MuJoCo writes positions and quaternions only."""
     place, turn = _numbers(frame, "pos", "0 0 0"), _numbers(frame, "quat", "1 0 0 0")
     out3, out4 = np.zeros(3), np.zeros(4)
     if "childclass" in frame.attrib:
@@ -162,7 +163,7 @@ def _pose(frame: ElementTree.Element, child: ElementTree.Element) -> None:
 
 
 def _name_unnamed(root: ElementTree.Element) -> None:
-    """Names for bodies, joints and actuators that have none."""
+    """Give names to bodies, joints and actuators that have none."""
     groups: dict[str, list[ElementTree.Element]] = {"body": [], "joint": [], "motor": []}
     for world in root.findall("worldbody"):
         groups["body"] += world.iter("body")

@@ -1,7 +1,7 @@
-"""Reads, compiles and steps MJCF files of strangers in processes of their own, which may crash, hang or run out of memory.
+"""Reads, compiles and steps untrusted MJCF files in separate processes, which may crash, hang or run out of memory.
 
-Run as a program it is a server, which loads MuJoCo once: every line of its input is a request (JSON), for which it forks, and is
-answered by a line. It ends with its input. :func:`try_out` is the client.
+Run as a program, it is a server that loads MuJoCo once. Every input line is a request (JSON): the server forks to run it and
+writes one line as the answer. It exits at the end of its input. :func:`try_out` is the client.
 """
 
 import atexit
@@ -17,28 +17,28 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-MOST_SAID = 2000  # characters of what a trial says that are kept
+MOST_SAID = 2000  # bytes of a trial's output that are kept
 
 
 class Limits(NamedTuple):
-    """What a trial may take."""
+    """Limits of one trial."""
 
-    seconds: float  # by the clock
-    cpu: int  # of a processor [s]
+    seconds: float  # elapsed time [s]
+    cpu: int  # processor time [s]
     memory: int  # address space [bytes]
 
 
 class TryOut(NamedTuple):
-    """How a trial ended."""
+    """The result of a trial."""
 
     status: int | None
-    """0: well, 3: MuJoCo refuses the file, below 0: the signal that ended it, None: it ran out of time."""
+    """0: success, 3: MuJoCo rejected the file, below 0: minus the signal that ended it, None: timeout; others: failure."""
     said: str
-    """Its output; the reason, where MuJoCo refuses the file."""
+    """Output of the trial; the reason if MuJoCo rejected the file."""
 
 
 class _Server:
-    """A server that belongs to this process."""
+    """A server process that belongs to the process that started it."""
 
     def __init__(self) -> None:
         command = [sys.executable, "-P", __file__]
@@ -47,10 +47,10 @@ class _Server:
         atexit.register(self.end)
 
     def ask(self, request: dict[str, Any]) -> Any:
-        """The answer.
+        """The server's answer to a request.
 
         Raises:
-            OSError: the server has gone.
+            OSError: the server has ended.
         """
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps(request).encode() + b"\n")
@@ -61,13 +61,13 @@ class _Server:
         return json.loads(line)
 
     def end(self) -> None:
-        """End it, if it is this process's; one of a parent is left to the parent."""
+        """End the server if this process started it; after a fork, leave it to the parent process."""
         atexit.unregister(self.end)
         if self.owner == os.getpid():
             self.process.kill()
             self.process.wait()
         else:
-            self.process.returncode = 0  # so that Popen does not miss a process that is none of its children
+            self.process.returncode = 0  # so that Popen does not poll a process that is not its child
         for pipe in (self.process.stdin, self.process.stdout):
             if pipe is not None:
                 with suppress(OSError):
@@ -78,14 +78,14 @@ _server: _Server | None = None
 
 
 def try_out(path: Path, limits: Limits) -> TryOut:
-    """Read, compile and step an MJCF file where it can do no harm.
+    """Read, compile and step an MJCF file in a separate process, where it can do no harm.
 
     Args:
-        path: of the file.
-        limits: of the trial.
+        path: path of the file.
+        limits: limits of the trial.
 
     Raises:
-        OSError: no server can be started.
+        OSError: no server can be started, or a second one ends without an answer.
     """
     global _server
     place = path.resolve()
@@ -102,7 +102,7 @@ def try_out(path: Path, limits: Limits) -> TryOut:
             _server = None
             if not again:
                 raise
-        except BaseException:  # Ctrl-C in the middle of an answer: the next one must not be that of this request
+        except BaseException:  # after Ctrl-C, the pending answer must not be taken for that of the next request
             _server.end()
             _server = None
             raise
@@ -110,7 +110,7 @@ def try_out(path: Path, limits: Limits) -> TryOut:
 
 
 def _fly(path: str) -> int:
-    """Compile the file and make two steps; the exit status, 3 with a line where MuJoCo refuses it."""
+    """Compile the file and simulate two steps; returns 0, or 3 after printing the reason if MuJoCo rejects the file."""
     import mujoco
 
     mujoco.set_mju_user_warning(lambda text: None)
@@ -126,7 +126,7 @@ def _fly(path: str) -> int:
 
 
 def _confined(request: dict[str, Any], output: int) -> None:
-    """The trial, in a process that was forked for it; never returns."""
+    """Run the trial in this forked process and exit; never returns."""
     status = 1
     try:
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
@@ -144,7 +144,7 @@ def _confined(request: dict[str, Any], output: int) -> None:
 
 
 def _ended(child: int, seconds: float) -> int | None:
-    """Exit status of a child, or None if it was ended after this time."""
+    """Exit status of a child process, or None if it was killed after ``seconds``."""
     until, pause = time.monotonic() + seconds, 0.001
     while True:
         process, status = os.waitpid(child, os.WNOHANG)
@@ -159,8 +159,8 @@ def _ended(child: int, seconds: float) -> int | None:
 
 
 def _serve() -> None:
-    """Answer requests until there are no more."""
-    import mujoco  # noqa: F401  # loaded here, not in every trial
+    """Answer requests until the input ends."""
+    import mujoco  # noqa: F401  # loaded once here instead of in every trial
 
     for line in sys.stdin:
         request = json.loads(line)

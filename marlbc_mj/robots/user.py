@@ -1,9 +1,9 @@
-"""Robots from a user's file: a Python file that makes one, or any MJCF whose actuators show how it is driven.
+"""Robots from a user's file: a Python file that defines one, or any MJCF whose actuators show how it is driven.
 
 A Python file is run and defines ``ROBOT``, a :class:`~marlbc_mj.robots.base.Robot`, or a function ``robot()`` that returns one;
-``file.py:NAME`` takes another name from it. An MJCF is taken as it is: two slide joints or a free joint with motors along x and y
-are driven directly, whatever their gears, senses and order; a free joint with rotors that lift and turn flies. A path that starts
-with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
+``file.py:NAME`` selects another name in it. An MJCF needs no additions: two slide joints or a free joint with motors along x and
+y are driven directly, whatever their gears, senses and order; a free joint with rotors that lift and turn flies. A path that
+starts with ``menagerie:`` is looked up in a checkout of MuJoCo Menagerie.
 """
 
 import os
@@ -27,21 +27,21 @@ MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
 _WAY_OUT = "write a Python file with a drive and a reading"
 _UNDRIVEN = "{}: its actuators neither push along x and y nor lift and turn; " + _WAY_OUT
-_MOST_TILTING = 1.0  # acceleration of a rotorcraft's references whose rotors turn it as fast as FLIGHT wants [m/s^2]
+_MOST_TILTING = 1.0  # acceleration limit of references for a rotorcraft that reaches FLIGHT's response [m/s^2]
 FLIGHT = Attitude((250.0, 250.0, 230.0), (20.0, 20.0, 25.0), 0.08)
-"""A brisk attitude loop and thrust lag for rotorcraft that no one has identified: a small quadrotor's, rounded."""
+"""A fast attitude loop and thrust lag for rotorcraft without identified values: those of a small quadrotor, rounded."""
 
 
 def is_file(name: str) -> bool:
-    """Whether a robot's name is a path rather than a name."""
+    """Whether a robot's name is the path of a file."""
     return split_name(name)[0].endswith(SUFFIXES) or name.startswith(MENAGERIE)
 
 
 def find(name: str) -> Path:
-    """The file that a name means.
+    """The path of the file that a name refers to.
 
     Raises:
-        ConfigurationError: it is not there, has no known suffix, or Menagerie is asked for and MENAGERIE_ROOT is not set.
+        ConfigurationError: the file is missing or has no known suffix, or MENAGERIE_ROOT is needed and not set.
     """
     path = Path(split_name(name)[0])
     if name.startswith(MENAGERIE):
@@ -57,14 +57,14 @@ def find(name: str) -> Path:
 
 
 Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
-"""Where a robot's file is, and the state of what is beside it."""
+"""Path of a robot's file, and name, modification time and size of the files in its folder."""
 
 
 def stamp_of(name: str) -> Stamp:
-    """The file that a name means now, and the state of that file and its neighbors; another value after an edit.
+    """The current stamp of a robot's file, which differs after an edit of the file or of others in its folder.
 
     Raises:
-        ConfigurationError: there is no such file.
+        ConfigurationError: as :func:`find`.
     """
     path = find(name).resolve()
     return path, beside(path, *SUFFIXES)
@@ -74,7 +74,7 @@ def load(name: str) -> Robot:
     """The robot of a file; its name is the path, so that scenarios and logs find it again.
 
     Raises:
-        ConfigurationError: what is wrong with the file, in one line.
+        ConfigurationError: the file cannot be used; the message gives the reason in one line.
     """
     path = find(name)
     return _from_python(path, name) if path.suffix == ".py" else from_mjcf(path, name)
@@ -107,13 +107,13 @@ def check_mjcf(path: Path) -> mujoco.MjModel:
     """Read and compile a user's MJCF by itself.
 
     Raises:
-        ConfigurationError: it cannot be read, uses a file outside its folder, or has no mass or no actuator.
+        ConfigurationError: it cannot be read, uses a file outside its folder, or fails :func:`check_model`.
     """
     return check_model(path, mujoco.MjSpec.from_string(standard_text(path)).compile())
 
 
 def check_model(path: Path, model: mujoco.MjModel) -> mujoco.MjModel:
-    """The model, if it has what every robot needs.
+    """The model, if it has a mass and usable actuators.
 
     Raises:
         ConfigurationError: no mass, no actuator, or an actuator with several controls.
@@ -129,10 +129,10 @@ def check_model(path: Path, model: mujoco.MjModel) -> mujoco.MjModel:
 
 
 def from_mjcf(path: Path, name: str) -> Robot:
-    """A robot from its MJCF alone: how it is driven, its mass and its size are read from the compiled model.
+    """A robot from its MJCF alone: its drive, mass and size are read from the compiled model.
 
     Raises:
-        ConfigurationError: the file is broken, or its actuators fit none of the ways above.
+        ConfigurationError: the file is invalid, or its actuators fit none of the kinds in the module's description.
     """
     spec = mujoco.MjSpec.from_string(standard_text(path))
     moved = slides_first(spec)
@@ -165,7 +165,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
 
 
 def _refuse_legs_and_wheels(path: Path, model: mujoco.MjModel, base: Base) -> None:
-    """Raise ConfigurationError, with an example, where every actuator moves something on the base and none the base itself."""
+    """Raise ConfigurationError, naming an actuator, if all actuators move parts on the base and none pushes the base itself."""
     own = np.flatnonzero(model.dof_bodyid == base.body)
     if np.abs(effects(model, posed(model))[:, own]).max(initial=0.0) > 0.0:
         return
@@ -177,7 +177,7 @@ def _refuse_legs_and_wheels(path: Path, model: mujoco.MjModel, base: Base) -> No
 
 
 def _moving_root(path: Path, model: mujoco.MjModel) -> int:
-    """The one body that moves and is carried by none that does."""
+    """The one body that has a joint and no moving ancestor; raises ConfigurationError unless there is exactly one."""
     moves, roots = np.zeros(model.nbody, dtype=bool), []
     for b in range(1, model.nbody):
         carried = bool(moves[model.body_parentid[b]])
@@ -193,12 +193,12 @@ def _moving_root(path: Path, model: mujoco.MjModel) -> int:
 
 
 def _slides_first(spec: mujoco.MjSpec) -> None:
-    """The further preparation of a robot that is given by its MJCF alone."""
+    """The ``prepare`` step of a robot that is given by its MJCF alone."""
     slides_first(spec)
 
 
 def _size(model: mujoco.MjModel, data: mujoco.MjData, root: int, base: Base) -> dict[str, Any]:
-    """Radius seen from above of the moving body and all below it, what a planar force accelerates, and what it touches."""
+    """Fields of a robot from the geometry of its moving bodies: radius from above, length unit, mass, substep and contact."""
     carried = {root}
     for b in range(root + 1, model.nbody):
         carried |= {b} if model.body_parentid[b] in carried else set()
@@ -224,7 +224,7 @@ def _direct(fields: dict[str, Any], motors: tuple[str, str], limit: float) -> Ro
 
 
 def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
-    """A rotorcraft whose attitude, and with it all that tilts it, is as slow as its rotors' moments ask for."""
+    """A rotorcraft; its attitude loop, limits and gains are scaled down to what its rotors' moments can achieve."""
     try:
         params, state, mass = rotor_numbers(spec, fields["body"], FLIGHT)
     except ConfigurationError as error:

@@ -1,4 +1,4 @@
-"""What wheeled robots share: their heading, and the inertias that a planar force and a turn meet."""
+"""Shared by wheeled robots: their heading, and their inertias against planar forces and turns."""
 
 from typing import NamedTuple
 
@@ -20,12 +20,12 @@ class Inertia(NamedTuple):
 
     mass: float  # [kg]
     turn: float  # about z [kg m^2]
-    ahead: float  # its centre of mass in front of the frame [m]
+    ahead: float  # distance from the frame forward to the center of mass [m]
     wheel: float  # one wheel about its axle [kg m^2]
 
 
 def inertia(spec: mujoco.MjSpec) -> Inertia:
-    """Read from the inertia matrix of a compiled robot whose joints are one free joint and then equal wheels."""
+    """Read the inertias from the mass matrix of a robot with one free joint, followed by equal wheels."""
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

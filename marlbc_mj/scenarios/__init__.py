@@ -20,19 +20,19 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "robot_gate": robot_gate,
     **{name: family().build for name, family in FAMILIES.items()},
 }
-"""Factory by name."""
+"""Scenario factories by name."""
 
 
 def make_scenario(name: str, *, allow_code: bool = False, **changes: Any) -> Scenario:
-    """A scenario by name, from a ``.toml`` file, or ``file.py:Name`` of a user's Python file, with any of its fields changed.
+    """A scenario by name, from a ``.toml`` file, or from a user's Python file, with any of its fields changed.
 
     Args:
-        name: of a scenario, or a path that ends in ``.toml``.
-        allow_code: whether a file's robot may be a Python file, which is run.
-        **changes: fields and their values.
+        name: name of a scenario, a path that ends in ``.toml``, or ``file.py:Name``.
+        allow_code: whether a TOML file may name a Python file as its robot, which is then run.
+        **changes: fields and their new values.
 
     Raises:
-        ConfigurationError: unknown name, a file that cannot be loaded, or a change that cannot be run.
+        ConfigurationError: an unknown name, a file that cannot be loaded, or an invalid change.
     """
     if names_attribute(name):
         return _from_python(name, changes)
@@ -40,13 +40,13 @@ def make_scenario(name: str, *, allow_code: bool = False, **changes: Any) -> Sce
         return load_scenario(name, allow_code=allow_code, **changes)
     if name not in SCENARIOS:
         raise unknown("scenario", name, (*SCENARIOS, f"a {SUFFIX} file"))
-    if name not in FAMILIES:  # families look at their own
+    if name not in FAMILIES:  # families check their own fields
         check_fields(SCENARIOS[name], changes)
     return SCENARIOS[name](**changes)
 
 
 def _from_python(name: str, changes: dict[str, Any]) -> Scenario:
-    """A scenario of a user's file, or what a function there returns."""
+    """A scenario defined in a user's Python file, or returned by a function in it."""
     scenario = made(name, Scenario)
     if not isinstance(scenario, Scenario):
         raise ConfigurationError(f"{name} is no Scenario, but {type(scenario).__name__}")
@@ -61,7 +61,7 @@ def check_fields(factory: Callable[..., Scenario], changes: Iterable[str]) -> No
     own = [name for name, each in signature(factory).parameters.items() if each.kind is not Parameter.VAR_KEYWORD]
     valid = dict.fromkeys([*own, *(field.name for field in fields(Scenario))])
     for name in changes:
-        if name not in valid and name != "agents":  # which the factory refuses by saying why
+        if name not in valid and name != "agents":  # which the factory rejects with a more helpful message
             raise unknown("field of a scenario", name, valid)
 
 

@@ -22,18 +22,18 @@ from marlbc_mj.util.seeding import stream
 from marlbc_mj.util.settings import check_kinds
 
 Point = tuple[float, float]
-MOST_SUBSTEPS = 10_000  # in one mission step
-MOST_STEPS = 10_000_000  # mission steps of an episode: what an hour of simulation makes
-MOST_BEHAVIORS = 6  # whose 720 orders are still a table
+MOST_SUBSTEPS = 10_000  # substeps in one mission step
+MOST_STEPS = 10_000_000  # mission steps in one episode; they take about an hour to simulate
+MOST_BEHAVIORS = 6  # 6 behaviors have 720 orders, still few enough for a table
 REFERENCE_MODES = ("virtual", "actual")
 COMPOSITIONS = ("null-space", "set-based")
-"""Avoidance as an equality task (12), or as an inequality."""
+"""Null-space composition treats avoidance as an equality task (12), set-based composition as an inequality."""
 YOUNG = {"young": True}
-"""Metadata of a field that came later: at its default, it changes neither a scenario nor what is filed under its hash."""
+"""Metadata of a field added later: at its default it changes nothing and is left out of hashes, so old hashes stay valid."""
 
 
 class OnPath(Protocol):
-    """What has a mission's path: a scenario, or what a log keeps of one."""
+    """Anything with a mission's path: a scenario, or the part of one that a log keeps."""
 
     @property
     def path_origin(self) -> Point: ...
@@ -42,7 +42,7 @@ class OnPath(Protocol):
 
 
 def desired_centroid(mission: OnPath, time: float) -> np.ndarray:
-    """(2,) p_cd of a mission at ``time`` [s], in m."""
+    """(2,) desired centroid p_cd of a mission at ``time`` [s], in m."""
     return np.array(mission.path_origin) + time * np.array(mission.path_velocity)
 
 
@@ -55,7 +55,7 @@ class Obstacle(NamedTuple):
 
 
 class Window(NamedTuple):
-    """From ``start`` to ``end`` (both exclusive) the scripted supervisor gives ``agent`` (-1: all) this order."""
+    """A time window, both ends exclusive, in which the scripted supervisor gives ``agent`` (-1: all agents) this order."""
 
     start: float  # [s]
     end: float  # [s]
@@ -65,7 +65,7 @@ class Window(NamedTuple):
 
 @dataclass(frozen=True)
 class Perturbation:
-    """How a seed changes the scenario: uniform draws around it. All zero (the default) makes every seed the same."""
+    """How a seed changes the scenario: uniform draws around its values. With the defaults every seed gives the same instance."""
 
     start_spread: float = 0.0  # each start coordinate moves by at most this [m]
     obstacle_spread: float = 0.0  # each obstacle coordinate moves by at most this [m]
@@ -81,21 +81,21 @@ class Draw(NamedTuple):
     """One seed's instance of a scenario."""
 
     starts: np.ndarray  # (N, 2) [m]
-    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; of one that moves, its place without motion
+    obstacles: np.ndarray  # (K, 3) x, y, radius [m]; for a moving obstacle, its place without motion
     drag_scale: float
     motions: np.ndarray = np.zeros((0, NUMBERS))  # (K, 6), or (0, 6) where all obstacles are at rest
-    layout: int | None = None  # number of the layout; None where a scenario has none to draw
+    layout: int | None = None  # number of the layout; None if the scenario draws no layout
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A team, its path, its behaviors, what is in the way and how it is simulated.
+    """A team, its path, its behaviors, the obstacles and the simulation settings.
 
-    Three clocks: a supervisor decides every ``mission_step``; the control law and physics run every ``substep``, of which a
-    mission step holds a whole number. Every number is checked when the scenario is built.
+    A supervisor decides every ``mission_step``; the control law and the physics run every ``substep``. A mission step is a whole
+    number of substeps. Every number is checked when the scenario is built.
 
     Raises:
-        ConfigurationError: naming the value that cannot be run.
+        ConfigurationError: a value is invalid; the message names it.
     """
 
     name: str
@@ -104,32 +104,32 @@ class Scenario:
     path_origin: Point = (0.0, 0.0)  # p_cd(0) [m]
     path_velocity: Point = (0.0, 0.0)  # p_cd' [m/s]
     obstacles: tuple[Obstacle, ...] = ()
-    safe_distance: float = 2.0  # d_OA: a clearance at or below it is a violation [m]
-    formation_names: tuple[str, str] = ("FM", "FR")  # behaviors whose slots G = 2 and G = 1 are judged by
-    formation_tolerance: float = 0.5  # [m], relative to the centroid
+    safe_distance: float = 2.0  # d_OA: a clearance of at most this is a violation [m]
+    formation_names: tuple[str, str] = ("FM", "FR")  # behaviors whose slots define G = 2 and G = 1
+    formation_tolerance: float = 0.5  # largest distance from the slot, relative to the centroid [m]
     duration: float = 100.0  # [s]
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"  # where behaviors are evaluated: at p_r or at the measured p
-    robot: str = PAPER_ROBOT  # of every agent
+    robot: str = PAPER_ROBOT  # robot of all agents
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
-    # what a controller's output of 1 is [N]; a robot's mass makes its gains per unit mass
+    # force for a controller's output of 1 [N]; set to a robot's mass, it makes controller gains per unit mass
     unit_force: float = field(default=1.0, metadata=YOUNG)
-    speed_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s]; the paper's point mass has none
-    acceleration_limit: float = field(default=np.inf, metadata=YOUNG)  # of references [m/s^2]
-    imperfections: Imperfections = field(default=NO_IMPERFECTIONS, metadata=YOUNG)  # noise, delay, loss of actuators
+    speed_limit: float = field(default=np.inf, metadata=YOUNG)  # speed limit of references [m/s]; the paper's point mass has none
+    acceleration_limit: float = field(default=np.inf, metadata=YOUNG)  # acceleration limit of references [m/s^2]
+    imperfections: Imperfections = field(default=NO_IMPERFECTIONS, metadata=YOUNG)  # sensor noise, sensor delay, actuator loss
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = Perturbation()
-    schedule: tuple[Window, ...] = ()  # the scripted supervisor's, order FM outside every window
+    schedule: tuple[Window, ...] = ()  # windows of the scripted supervisor; outside all of them the order is FM
     description: str = ""
-    motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one an obstacle, or none: all at rest
+    motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one per obstacle, or empty if all obstacles are at rest
     layout: Layout | None = field(default=None, metadata=YOUNG)  # draws obstacles and motions anew for every seed
-    split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # whose layouts are drawn
-    # how an order becomes a reference: avoidance as an equality task (12), or as an inequality
+    split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # which layouts are drawn
+    # how an order becomes a reference, see COMPOSITIONS
     composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
-    communication: Communication = field(default=IDEAL, metadata=YOUNG)  # who hears whom, when, of what share of messages
-    robots: tuple[str, ...] = field(default=(), metadata=YOUNG)  # of each agent, where they differ; ``robot`` is then the first
+    communication: Communication = field(default=IDEAL, metadata=YOUNG)  # range, delay and loss of messages
+    robots: tuple[str, ...] = field(default=(), metadata=YOUNG)  # robot of each agent if they differ; ``robot`` is then the first
 
     def __post_init__(self) -> None:
         check_kinds(self, f"scenario {self.name!r}: ")
@@ -158,28 +158,28 @@ class Scenario:
         """The robots of all agents.
 
         Raises:
-            ConfigurationError: an unknown robot, or robots that cannot be in one world.
+            ConfigurationError: an unknown robot, or robots that cannot share a world.
         """
         return make_fleet(self.robots or (self.robot,) * self.agents)
 
     @property
     def force_limits(self) -> np.ndarray:
-        """(N,) force limits per axis [N]: ``force_limit``, and no more than a robot of a mixed team has itself."""
+        """(N,) force limits per axis [N]: ``force_limit``, in a mixed team capped by each robot's own limit."""
         return self.fleet.force_limits(self.force_limit) if self.robots else np.full(self.agents, float(self.force_limit))
 
     @property
     def least_acceleration(self) -> float:
-        """What the weakest agent's actuators give per axis [m/s^2]."""
+        """Largest acceleration per axis of the weakest agent [m/s^2]."""
         return float((self.force_limits / (self.fleet.masses(self.mass) if self.robots else self.mass)).min())
 
     @property
     def mission_steps(self) -> int:
-        """Mission steps in one episode."""
+        """Number of mission steps in one episode."""
         return round(self.duration / self.mission_step)
 
     @property
     def substeps(self) -> int:
-        """Physics substeps in one mission step."""
+        """Number of physics substeps in one mission step."""
         return round(self.mission_step / self.substep)
 
     @cached_property
@@ -196,7 +196,7 @@ class Scenario:
 
     @property
     def draws(self) -> bool:
-        """Whether anything depends on the seed: starts, obstacles, drag, layout, noise of sensors or lost messages."""
+        """Whether anything depends on the seed: starts, obstacles, drag, layout, sensor noise or lost messages."""
         noisy = self.imperfections.position_noise > 0 or self.imperfections.velocity_noise > 0
         return self.perturbation != Perturbation() or self.layout is not None or noisy or self.communication.loss > 0
 
@@ -206,16 +206,16 @@ class Scenario:
         return len(self.motions) > 0
 
     def obstacle_array(self) -> np.ndarray:
-        """(K, 3) x, y, radius [m]; of one that moves, its place without motion."""
+        """(K, 3) x, y, radius [m] of the obstacles; for a moving obstacle, its place without motion."""
         return np.array(self.obstacles, dtype=np.float64).reshape(-1, 3)
 
     def draw(self, rng: np.random.Generator) -> Draw:
         """One instance: starts, obstacles and drag scale drawn around this scenario's values.
 
-        A scenario with a layout draws that first. A draw that puts an obstacle on a start is drawn again.
+        A scenario with a layout draws the layout first. A draw that puts an obstacle on a start is repeated.
 
         Raises:
-            ConfigurationError: a hundred draws in a row did, or no layout was found.
+            ConfigurationError: 100 draws in a row put an obstacle on a start, or no layout was found.
         """
         spread = self.perturbation
         for _ in range(100):
@@ -230,7 +230,7 @@ class Scenario:
         raise ConfigurationError(f"scenario {self.name!r}: {spread} puts an obstacle on a start in every one of 100 draws")
 
     def draw_of(self, seed: int) -> Draw:
-        """The draw with which ``World.reset(seed)`` starts its world 0.
+        """The draw that ``World.reset(seed)`` uses for world 0.
 
         Raises:
             ConfigurationError: as :meth:`draw`.
@@ -238,7 +238,7 @@ class Scenario:
         return self.draw(stream(seed))
 
     def _lay_out(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, int | None]:
-        """Obstacles (K, 3), motions (K, 6) or (0, 6), and the number of the layout if there is one."""
+        """Obstacles (K, 3), motions (K, 6) or (0, 6), and the layout's number, None without a layout."""
         if self.layout is None:
             return self.obstacle_array(), motion_array(self.motions), None
         number = layout_number(rng, self.split)
@@ -246,7 +246,7 @@ class Scenario:
         return obstacles.copy(), motions, number
 
     def check_windows(self, windows: tuple[Window, ...]) -> None:
-        """Raise ConfigurationError for a window with an unknown agent, or times that are not finite or not in order."""
+        """Raise ConfigurationError for a window with an unknown agent, times that are not finite, or an end before its start."""
         for window in windows:
             if not np.isfinite((window.start, window.end)).all():
                 raise ConfigurationError(f"window {tuple(window)}: times must be finite")
@@ -349,10 +349,10 @@ class Scenario:
 
 
 def with_changes(made: Mapping[str, Any], changes: Mapping[str, Any]) -> Scenario:
-    """A scenario with these fields, some of them changed.
+    """A scenario from the fields ``made``, of which ``changes`` override some.
 
     Raises:
-        ConfigurationError: a change that is no field.
+        ConfigurationError: a change that names no field of a scenario.
     """
     known = [each.name for each in fields(Scenario)]
     if "agents" in changes:
@@ -377,9 +377,9 @@ def standard_behaviors(
     agent_distance: float | None = None,
     line_width: float | None = None,
 ) -> tuple[Behavior, ...]:
-    """OA, FM and FR in this order, with the gains of Table 2; then AA with OA's gain, if ``agent_distance`` is given.
+    """OA, FM and FR, by default with the gains of Table 2, then AA with OA's gain if ``agent_distance`` is given.
 
-    With ``line_width`` [m], FR comes to its slots along their lines, see :class:`~marlbc_mj.core.behaviors.LineFormation`.
+    With ``line_width`` [m], FR is a :class:`~marlbc_mj.core.behaviors.LineFormation` of that width.
     """
     column = Formation("FR", reconstruction, formation_gain)
     if line_width is not None:

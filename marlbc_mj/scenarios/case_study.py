@@ -7,7 +7,7 @@ from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behavi
 STARTS = ((-2.0, 8.0), (-2.0, -8.0), (-7.0, 14.0), (-7.0, -14.0))
 SLOTS = ((2.5, 6.0), (2.5, -6.0), (-2.5, 12.0), (-2.5, -12.0))
 COLUMN = ((4.5, 0.0), (1.5, 0.0), (-1.5, 0.0), (-4.5, 0.0))
-"""Gamma_i p_c_i with Gamma_3 and Gamma_4 positive; the published signs put two pairs of agents in one place (erratum 4)."""
+"""Gamma_i p_c_i with Gamma_3 and Gamma_4 positive; with the published signs two pairs of slots coincide (erratum 4)."""
 OBSTACLES = (
     Obstacle(20, 5),
     Obstacle(40, -11),
@@ -21,13 +21,13 @@ SCHEDULE = (
     Window(43.1, 46.9, 3, "OA>FM"),
     Window(50.0, 82.5, -1, "FR"),
 )
-"""The fewest switches the geometry allows: slots of agents 1 and 4 pass a point at 1 m, every slot meets a disc."""
+"""As few switches as the geometry allows: the slots of agents 1 and 4 pass a point obstacle at 1 m; every slot hits a disc."""
 
 
 def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
-    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` is the published OA (erratum 6).
+    """The case study; ``changes`` replace any field of :class:`Scenario`, ``two_sided`` selects the published OA (erratum 6).
 
-    OA keeps the ``safe_distance`` that violations are judged by.
+    A changed ``safe_distance`` applies both to OA and to the test for violations.
     """
     distance = changes.get("safe_distance", 2.0)
     fields: dict[str, Any] = {
@@ -44,10 +44,9 @@ def paper(*, two_sided: bool = False, **changes: Any) -> Scenario:
 
 
 def cruise(**changes: Any) -> Scenario:
-    """The case study's team, in formation from the start, on an oblique path with nothing in the way.
+    """The case study's team, in formation from the start, on an oblique path without obstacles.
 
-    Crossing y sweeps the drag (43) through its periods while the forces stay small: the place to see whether an identifier
-    learns.
+    Motion along y sweeps the drag (43) through its periods while forces stay small, which shows whether an identifier learns.
     """
     fields: dict[str, Any] = {
         "name": "cruise",

@@ -1,4 +1,4 @@
-"""Families of missions, which differ in their obstacles; every seed draws new places. Their base is in
+"""Families of missions, one per kind of obstacles; every seed draws new positions. Their base class is in
 :mod:`marlbc_mj.scenarios.family`. A family is used by name, from a TOML file, or as a Python object:
 ``Field(agents=9, formation="grid").build()``.
 """
@@ -19,7 +19,7 @@ START_SPREAD = Perturbation(start_spread=0.5)
 
 @dataclass(frozen=True, kw_only=True)
 class Exchange(Family):
-    """Everyone starts where the agent opposite in a circle belongs: without agent avoidance all meet in the middle."""
+    """Agents on a circle swap places with the opposite side; without agent avoidance all of them meet in the middle."""
 
     name: str = "exchange"
     agents: int = 8
@@ -27,7 +27,7 @@ class Exchange(Family):
     spacing: float = 6.0
     column_spacing: float = 4.0
     length: float = 40.0
-    formation_gain: float = 0.2  # slow enough for AA to act: 3 m/s at the start
+    formation_gain: float = 0.2  # about 3 m/s at the start, slow enough for AA to act
     agent_distance: float = 2.5
     perturbation: Perturbation = START_SPREAD
     summary: ClassVar[str] = "everyone starts opposite its slot, so that all paths cross"
@@ -38,13 +38,13 @@ class Exchange(Family):
 
 @dataclass(frozen=True, kw_only=True)
 class Field(Family):
-    """Discs of different size at random places."""
+    """Discs of random sizes at random places."""
 
     name: str = "field"
     obstacles: int = 12
     radius: Range = (0.5, 2.0)  # [m]
-    margin: float = 3.0  # by which the field is wider than the formation, on either side [m]
-    gap: float = 3.0  # between two discs' surfaces [m]
+    margin: float = 3.0  # extra width of the field on each side of the formation [m]
+    gap: float = 3.0  # least distance between the surfaces of two discs [m]
     summary: ClassVar[str] = "a field of discs, drawn by the seed"
     cluttered: ClassVar[bool] = True
 
@@ -72,20 +72,20 @@ class Field(Family):
         return self.scatter(self.obstacles, self.radius, self.gap)
 
     def scatter(self, count: int, radius: Range, gap: float) -> Scatter:
-        """Discs all over the way."""
+        """Discs at random places along the whole route."""
         first, last, width = self.way[0] + radius[1], self.way[1] - radius[1], self.reach + self.margin
         return Scatter(count, radius, (first, last), (-width, width), gap)
 
     def schedule(self) -> tuple[Window, ...]:
-        return ()  # every seed would need another
+        return ()  # every seed would need its own schedule
 
 
 @dataclass(frozen=True, kw_only=True)
 class Forest(Field):
-    """Many thin trunks, none nearer to another than an agent needs to pass."""
+    """Many thin trunks, far enough apart for an agent to pass between any two."""
 
     name: str = "forest"
-    obstacles: int = 0  # 0: as many as ``density`` says
+    obstacles: int = 0  # 0: the number follows from ``density``
     density: float = 0.025  # trunks per square metre
     radius: Range = (0.15, 0.4)
     safe_distance: float = 0.75
@@ -102,7 +102,7 @@ class Forest(Field):
 
     @property
     def trunks(self) -> int:
-        """How many there are."""
+        """Number of trunks."""
         area = (self.way[1] - self.way[0]) * 2.0 * (self.reach + self.margin)
         return self.obstacles or max(1, round(self.density * area))
 
@@ -112,13 +112,13 @@ class Forest(Field):
 
 @dataclass(frozen=True, kw_only=True)
 class Gates(Family):
-    """Walls of discs across the way, each with one opening, all of a given width."""
+    """Walls of discs across the route, each with one opening of the same width."""
 
     name: str = "gates"
     gates: int = 2
-    width: float = 5.0  # between the surfaces on both sides of an opening [m]
-    shift: float = 0.75  # the middle of an opening is drawn within this distance of the path [m]
-    post: float = 1.5  # radius of the discs that make a wall [m]
+    width: float = 5.0  # free width of an opening, between the surfaces of the discs [m]
+    shift: float = 0.75  # largest distance of an opening's middle from the path [m]
+    post: float = 1.5  # radius of the discs that form a wall [m]
     depth: float = 0.0  # length of the passage behind an opening [m]
     summary: ClassVar[str] = "walls across the way, each with an opening at a drawn place"
     cluttered: ClassVar[bool] = True
@@ -143,11 +143,11 @@ class Gates(Family):
             raise self.infeasible(f"{self.gates} passages of {each:g} m do not fit into {whole:g} m of way")
 
     def _pitch(self) -> float:
-        """From one opening to the next [m]."""
+        """Distance from one opening to the next [m]."""
         return float(np.ptp(self.way)) / self.gates
 
     def passages(self) -> tuple[Range, ...]:
-        """Where each begins and ends [m]: in the middle of its share of the way."""
+        """Start and end of each passage along the route [m]; a passage is in the middle of its share of the route."""
         middles = self.way[0] + self._pitch() * (np.arange(self.gates) + 0.5)
         return tuple((float(x - 0.5 * self.depth), float(x + 0.5 * self.depth)) for x in middles)
 
@@ -155,7 +155,7 @@ class Gates(Family):
         return Walls(self.passages(), self.width, self.shift, self.post, self.reach + self.safe_distance + 2.0 * self.post)
 
     def schedule(self) -> tuple[Window, ...]:
-        """The column from before the first agent comes near a wall until the last one has left it."""
+        """Column (FR) from before the first agent comes near a wall until the last agent has left it."""
         farthest = float(np.linalg.norm(self.slots - self.column, axis=1).max())
         settle = 1.0 + float(np.log(max(2.0, farthest / self.formation_tolerance))) / self.formation_gain
         zone = self.post + self.safe_distance
@@ -173,7 +173,7 @@ class Gates(Family):
 
 @dataclass(frozen=True, kw_only=True)
 class Corridor(Gates):
-    """One long passage between two walls."""
+    """One wall whose opening leads into a long passage between two walls."""
 
     name: str = "corridor"
     gates: int = 1
@@ -184,15 +184,15 @@ class Corridor(Gates):
 
 @dataclass(frozen=True, kw_only=True)
 class Crossing(Family):
-    """Obstacles that move, beyond the paper's Assumption 2: some cross the way when the team comes, others swing across it."""
+    """Moving obstacles, which the paper's Assumption 2 excludes: some cross the route as the team passes, others swing across."""
 
     name: str = "traffic"
     obstacles: int = 6
-    swinging: int = 3  # how many of them swing; the others cross
+    swinging: int = 3  # number of obstacles that swing; the others cross
     radius: Range = (0.5, 1.5)  # [m]
     obstacle_speed: Range = (0.3, 1.0)  # [m/s]
     swing: Range = (2.0, 5.0)  # amplitude [m]
-    gap: float = 3.0  # between two of them, at any time [m]
+    gap: float = 3.0  # least distance between the surfaces of two obstacles at any time [m]
     summary: ClassVar[str] = "obstacles that cross the way or swing across it"
     cluttered: ClassVar[bool] = True
 
@@ -241,14 +241,14 @@ FAMILIES: dict[str, type[Family]] = {
     "corridor": Corridor,
     "traffic": Crossing,
 }
-"""Class by name."""
+"""Family classes by name."""
 
 
 def held_out(scenario: Scenario) -> Scenario:
     """The same scenario with layouts that no training seed draws.
 
     Raises:
-        ConfigurationError: the scenario has no layout to draw.
+        ConfigurationError: the scenario draws no layouts.
     """
     if scenario.layout is None:
         drawn = ", ".join(name for name, family in FAMILIES.items() if family().layout() is not None)

@@ -1,8 +1,8 @@
-"""The base of all families of missions: a team, its formation and its way. A frozen dataclass that builds a scenario.
+"""The base of all families of missions: a frozen dataclass of a team, its formation and its route that builds a scenario.
 
-A team in formation at rest at the origin travels ``length`` along +x at ``speed``, and reforms into a column (FR) where its
-supervisor says so. Every length, speed, gain and limit is a field, so a family fits robots of any size; what cannot be flown is
-refused with the reason when the scenario is built.
+A team starts at rest in formation at the origin, travels ``length`` along +x at ``speed``, and forms a column (FR) when its
+supervisor chooses it. Every length, speed, gain and limit is a field, so a family fits robots of any size. Settings that make a
+mission infeasible are rejected with the reason when the scenario is built.
 """
 
 from dataclasses import dataclass, field, fields, replace
@@ -23,46 +23,46 @@ from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.settings import check_kinds
 
 NOMINAL = 0
-"""Number of the layout that a scenario shows before a seed is drawn: a training one."""
+"""Number of the layout that a scenario contains before a seed is drawn; it is a training layout."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mission:
-    """The part of a mission that does not depend on its way: clocks, robots, avoidance and formation."""
+    """The settings of a mission that do not depend on its route: time steps, robots, avoidance and formation."""
 
     name: str
-    safe_distance: float = 1.0  # to obstacles: d_OA [m]
-    agent_avoidance: bool = True  # whether AA is among the behaviors
+    safe_distance: float = 1.0  # from obstacles: d_OA [m]
+    agent_avoidance: bool = True  # whether AA is one of the behaviors
     agent_distance: float = 1.5  # between agents: d_AA [m]
-    avoidance_gain: float = 20.0  # of OA and AA [1/s]
-    formation_gain: float  # of FM and FR [1/s]
-    formation_tolerance: float = 0.5  # [m]
+    avoidance_gain: float = 20.0  # gain of OA and AA [1/s]
+    formation_gain: float  # gain of FM and FR [1/s]
+    formation_tolerance: float = 0.5  # largest distance from the slot, relative to the centroid [m]
     mission_step: float = 0.05  # [s]
     substep: float = 0.005  # [s]
     reference: Literal["virtual", "actual"] = "virtual"
     composition: Literal["null-space", "set-based"] = "null-space"  # avoidance as an equality task, or as an inequality
-    column_approach: Literal["straight", "line"] = "straight"  # how FR comes to its slots: straight, or along their lines
-    robot: str = "point_mass"  # of every agent
-    robots: tuple[str, ...] = ()  # of each agent, where they differ
+    column_approach: Literal["straight", "line"] = "straight"  # how FR approaches its slots, see LineFormation
+    robot: str = "point_mass"  # robot of all agents
+    robots: tuple[str, ...] = ()  # robot of each agent if they differ
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
-    unit_force: float = 1.0  # what a controller's output of 1 is [N]: a robot's mass
-    speed_limit: float = np.inf  # of references [m/s]
-    acceleration_limit: float = np.inf  # of references [m/s^2]
+    unit_force: float = 1.0  # force for a controller's output of 1 [N]; a robot's scale sets it to the robot's mass
+    speed_limit: float = np.inf  # speed limit of references [m/s]
+    acceleration_limit: float = np.inf  # acceleration limit of references [m/s^2]
     imperfections: Imperfections = NO_IMPERFECTIONS
     communication: Communication = IDEAL
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = field(default_factory=Perturbation)
 
     def shared(self) -> dict[str, Any]:
-        """The fields that mean the same in a scenario."""
+        """The fields that a scenario has under the same name."""
         known = {f.name for f in fields(Scenario)}
         return {f.name: getattr(self, f.name) for f in fields(self) if f.name in known}
 
     def behaviors_for(
         self, slots: tuple[Point, ...], column: tuple[Point, ...], *, two_sided: bool = False
     ) -> tuple[Behavior, ...]:
-        """OA, FM and FR, and AA where agents avoid each other. A line is as wide as agents keep apart."""
+        """OA, FM and FR, and AA if agents avoid each other. The line width of FR is ``agent_distance``."""
         return standard_behaviors(
             slots,
             column,
@@ -77,39 +77,39 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class Family(Mission):
-    """The base of all families; by itself, a mission with nothing in the way.
+    """The base of all families; used by itself, a mission without obstacles.
 
     Raises:
-        ConfigurationError: from :meth:`build`, naming the value that cannot be flown and why.
+        ConfigurationError: from :meth:`build`, for settings that make the mission infeasible; the message names value and reason.
     """
 
     name: str = "open"
-    formation_gain: float = 4.0  # of FM and FR [1/s]; half of the case study's, whose references jump at 96 m/s
+    formation_gain: float = 4.0  # gain of FM and FR [1/s]; half the case study's, which gives references of up to 96 m/s
     agents: int = 4  # 2 to 256
     formation: str = "wedge"  # line, wedge, circle or grid
     spacing: float = 6.0  # between neighbors in formation [m]
-    files: int = 1  # columns side by side that FR forms
+    files: int = 1  # number of columns side by side that FR forms
     column_spacing: float = 3.0  # between neighbors in the column [m]
-    length: float = 60.0  # of the way [m]
-    speed: float = 1.0  # [m/s]
+    length: float = 60.0  # length of the route [m]
+    speed: float = 1.0  # speed of the desired centroid [m/s]
     two_sided: bool = False  # OA as the published equality (erratum 6)
-    split: Literal["train", "test"] = "train"  # whose layouts are drawn; the held-out ones are "test"
+    split: Literal["train", "test"] = "train"  # which layouts are drawn; "test" layouts are held out
     summary: ClassVar[str] = "nothing in the way"
-    cluttered: ClassVar[bool] = False  # whether the way must have room for obstacles
+    cluttered: ClassVar[bool] = False  # whether the route must have room for obstacles
 
     @cached_property
     def slots(self) -> np.ndarray:
-        """(N, 2) of the formation [m]."""
+        """(N, 2) slot offsets of the formation [m]."""
         return make_formation(self.formation, self.agents, self.spacing)
 
     @cached_property
     def column(self) -> np.ndarray:
-        """(N, 2) of the column [m]."""
+        """(N, 2) slot offsets of the column [m]."""
         return column(self.slots, self.column_spacing, self.files)
 
     @property
     def way(self) -> Range:
-        """Where along x surfaces of obstacles may be, so that the formation is clear of them at both ends [m]."""
+        """Range of x for obstacle surfaces that keeps the formation clear of them at both ends of the route [m]."""
         margin = self.safe_distance + self.formation_tolerance
         return float(self.slots[:, 0].max() + margin), float(self.length + self.slots[:, 0].min() - margin)
 
@@ -119,19 +119,19 @@ class Family(Mission):
         return float(np.abs(self.slots[:, 1]).max())
 
     def layout(self) -> Layout | None:
-        """What draws the obstacles; None where there are none."""
+        """The layout that draws the obstacles; None without obstacles."""
         return None
 
     def schedule(self) -> tuple[Window, ...]:
-        """For the scripted supervisor, where the family's geometry is the same for every seed."""
+        """Windows for the scripted supervisor; empty if every seed would need other windows."""
         return (Window(0.0, 0.0, -1, "FM"),)
 
     def starts(self) -> np.ndarray:
-        """(N, 2) [m]."""
+        """(N, 2) start positions [m]."""
         return self.slots
 
     def build(self, **changes: Any) -> Scenario:
-        """The scenario; ``changes`` replace fields of the family, or of the scenario where the family has none of that name."""
+        """The scenario; ``changes`` replace fields of the family, or of the scenario if the family has no such field."""
         own = {f.name for f in fields(self)}
         family = replace(self, **{key: value for key, value in changes.items() if key in own})
         rest = {key: value for key, value in changes.items() if key not in own}
@@ -145,8 +145,8 @@ class Family(Mission):
         return family._scenario(rest)
 
     def check(self) -> None:
-        """Raise ConfigurationError for what cannot be flown."""
-        slots = self.slots  # refuses an unknown formation and a team that is too small or too large
+        """Raise ConfigurationError for settings that make the mission infeasible."""
+        slots = self.slots  # rejects an unknown formation and a team that is too small or too large
         for key in ("length", "speed", "column_spacing", "agent_distance"):
             value = getattr(self, key)
             if not (np.isfinite(value) and value > 0):
@@ -163,7 +163,7 @@ class Family(Mission):
             raise self.infeasible(f"a formation {extent:g} m long leaves nothing of a way of {self.length:g} m; make it longer")
 
     def behaviors(self) -> tuple[Behavior, ...]:
-        """Of the family's formation and column."""
+        """The behaviors for the family's formation and column."""
         return self.behaviors_for(points(self.slots), points(self.column), two_sided=self.two_sided)
 
     def infeasible(self, reason: str) -> ConfigurationError:
@@ -192,5 +192,5 @@ class Family(Mission):
 
 
 def points(rows: np.ndarray) -> tuple[tuple[float, float], ...]:
-    """(n, 2) as a tuple of points."""
+    """The rows of an (n, 2) array as a tuple of points."""
     return tuple((float(x), float(y)) for x, y in rows)

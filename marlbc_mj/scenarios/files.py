@@ -8,7 +8,7 @@
     kind = "gusts"
     seed = 7
 
-The file loads into the family's own dataclass, so it knows the same keys, checks and defaults as Python does.
+The file is loaded into the family's own dataclass, so keys, checks and defaults are the same as in Python.
 """
 
 import math
@@ -42,15 +42,15 @@ class Custom(Mission):
     """A mission whose starts, slots and obstacles are given point by point."""
 
     starts: tuple[Point, ...]  # [m]
-    slots: tuple[Point, ...]  # FM: offsets from the desired centroid [m]
-    column: tuple[Point, ...]  # FR [m]
+    slots: tuple[Point, ...]  # FM: slot offsets from the desired centroid [m]
+    column: tuple[Point, ...]  # FR: slot offsets from the desired centroid [m]
     name: str = "custom"
     formation_gain: float = 2.0  # [1/s]
     path_origin: Point = (0.0, 0.0)  # [m]
     path_velocity: Point = (1.0, 0.0)  # [m/s]
-    obstacles: tuple[Obstacle, ...] = ()  # [x, y] or [x, y, radius] each [m]
-    motions: tuple[Motion, ...] = ()  # [vx, vy, ax, ay, period, phase] each; zeros at the end may be left out
-    schedule: tuple[Window, ...] = ()  # [start, end, agent, order] each
+    obstacles: tuple[Obstacle, ...] = ()  # each [x, y] or [x, y, radius] [m]
+    motions: tuple[Motion, ...] = ()  # each [vx, vy, ax, ay, period, phase]; trailing defaults may be left out
+    schedule: tuple[Window, ...] = ()  # each [start, end, agent, order]
     duration: float = 60.0  # [s]
 
     def build(self, **changes: Any) -> Scenario:
@@ -61,19 +61,19 @@ class Custom(Mission):
 
 
 def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any) -> Scenario:
-    """The scenario of a TOML file, with any of its fields changed. Reading it runs no code unless that is allowed.
+    """The scenario of a TOML file, with any of its fields changed. Loading runs no code unless ``allow_code`` is set.
 
-    A robot's file is looked up beside the TOML file. A robot that has a scale (mass, limits, substep) gives it to fields that the
-    file does not name; of several, see :meth:`marlbc_mj.robots.fleet.RobotFleet.scale`.
+    A robot's file is looked up in the folder of the TOML file. A robot's scale (mass, limits, substep) fills the fields that the
+    TOML file does not set; for a mixed team see :meth:`marlbc_mj.robots.fleet.RobotFleet.scale`.
 
     Args:
-        path: the file.
-        allow_code: whether its robot may be a Python file, which is run.
-        **changes: fields of the family, or of the scenario where the family has none of that name.
+        path: path of the TOML file.
+        allow_code: whether the file may name a Python file as its robot, which is then run.
+        **changes: fields of the family, or of the scenario if the family has no such field.
 
     Raises:
-        ConfigurationError: no such file, no TOML, an unknown key or a value of another type (named, with the valid ones), or a
-            mission that cannot be flown (with the reason).
+        ConfigurationError: no such file, invalid TOML, an unknown key or a value of the wrong type (named, with the valid ones),
+            or an infeasible mission (with the reason).
     """
     content = _with_robot(_read(Path(path)), Path(path), changes, allow_code=allow_code)
     name = content.pop("family", None)
@@ -89,7 +89,7 @@ def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any)
         return mission.build(**changes)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from error
-    except (ArithmeticError, TypeError, ValueError, RecursionError, MemoryError) as error:  # numbers that no check foresaw
+    except (ArithmeticError, TypeError, ValueError, RecursionError, MemoryError) as error:  # numbers that no check anticipates
         raise ConfigurationError(
             f"{path}: a value that no scenario can have: {one_line(error) or type(error).__name__}"
         ) from error
@@ -109,12 +109,12 @@ def _read(path: Path) -> dict[str, Any]:
         raise
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, or a number of thousands of digits
+    except (ValueError, RecursionError) as error:  # invalid TOML or UTF-8, or a number with thousands of digits
         raise ConfigurationError(f"{path} is not TOML: {one_line(error)}") from error
 
 
 def _depth(text: str) -> int:
-    """An upper bound of how deep TOML is nested: brackets that are open at once, and parts of a dotted key."""
+    """Estimate of how deeply TOML is nested: the most brackets open at once or, if larger, the most dots in a key."""
     deepest = depth = 0
     for character in text:
         depth += (character in "[{") - (character in "]}")
@@ -123,10 +123,10 @@ def _depth(text: str) -> int:
 
 
 def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any], *, allow_code: bool) -> dict[str, Any]:
-    """The content with the robots' files found beside the scenario's, and the robots' scale where the file does not set it.
+    """The content with paths of robot files resolved, and with the robots' scale in fields that the file does not set.
 
     Raises:
-        ConfigurationError: a robot that cannot be made, or a program that the file names, without leave to run it.
+        ConfigurationError: a robot that cannot be made, or a Python file as robot without ``allow_code``.
     """
     given = {key: changes[key] for key in ("robot", "robots") if key in changes}
     named = {key: value for key, value in content.items() if key in ("robot", "robots") and not given}
@@ -136,19 +136,19 @@ def _with_robot(content: dict[str, Any], path: Path, changes: Mapping[str, Any],
         named["robots"] = [_beside(name, path, allow_code) for name in named["robots"]]
     chosen = given or named
     if not isinstance(chosen.get("robot", ""), str) or not _are_texts(chosen.get("robots", ())):
-        return content  # which its dataclass refuses
+        return content  # the dataclass rejects it
     scale = {key: value for key, value in _scale(chosen).items() if value != math.inf}
     rest = {key: value for key, value in content.items() if not given or key not in ("robot", "robots")}
     return {**scale, **rest, **named}
 
 
 def _are_texts(value: Any) -> bool:
-    """Whether a value is a list of texts."""
+    """Whether a value is a list or tuple of strings."""
     return isinstance(value, list | tuple) and all(isinstance(entry, str) for entry in value)
 
 
 def _scale(chosen: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields that one robot for all, or the robots of all agents, give a scenario; without the names themselves."""
+    """The fields of a scenario that follow from its robot or robots, without the names of the robots."""
     if not chosen:
         return {}
     robots = chosen.get("robots")
@@ -157,10 +157,10 @@ def _scale(chosen: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _beside(name: str, path: Path, allow_code: bool) -> str:
-    """The name of a robot in the scenario file ``path``; of a file beside that one, its path.
+    """A robot's name in the scenario file ``path``, or its path if it is a file in the same folder.
 
     Raises:
-        ConfigurationError: a program, without leave to run it.
+        ConfigurationError: a Python file without ``allow_code``.
     """
     if name.partition(":")[0].endswith(".py") and not allow_code:
         raise ConfigurationError(f"{path}: robot {name!r} is a program; add --allow-code (allow_code=True in Python) to run it")
@@ -169,7 +169,7 @@ def _beside(name: str, path: Path, allow_code: bool) -> str:
 
 
 def _changes(content: Mapping[str, Any]) -> dict[str, Any]:
-    """Fields of a scenario that a file gives another value; those that follow from others are out of its reach."""
+    """The scenario fields that a file changes; behaviors, layout and split cannot be set by a file."""
     valid = {name: hint for name, hint in field_types(Scenario).items() if name not in ("behaviors", "layout", "split")}
     for key in content:
         if key not in valid:
@@ -178,7 +178,7 @@ def _changes(content: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _disturbance(value: Any, _: Any) -> Disturbance:
-    """A table whose ``kind`` says which class the rest of it fills."""
+    """A disturbance from a table; ``kind`` selects the class, the other keys are its fields."""
     if not isinstance(value, dict):
         raise misfit("a table", value)
     make, _ = choose(value.get("kind"), DISTURBANCES, ".kind")

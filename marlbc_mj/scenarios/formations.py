@@ -10,26 +10,26 @@ _LEAST, _MOST = 2, 256  # agents
 
 
 def line(agents: int, spacing: float) -> np.ndarray:
-    """Abreast, across the direction of travel."""
+    """A row of agents across the direction of travel."""
     return np.column_stack([np.zeros(agents), spacing * (np.arange(agents) - 0.5 * (agents - 1))])
 
 
 def wedge(agents: int, spacing: float) -> np.ndarray:
-    """A leader and two arms at 45 degrees behind it, agents in turn on the left and on the right."""
+    """A leader and two arms behind it at 45 degrees; agents alternate between the left and the right arm."""
     place = np.arange(agents)
     rank, side = (place + 1) // 2, np.where(place % 2 == 1, 1.0, -1.0)
     return _centred(spacing * np.sqrt(0.5) * np.column_stack([-rank, side * rank]))
 
 
 def circle(agents: int, spacing: float) -> np.ndarray:
-    """A regular polygon whose sides are ``spacing`` long, the first agent in front."""
+    """A regular polygon with sides of length ``spacing`` and the first agent in front."""
     turn = 2.0 * np.pi * np.arange(agents) / agents
     radius = 0.5 * spacing / np.sin(np.pi / agents)
     return np.asarray(radius * np.column_stack([np.cos(turn), np.sin(turn)]))
 
 
 def grid(agents: int, spacing: float) -> np.ndarray:
-    """Rows of equal length, as square as the number allows; a last row that is shorter stands in the middle."""
+    """Rows of equal length, as square as the number of agents allows; a shorter last row is centered."""
     width = int(np.ceil(np.sqrt(agents)))
     row = np.arange(agents) // width
     filled = np.minimum(width, agents - row * width)
@@ -42,7 +42,7 @@ FORMATIONS: dict[str, tuple[Callable[[int, float], np.ndarray], str]] = {
     "circle": (circle, "a regular polygon"),
     "grid": (grid, "rows and columns, as square as the number allows"),
 }
-"""Slots (N, 2) [m] from number of agents and spacing [m], and one line of description, by name."""
+"""By name: a function that returns slots (N, 2) [m] for a number of agents and a spacing [m], and a one-line description."""
 
 
 def make_formation(name: str, agents: int, spacing: float) -> np.ndarray:
@@ -63,7 +63,7 @@ def make_formation(name: str, agents: int, spacing: float) -> np.ndarray:
 def column(slots: np.ndarray, spacing: float, files: int = 1) -> np.ndarray:
     """(N, 2) offsets of the same team in ``files`` columns along x, ``spacing`` [m] apart both ways.
 
-    Who is in front in ``slots`` (N, 2) is in front here, and of those side by side the left one goes to the left.
+    Agents in front in ``slots`` (N, 2) are in front in the column, and agents side by side keep their order from left to right.
     """
     agents = len(slots)
     ranked = np.lexsort((np.abs(slots[:, 1]).round(9), -slots[:, 0].round(9)))

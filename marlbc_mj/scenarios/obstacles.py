@@ -1,7 +1,7 @@
-"""Layouts: how a seed places obstacles in the way of a team that travels along +x. Each is a frozen dataclass with ``sample``.
+"""Layouts: how a seed places obstacles in front of a team that travels along +x. Each is a frozen dataclass with ``sample``.
 
-Every draw leaves a way: static obstacles are so far apart that an agent can pass between any two, and what moves is nowhere near
-the slots when a mission begins or ends. A draw that does not is rejected, and after too many rejections the reason is said.
+Every layout leaves a way through: scattered discs keep a gap, walls have openings, and moving obstacles stay away from the slots
+when a mission begins and ends. Draws that break this are rejected; after too many rejections an error gives the reason.
 """
 
 from dataclasses import dataclass
@@ -13,24 +13,24 @@ from marlbc_mj.scenarios.layout import Sample
 from marlbc_mj.util.errors import ConfigurationError
 
 TRIES = 400  # places tried for one obstacle
-RESTARTS = 20  # layouts begun before a family says that it found none
-_FULL = 0.55  # share of an area that discs thrown at random can cover; beyond it there is no use in trying
+RESTARTS = 20  # layouts tried before an error is raised
+_FULL = 0.55  # share of an area that randomly placed discs can cover; more is rejected without trying
 
 Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
 class Scatter:
-    """Discs at random places of a rectangle, their surfaces at least ``gap`` apart."""
+    """Discs at random places in a rectangle, their surfaces at least ``gap`` apart."""
 
     count: int
-    radius: Range  # uniform [m]
-    x: Range  # where middles may be [m]
-    y: Range  # [m]
-    gap: float  # [m]
+    radius: Range  # drawn uniformly [m]
+    x: Range  # range of the centers [m]
+    y: Range  # range of the centers [m]
+    gap: float  # least distance between two surfaces [m]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """Discs thrown one after the other, where they have room."""
+        """Discs placed at random one after the other where there is room."""
         mean = 0.5 * sum(self.radius) + 0.5 * self.gap
         area = (self.x[1] - self.x[0] + 2.0 * mean) * (self.y[1] - self.y[0] + 2.0 * mean)
         if self.count * np.pi * mean**2 > _FULL * area:
@@ -44,7 +44,7 @@ class Scatter:
         raise ConfigurationError(self._reason(f"of {RESTARTS} draws the fullest held {most}"))
 
     def _throw(self, rng: np.random.Generator) -> np.ndarray:
-        """(k, 3) discs, k = ``count`` if all found a place."""
+        """(k, 3) discs; k = ``count`` if there was room for all."""
         discs = np.empty((self.count, 3))
         radii = np.sort(rng.uniform(*self.radius, self.count))[::-1]  # the large ones first, while there is room
         for k, radius in enumerate(radii):
@@ -58,7 +58,7 @@ class Scatter:
     def _first_free(self, places: np.ndarray, radius: float, discs: np.ndarray) -> int:
         """Index of the first of ``places`` (P, 2) with room for a disc among ``discs`` (k, 3); -1 if there is none."""
         first = 0
-        while first < len(places):  # one place, then more and more at a time: most discs find room soon, also among thousands
+        while first < len(places):  # batches of doubling size: most discs find room after few tries, even among thousands
             some = places[first : 2 * first + 1]
             room = np.linalg.norm(some[:, None] - discs[None, :, :2], axis=-1) - discs[:, 2] - radius
             free = np.flatnonzero((room >= self.gap).all(axis=1))
@@ -76,51 +76,51 @@ class Scatter:
 
 @dataclass(frozen=True)
 class Walls:
-    """Gates and corridors: walls of discs across the way, each with an opening, and along both sides of a passage behind it.
+    """Gates and corridors: walls of discs across the route, each with an opening, and along both sides of the passage behind it.
 
-    An opening's middle is drawn within ``shift`` of the path, the free width between the discs' surfaces is ``width``.
+    An opening's middle is drawn within ``shift`` of the path; its free width, between disc surfaces, is ``width``.
     """
 
-    passages: tuple[Range, ...]  # where each begins and ends [m]; a gate begins and ends in one place
+    passages: tuple[Range, ...]  # start and end of each along x [m]; equal for a gate
     width: float  # [m]
     shift: float  # [m]
-    radius: float  # of the discs [m]
-    reach: float  # walls across reach at least this far from the path [m]
+    radius: float  # radius of the discs [m]
+    reach: float  # walls across the route extend at least this far from the path [m]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """All passages, every opening at a random place."""
+        """Draw all passages, each opening at a random place."""
         walls = [self._passage(*ends, float(rng.uniform(-self.shift, self.shift))) for ends in self.passages]
         return Sample(np.concatenate(walls), np.zeros((0, NUMBERS)))
 
     def _passage(self, first: float, last: float, middle: float) -> np.ndarray:
-        """(k, 3) discs; the same number for every opening."""
+        """(k, 3) discs of one passage; k does not depend on ``middle``."""
         side = 0.5 * self.width + self.radius
         across = side + 2.0 * self.radius * np.arange(int(np.ceil((self.reach + self.shift - side) / (2.0 * self.radius))) + 1)
         along = np.linspace(first, last, int(np.ceil((last - first) / (2.0 * self.radius))) + 1)[1:]
         places = [(first, middle + sign * y) for sign in (1.0, -1.0) for y in across]
         places += [(x, middle + sign * side) for sign in (1.0, -1.0) for x in along]
-        return np.array([(x, y, self.radius) for x, y in places]).reshape(-1, 3)  # none, where an opening takes the whole width
+        return np.array([(x, y, self.radius) for x, y in places]).reshape(-1, 3)  # (0, 3) if the opening is wider than the walls
 
 
 @dataclass(frozen=True)
 class Traffic:
-    """Discs that move: some cross the way in a straight line when the team passes, the others swing to and fro across it."""
+    """Moving discs: some cross the route in a straight line as the team passes, the others swing back and forth across it."""
 
     count: int
-    swinging: int  # how many of them swing
+    swinging: int  # number of discs that swing; the others cross
     radius: Range  # [m]
-    speed: Range  # of those that cross, and the greatest of those that swing [m/s]
+    speed: Range  # speed of crossing discs, peak speed of swinging discs [m/s]
     swing: Range  # amplitude [m]
-    x: Range  # where they are met [m]
-    y: float  # they cross the path's line within this distance [m]
-    arrival: tuple[float, float]  # the team is at x at the time arrival[0] + arrival[1] x [s]
-    spread: float  # by which one that crosses may be early or late [s]
-    end: float  # of the mission [s]
-    keep_out: tuple[tuple[float, float, float, float], ...]  # boxes x0, x1, y0, y1 at the start, then at the end [m]
-    gap: float  # between two of them, at any time [m]
+    x: Range  # where they meet the team [m]
+    y: float  # largest distance from the path at that moment, or of the middle of the swing [m]
+    arrival: tuple[float, float]  # the team reaches x at the time arrival[0] + arrival[1] x [s]
+    spread: float  # how early or late a crossing disc may be [s]
+    end: float  # duration of the mission [s]
+    keep_out: tuple[tuple[float, float, float, float], ...]  # boxes x0, x1, y0, y1 to avoid at the start and at the end [m]
+    gap: float  # least distance between two surfaces, checked every 0.25 s [m]
 
     def sample(self, rng: np.random.Generator) -> Sample:
-        """One obstacle after the other, each kept if it stays clear of those before and of the slots at start and end."""
+        """Draw obstacles one by one; each is kept if it stays clear of the earlier ones, and of the slots at start and end."""
         for _ in range(RESTARTS):
             anchors, motions = self._add_all(rng)
             if len(anchors) == self.count:
@@ -148,7 +148,7 @@ class Traffic:
         return anchors, motions
 
     def _one(self, rng: np.random.Generator, x: float, swings: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Anchor (3,) and motion (6,)."""
+        """Anchor (3,) and motion (6,) of one random obstacle."""
         radius, speed, side = rng.uniform(*self.radius), rng.uniform(*self.speed), rng.choice((-1.0, 1.0))
         y = rng.uniform(-self.y, self.y)
         if swings:
@@ -162,7 +162,7 @@ class Traffic:
         return np.array([*(np.array([x, y]) - velocity * when), radius]), np.array([*velocity, 0.0, 0.0, 1.0, 0.0])
 
     def _free(self, track: np.ndarray, tracks: np.ndarray) -> bool:
-        """Whether a track (T, 3) stays ``gap`` from the others (T, k, 3), and out of the boxes when a mission begins and ends."""
+        """Whether a track (T, 3) keeps ``gap`` to the other tracks (T, k, 3) and is outside ``keep_out`` at start and end."""
         between = np.linalg.norm(tracks[..., :2] - track[:, None, :2], axis=-1) - tracks[..., 2] - track[:, None, 2]
         if (between < self.gap).any():
             return False

@@ -1,9 +1,9 @@
-"""The case study's first obstacle and gate, scaled to a robot: its size, speed, acceleration, force and contacts.
+"""The case study's first obstacle and gate, scaled to a robot's size, speed, acceleration, force and contacts.
 
-Lengths are the paper's times the robot's length unit. The team travels at 0.4 of the robot's speed limit, and behaviors' gains
-are what its acceleration can follow: a reference that closes a gap with rate Lambda brakes with Lambda v, so Lambda = 0.8 a / v
-for FM and FR. Avoidance begins outside the distance that is judged, by what the team's speed takes to brake.
-Where robots differ, the greatest length unit and the smallest speed and acceleration count.
+Lengths are the paper's, times the robot's length unit. The team travels at 0.4 of the robot's speed limit v. Gains are limited by
+its acceleration limit a: a reference that closes a gap with rate Lambda decelerates with Lambda v, so Lambda = 0.8 a / v for FM
+and FR. OA starts outside the safe distance, early enough for the team to brake. In a mixed team the greatest length unit and the
+smallest speed and acceleration count.
 """
 
 from pathlib import Path
@@ -16,22 +16,22 @@ from marlbc_mj.robots import make_fleet
 from marlbc_mj.scenarios.base import Obstacle, Scenario, Window, standard_behaviors, with_changes
 from marlbc_mj.scenarios.case_study import COLUMN, OBSTACLES, SLOTS
 
-LENGTH, ORIGIN = 108.0, -2.5  # of the path, where it starts, in length units
-POINT, COLUMN_IN, COLUMN_OUT = (14.8, 20.5), 36.0, 82.0  # of the path, in length units: schedule of the script
-SAFE = 2.0  # d_OA in length units, as the paper's
-AIR_DRAG = 0.0147  # of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/m]
+LENGTH, ORIGIN = 108.0, -2.5  # length of the path and x of its start, in length units
+POINT, COLUMN_IN, COLUMN_OUT = (14.8, 20.5), 36.0, 82.0  # x on the path at which the schedule switches, in length units
+SAFE = 2.0  # d_OA in length units, as in the paper
+AIR_DRAG = 0.0147  # linear drag of a Crazyflie, drone-models 0.1.0, so_rpy_rotor_drag [N s/m]
 
 
 def robot_gate(robot: str = "disc", *, robots: tuple[str, ...] = (), **changes: Any) -> Scenario:
-    """Four robots around a point obstacle and through the gate; ``changes`` replace any field.
+    """Four robots pass a point obstacle and the gate.
 
     Args:
-        robot: that all have.
-        robots: one per agent, in its place.
-        **changes: fields of the scenario and their values.
+        robot: name of the robot of all agents.
+        robots: names of robots, one per agent; overrides ``robot``.
+        **changes: fields of the scenario and their new values.
 
     Raises:
-        ConfigurationError: unknown robot, or robots that cannot be in one world.
+        ConfigurationError: an unknown robot, or robots that cannot share a world.
     """
     fleet = make_fleet(robots or (robot,) * len(SLOTS))
     unit = fleet.length
@@ -62,8 +62,9 @@ def robot_gate(robot: str = "disc", *, robots: tuple[str, ...] = (), **changes: 
 
 
 def _schedule(unit_time: float) -> tuple[Window, ...]:
-    """Agent 1 around the point, then the whole team through the gate in a column; ``unit_time`` [s] is one length unit of the
-    path.
+    """Agent 1 avoids the point, then the whole team passes the gate in a column.
+
+    ``unit_time`` [s] is the time for one length unit of the path.
     """
     return (
         Window(unit_time * (POINT[0] - ORIGIN), unit_time * (POINT[1] - ORIGIN), 0, "OA>FM"),

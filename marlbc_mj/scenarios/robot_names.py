@@ -1,21 +1,21 @@
-"""Which robot each agent of a scenario has: one name for all, or one per agent."""
+"""The robots of a scenario's agents: one name for all, or one per agent."""
 
 from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError
 
 PAPER_ROBOT = "point_mass"
-"""What all agents have where nothing is said."""
+"""The default robot of all agents."""
 
 
 def settle_robots(scenario: str, agents: int, robot: str, robots: Any) -> tuple[str, tuple[str, ...]]:
-    """The fields ``robot`` and ``robots`` of a scenario as they are kept: equal teams have equal fields.
+    """Normalize the fields ``robot`` and ``robots`` of a scenario, so that equal teams have equal fields.
 
     Returns:
-        The robot of all agents and (); where agents' robots differ, the first agent's robot and those of all.
+        The robot of all agents and (); if the robots differ, the first agent's robot and the robots of all agents.
 
     Raises:
-        ConfigurationError: no names, another number than there are agents, or both fields given and in disagreement.
+        ConfigurationError: ``robots`` does not hold one name per agent, or contradicts ``robot``.
     """
     if not isinstance(robots, tuple | list) or not all(isinstance(name, str) for name in robots):
         raise ConfigurationError(f"scenario {scenario!r}: robots must be names, one per agent, got {robots!r}")

@@ -1,5 +1,5 @@
-"""Missions for a team of any size: large teams have a longer way, a column of several files and wider openings, and a field has
-as many discs on a square metre as the field of four agents.
+"""Missions for a team of any size: large teams get a longer route, a column of several files and wider openings, and a field
+has as many discs per square metre as the field for four agents.
 """
 
 from typing import Any, NamedTuple
@@ -10,25 +10,25 @@ from marlbc_mj.scenarios.formations import FORMATIONS
 from marlbc_mj.util.errors import ConfigurationError, unknown
 
 AGENTS_IN_A_FILE = 8
-"""Agents that a file of the column has, about."""
+"""Approximate number of agents in one file of the column."""
 LONG_WAY = 120.0
-"""Way of a team whose column has several files [m]."""
+"""Length of the route for a team with several files in its column [m]."""
 DISC_DENSITY = 12 / 912.0
-"""Discs per square metre, as in the field of four agents."""
+"""Discs per square metre, as in the field for four agents."""
 
 
 class TeamName(NamedTuple):
-    """A team by formation and size."""
+    """Formation and size of a team."""
 
     formation: str
     agents: int
 
 
 def read_team(name: str) -> TeamName:
-    """A team from its text, ``wedge-4``.
+    """Parse the name of a team such as ``wedge-4``.
 
     Raises:
-        ConfigurationError: another form, an unknown formation, or a team of one.
+        ConfigurationError: a name of another form, an unknown formation, or fewer than 2 agents.
     """
     formation, dash, agents = name.partition("-")
     if not (dash and agents.isdigit()):
@@ -41,15 +41,15 @@ def read_team(name: str) -> TeamName:
 
 
 def files_of(agents: int) -> int:
-    """Files of a team's column."""
+    """Number of files in the column of a team."""
     return max(1, (agents + AGENTS_IN_A_FILE // 2) // AGENTS_IN_A_FILE)
 
 
 def team_settings(family: str, formation: str, agents: int, long_way: float = LONG_WAY) -> dict[str, Any]:
     """Fields of a family for a team of this size.
 
-    In one file, a large team would never be through before the end. The opening of gates and corridors is wider by the width of
-    the column. ``long_way`` [m] is the way of a team whose column has several files.
+    A large team gets several files, because in one file it would not be through before the mission ends. Its route is
+    ``long_way`` [m] long, and openings of gates and corridors are wider by the width of its column.
     """
     files = files_of(agents)
     changes: dict[str, Any] = {"agents": agents, "formation": formation}
@@ -65,10 +65,10 @@ def team_settings(family: str, formation: str, agents: int, long_way: float = LO
 
 
 def room_for(family: str, formation: str | None, agents: int | None) -> dict[str, Any]:
-    """:func:`team_settings` of a family's own team, or of another formation or size.
+    """:func:`team_settings` with the family's default for a formation or size that is None.
 
     Raises:
-        ConfigurationError: no such family.
+        ConfigurationError: the family is unknown.
     """
     if family not in FAMILIES:
         raise unknown("family that can make room for a team", family, FAMILIES)
@@ -77,9 +77,9 @@ def room_for(family: str, formation: str | None, agents: int | None) -> dict[str
 
 
 def team_mission(family: str, formation: str, agents: int, *, long_way: float = LONG_WAY, **changes: Any) -> Scenario:
-    """A family for a team of this size, see :func:`team_settings`; ``changes`` are other fields.
+    """The scenario of a family for a team of this size, see :func:`team_settings`; ``changes`` override fields.
 
     Raises:
-        ConfigurationError: what the family cannot fly.
+        ConfigurationError: settings that make the mission infeasible.
     """
     return FAMILIES[family]().build(**{**team_settings(family, formation, agents, long_way), **changes})

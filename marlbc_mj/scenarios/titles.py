@@ -1,4 +1,4 @@
-"""What a mission is called where a person reads it: in a page's title, in a video's header."""
+"""Titles of missions and robots for people, used in page titles and video headers."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ ROBOT_TITLES = {
 
 
 def mission_title(name: str) -> str:
-    """The title of a scenario, by its name; a name of a user's own with its separators as spaces."""
+    """The title of a scenario; an unknown name is capitalized and its underscores become spaces."""
     mission, _, suffix = name.partition("-")
     robots = suffix.split("+") if suffix else []
     if mission in MISSION_TITLES and all(robot in ROBOTS for robot in robots):
@@ -37,7 +37,7 @@ def mission_title(name: str) -> str:
 
 
 def robots_title(names: Sequence[str]) -> str:
-    """The robots of a team, from the name of each agent's: "discs", or "discs (1, 2), Crazyflies (3)" with agents' numbers."""
+    """Title for the robots of all agents: "discs", or with agents' numbers "discs (1, 2), Crazyflies (3)"."""
     titles = [ROBOT_TITLES.get(name, name) for name in names]
     if len(set(titles)) == 1:
         return titles[0]

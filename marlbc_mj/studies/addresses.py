@@ -1,8 +1,8 @@
-"""Content addresses: a job's key is a hash of all that its result depends on, so that equal keys mean equal results.
+"""Content addresses: a job's key is a hash of everything its result depends on, so that equal keys mean equal results.
 
-That is the study's name, the job's configuration, what the files of the user hold that it names or whose types it uses, and the
-code: this package's version and sources, and the versions of the libraries that compute. The processor is not part of it: results
-of one key are the same bits on processors of one kind.
+The hash covers the study's name, the job's configuration, the contents of user files that the configuration names or takes types
+from, and the code: this package's version and sources, and the versions of the numerical libraries. It does not cover the
+processor: results under one key are identical to the last bit only on processors of the same kind.
 """
 
 import hashlib
@@ -21,20 +21,20 @@ from marlbc_mj.util.modules import split_name
 from marlbc_mj.util.provenance import versions
 
 COMPUTING = ("python", "marlbc-mj", "mujoco", "numpy", "numba")
-"""Packages whose versions count."""
+"""Packages whose versions are part of a key."""
 _PACKAGE = __name__.partition(".")[0]
 _ROOT = Path(__file__).resolve().parents[1]
 _SHOWING = ("cli", "report")
-"""Parts of the package on which no result depends."""
+"""Subpackages that no result depends on."""
 _SOURCES = (".json", ".py", ".safetensors", ".xml")
 _NEIGHBORS = {".py": (".py",), ".xml": ()}
-"""Kinds of files that a file of a kind may use from its own folder; none stands for all kinds."""
-MOST_NEIGHBORS = 1000
+"""Suffixes of the files that a file with the given suffix may use from its own folder; an empty tuple means all suffixes."""
+MOST_NEIGHBORS = 1000  # files in a folder beyond which none of them counts
 
 
 @cache
 def code_version() -> str:
-    """What results depend on besides their configuration, in words and a digest of the sources."""
+    """A description of the code that results depend on: package versions and a digest of the sources."""
     digest = hashlib.sha256()
     for path in _package_sources():
         digest.update(f"{path.relative_to(_ROOT).as_posix()}\0".encode())
@@ -59,26 +59,26 @@ def _package_sources() -> list[Path]:
 
 
 class Addresses:
-    """Keys of the jobs of one study; what they have in common is hashed once."""
+    """Computes the keys of the jobs of one study; the parts that jobs share are hashed once."""
 
     def __init__(self, study: Study[Any, Any]) -> None:
         self._study = study
         self._common = f"{type(study).__module__}:{type(study).__qualname__}\0{code_version()}\0".encode()
-        self._parts: dict[int, tuple[Any, bytes]] = {}  # by identity; the object is kept so that its identity is
+        self._parts: dict[int, tuple[Any, bytes]] = {}  # by id(); holding the object keeps its id unique
         self._files: dict[str, bytes] = {}
 
     def key(self, job: Any) -> str:
         """The key of a job, 64 hexadecimal digits.
 
         Raises:
-            ConfigurationError: something in the job is no data.
+            ConfigurationError: the job contains something that is not data.
         """
         describe = getattr(self._study, "describe", None)
         configuration = job if describe is None else describe(job)
         return hashlib.sha256(self._common + self._digest(configuration)).hexdigest()
 
     def _digest(self, part: Any) -> bytes:
-        """Digest of one part of a configuration, together with the files of the user that it means."""
+        """Digest of one part of a configuration and of the user files that it refers to."""
         if isinstance(part, tuple):
             digest = hashlib.sha256(f"{type(part).__qualname__} {len(part)}\0".encode())
             for entry in part:
@@ -102,7 +102,7 @@ class Addresses:
 
 
 def _user_files(encoder: Encoder) -> Iterator[str]:
-    """Files that texts of a configuration name, and those in which its types are defined."""
+    """User files that strings of a configuration name, and those that define its types."""
     for text in encoder.texts:
         file = split_name(text)[0]
         if file.endswith((*_NEIGHBORS, ".safetensors", ".toml")) and "\0" not in file and Path(file).is_file():
@@ -114,7 +114,7 @@ def _user_files(encoder: Encoder) -> Iterator[str]:
 
 
 def _contents(path: Path) -> bytes:
-    """Digest of a file, and of those in its folder that it may use."""
+    """Digest of a file and of the files in its folder that it may use."""
     used = {path, *_neighbors(path)}
     digest = hashlib.sha256()
     for each in sorted(used):

@@ -1,8 +1,8 @@
-"""Many draws of a scenario side by side in one World: flown together and measured one by one.
+"""Many draws of a scenario, simulated side by side in one World and measured one by one.
 
-Worlds and teams do not interact. So what comes of a draw, its metrics or the reason why there are none, is to the bit what
-:func:`~marlbc_mj.episode.run_episode` gives for that draw alone. Only decision times differ: that of all teams together is
-shared out evenly.
+Worlds and teams do not interact. So the outcome of a draw, its metrics or the reason why it failed, is identical to the last bit
+to that of :func:`~marlbc_mj.episode.run_episode` for the same draw alone. Only decision times differ: the time for all teams is
+divided evenly among them.
 """
 
 from collections.abc import Sequence
@@ -30,13 +30,13 @@ from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.seeding import stream
 
 MOST_TOGETHER = 32
-"""Draws that are flown together: more would share the cost of a call, which is small by then, with no gain."""
+"""Draws simulated together, at most; by then the cost per call is so small that sharing it among more draws gains nothing."""
 RECORD_BYTES = 128e6
-"""Bound of what the substeps of those draws take, unless one draw alone takes more [bytes]."""
+"""Most memory for the substep records of these draws, unless a single draw needs more [bytes]."""
 
 
 class Flown(NamedTuple):
-    """The method that flies every draw."""
+    """The method under test, and the scenario that draws are made from."""
 
     scenario: Scenario
     supervisor: Supervisor
@@ -55,16 +55,16 @@ def evaluate_batch(
     shield: bool = False,
     progress: Progress = silent,
 ) -> tuple[SeedRun, ...]:
-    """One method on every seed; a draw that cannot be flown to its end has the reason in the place of metrics.
+    """Run one method on every seed. A run that fails holds the reason instead of metrics.
 
     Args:
-        scenario: drawn from, once per seed.
-        seeds: of the draws.
-        supervisor: by name, see :func:`~marlbc_mj.supervisors.make_supervisor`.
-        controller: by name.
-        composition: of orders to references; None: the scenario's.
-        shield: whether agents have a shield, of the scenario's own numbers.
-        progress: called for every seed, with how many are done.
+        scenario: the scenario to draw from, once per seed.
+        seeds: one draw each.
+        supervisor: name of the supervisor, see :func:`~marlbc_mj.supervisors.make_supervisor`.
+        controller: name of the controller.
+        composition: name of the composition of orders into references; None keeps the scenario's.
+        shield: whether agents have a shield, with the scenario's own numbers.
+        progress: called after every seed with the number of seeds done.
 
     Raises:
         ConfigurationError: unknown names, or a composition that the scenario cannot have.
@@ -76,7 +76,7 @@ def evaluate_batch(
     )
     try:
         World(scenario, entry.law, shield=shield)
-    except ConfigurationError as error:  # this law cannot run in this scenario, whatever the draw
+    except ConfigurationError as error:  # the controller cannot run in this scenario under any draw
         return tuple(SeedRun(seed, None, failure=str(error)) for seed in seeds)
     runs: list[SeedRun] = []
     together = draws_together(scenario)
@@ -88,15 +88,15 @@ def evaluate_batch(
 
 
 def draws_together(scenario: Scenario) -> int:
-    """How many draws of a scenario are flown at once."""
+    """The number of draws of a scenario that are simulated together."""
     each = 8 * 2 * len(Record._fields) * scenario.agents * scenario.substeps * scenario.mission_steps  # bytes of doubles
     return max(1, min(MOST_TOGETHER, int(RECORD_BYTES // each)))
 
 
 def fly_side_by_side(entry: Flown, seeds: Sequence[int]) -> list[SeedRun]:
-    """One run per seed, all flown at once.
+    """One run per seed, all simulated together.
 
-    A supervisor that raises does not say on which draw. Then the draws are flown in halves, until it is known.
+    An error raised by a supervisor does not tell which draw caused it. Then the draws are halved until it is found.
     """
     flight = None
     try:
@@ -111,11 +111,11 @@ def fly_side_by_side(entry: Flown, seeds: Sequence[int]) -> list[SeedRun]:
 
 
 class JointFlight:
-    """Episodes side by side, all that is recorded of them, and why some could not be finished.
+    """Episodes simulated side by side: their records, and the reasons of those that failed.
 
     Args:
-        entry: what is flown.
-        seeds: one draw each; those for which there is none have failed.
+        entry: the method and the scenario.
+        seeds: one draw each; a seed without a valid draw counts as failed.
 
     Raises:
         ConfigurationError: a setting that cannot be run.
@@ -129,15 +129,15 @@ class JointFlight:
         self.failures: dict[int, str] = {}  # by world
         self.instances = [self._begin(b) for b in range(count)]
         steps, shape = scenario.mission_steps, (count, scenario.mission_steps * scenario.substeps + 1, scenario.agents, 2)
-        self.record = Record(*(np.empty(shape) for _ in Record._fields))  # and the end, of position and velocity
+        self.record = Record(*(np.empty(shape) for _ in Record._fields))  # last row: position and velocity at the end
         self.command = np.empty((count, steps, scenario.agents), dtype=np.int64)
         self.formation = np.empty((count, steps), dtype=np.int64)
         self.reward = np.empty((count, steps))
-        self.decision_ms = np.empty(steps)  # of one team
+        self.decision_ms = np.empty(steps)  # per team
         self.shield: ShieldCounts | None = None  # (B, N) each, at the end
 
     def _begin(self, b: int) -> Instance | None:
-        """Draw the instance of world ``b``; None, and a failure, where there is none."""
+        """Draw the instance of world ``b``; where no draw is valid, note the failure and return None."""
         world, state = self.world, self.world.state
         try:
             world.begin(b, stream(self.seeds[b]))
@@ -147,11 +147,11 @@ class JointFlight:
         return Instance(state.position[b].copy(), state.obstacles[b, :, :3].copy(), float(state.disturbance_params[b, 0]))
 
     def fly(self, supervisor: Supervisor) -> None:
-        """All episodes to their end, or until every one of them has failed.
+        """Run all episodes to their end, or until every one of them has failed.
 
         Raises:
             ConfigurationError: a decision of wrong shape or type.
-            SimulationError: the supervisor's, or it raised an error.
+            SimulationError: the supervisor raised an error.
         """
         world, count = self.world, self.world.worlds
         try:
@@ -181,14 +181,14 @@ class JointFlight:
         self.reward[:, m], self.shield = step.reward, step.shield
 
     def _drop_diverged(self) -> bool:
-        """Whether worlds diverged; they have failed, and begin an episode that is not recorded, since the others continue."""
+        """Mark diverged worlds as failed and restart them, so that the others can continue; return whether there were any."""
         world, state = self.world, self.world.state
         diverged = np.flatnonzero(state.status).tolist()
         for b in diverged:
             alone = Team(*(rows[b : b + 1] for rows in state))
             error = team.diverged(world.plan, alone, 0, int(state.status[b]), int(state.steps[b]) - 1)
             self.failures.setdefault(b, str(error))
-            world.begin(b, stream(0, b))  # what this world was made with
+            world.begin(b, stream(0, b))  # the draw that this world was constructed with
         return bool(diverged)
 
     def measured(self, b: int) -> SeedRun:
@@ -204,7 +204,7 @@ class JointFlight:
         return SeedRun(seed, instance, metrics=measure(trajectory))
 
     def trajectory(self, b: int) -> Trajectory:
-        """What is measured of world ``b``; controllers' states and poses, which no metric reads, are not kept."""
+        """The recorded trajectory of world ``b``, without controller states and poses, which no metric reads."""
         scenario, state = self.entry.scenario, self.world.state
         position, velocity, reference, reference_velocity, force = (tape[b] for tape in self.record)
         return Trajectory(

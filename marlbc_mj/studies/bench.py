@@ -1,4 +1,4 @@
-"""The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it leaves."""
+"""The benchmark: a matrix of supervisors and controllers on one scenario, and the folder of results it writes."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -30,20 +30,20 @@ from marlbc_mj.util.provenance import provenance
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """What one benchmark run does."""
+    """Settings of one benchmark run."""
 
-    supervisors: tuple[str, ...] | None = None  # None: see matrix
+    supervisors: tuple[str, ...] | None = None  # None: the default of matrix
     controllers: tuple[str, ...] | None = None
     seed: int = 0
     figures: bool = True
     logs: bool = True
     video: Literal["first", "all", "none"] = "first"
     overwrite: bool = False
-    seeds: int | None = None  # this many draws around the scenario, from ``seed`` on, instead of one
-    workers: int = 1  # processes that share the jobs
+    seeds: int | None = None  # number of draws around the scenario, from ``seed`` on; None: one episode
+    workers: int = 1  # processes that run the jobs
     engine: EngineName = "local"  # where jobs run, see marlbc_mj.studies.engines
     shield: bool = False  # give agents a shield, see marlbc_mj.core.shield
-    against: str | None = None  # with ``seeds``: the method that others are compared with; None: the first
+    against: str | None = None  # with ``seeds``: key of the method that others are compared with; None: the first
 
     def __post_init__(self) -> None:
         for kind, names, known in (
@@ -63,16 +63,16 @@ class BenchConfig:
 
     @property
     def methods(self) -> list[tuple[str, str]]:
-        """Names of supervisor and controller of every method, in order."""
+        """Names of the supervisor and controller of every method, in order."""
         return matrix(self.supervisors, self.controllers)
 
 
 def matrix(supervisors: Sequence[str] | None = None, controllers: Sequence[str] | None = None) -> list[tuple[str, str]]:
-    """The methods of a benchmark, as names of supervisor and controller.
+    """The methods of a benchmark, as pairs of supervisor and controller names.
 
-    Without names: every registered supervisor but those ``ON_REQUEST`` with ``sorlc``, then ``scripted`` with every other
-    controller; ``scripted`` with ``sorlc`` comes first. With names: every named supervisor with every named controller, where
-    ``sorlc`` stands for controllers and ``scripted`` for supervisors that are not named.
+    Without names: every registered supervisor except those in ``ON_REQUEST`` with ``sorlc``, then ``scripted`` with every other
+    controller; ``scripted`` with ``sorlc`` comes first. With names: every named supervisor with every named controller. If only
+    one kind is named, the other defaults to ``scripted`` or ``sorlc``.
     """
     if supervisors is None and controllers is None:
         first = sorted((name for name in SUPERVISORS if name not in ON_REQUEST), key=lambda name: name != "scripted")
@@ -93,7 +93,7 @@ def _check_names(kind: str, names: Sequence[str], known: dict[str, Any]) -> None
 
 @dataclass(frozen=True)
 class BenchStudy:
-    """One episode of every method. A method that fails, or cannot start in this scenario, is a result with its reason."""
+    """One episode of every method. A method that fails, or cannot start in this scenario, has a result that gives the reason."""
 
     scenario: Scenario
     config: BenchConfig
@@ -105,7 +105,7 @@ class BenchStudy:
         return fly_or_fail(job, watch.folder if self.config.logs else None, watch.progress)
 
     def describe(self, job: EpisodeJob) -> tuple[EpisodeJob, bool]:
-        """What a job's result and files depend on."""
+        """Everything that a job's result and files depend on."""
         return job, self.config.logs
 
     def report(self, results: Sequence[Result], out: Path | None, progress: Progress = silent) -> Report:
@@ -126,20 +126,20 @@ def run_bench(
     progress: Progress | None = None,
     ended: Callable[[Result], None] | None = None,
 ) -> tuple[list[Result], list[str]]:
-    """Run the whole matrix and write ``out``; returns the results and what could not be written (a video without GL).
+    """Run the whole matrix and write ``out``; returns the results, and messages about outputs not written (a video without GL).
 
-    A method that fails, or cannot start in this scenario, is a reported outcome, not a missing row. Until all have ended, a page
-    and tables of those that have are in ``out/.jobs/so_far``.
+    A method that fails, or cannot start in this scenario, is a reported outcome, not a missing row. Until all methods have ended,
+    ``out/.jobs/so_far`` holds a page and tables of those that have.
 
     Args:
-        scenario: what is flown.
-        config: the methods, and what is written of them.
+        scenario: the scenario of all episodes.
+        config: the methods, and the outputs to write.
         out: folder of the results.
-        progress: called with what is being done, how much of it is done and how much there is.
+        progress: called with the current stage, the amount done and the total.
         ended: called with the result of each method as soon as it ends.
 
     Raises:
-        ConfigurationError: a setting or the output folder; nothing is written then.
+        ConfigurationError: an invalid setting or output folder; nothing is written then.
     """
     study = BenchStudy(scenario, config)
     page = SoFar(out, [job.key for job in study.jobs()], partial(write_so_far, config=describe(scenario, config)))
@@ -162,7 +162,7 @@ def run_bench(
 
 
 def describe(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
-    """What config.json says: versions, revision, machine, command line and every setting."""
+    """The contents of config.json: versions, revision, machine, command line and every setting."""
     return {
         **provenance(),
         "command": " ".join(["marlbc", *sys.argv[1:]]),
@@ -175,7 +175,7 @@ def describe(scenario: Scenario, config: BenchConfig) -> dict[str, Any]:
 def _render_videos(
     results: Sequence[Result], config: BenchConfig, folder: Path, progress: Progress
 ) -> tuple[list[Path], list[str]]:
-    """Videos of the methods that ran; a machine without off-screen GL loses the videos and nothing else."""
+    """Render videos of the methods that ran; without off-screen GL only the videos are missing."""
     if config.video == "none":
         return [], []
     from marlbc_mj.recording.video import render_video
@@ -206,13 +206,13 @@ def run_single(
     shield: bool = False,
     progress: Progress | None = None,
 ) -> Result:
-    """One method, its log, metrics.json and config.json in ``out``.
+    """Run one method; write its log, metrics.json and config.json into ``out``.
 
     The log grows in place as ``*.mcap.partial``, so that a killed run can be recovered.
 
     Raises:
-        ConfigurationError: a setting or the output folder; a method that cannot start is a wrong setting here.
-        SimulationError: the run failed; its log stays as it was.
+        ConfigurationError: an invalid setting or output folder, or a method that cannot start.
+        SimulationError: the run failed; its log is kept as it is.
     """
     config = BenchConfig((supervisor,), (controller,), seed=seed, overwrite=overwrite, shield=shield)
     check_folder(out, overwrite=overwrite)

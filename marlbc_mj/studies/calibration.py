@@ -1,8 +1,8 @@
-"""Source of the velocity gains of the finite- and fixed-time rivals: Table 6's published maxima, inverted by a search.
+"""Source of the velocity gains of the finite- and fixed-time baselines: a search that inverts the maxima published in Table 6.
 
-Their largest force occurs in the first substep of the column (FR), and again in the first one after it, when v_r jumps; it is
-nearly proportional to the velocity gain. So one gain cannot fit four published maxima: the search fits the largest of them, and
-the other agents' tell how well the law's shape explains the table.
+Their largest force occurs where v_r jumps: in the first substep of the column (FR), and again in the first one after it. It is
+nearly proportional to the velocity gain, so one gain cannot fit four published maxima. The search fits the largest of them; the
+maxima of the other agents show how well the law's shape explains the table.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,31 +24,31 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 from marlbc_mj.util.progress import Progress, silent
 
 CALIBRATED: dict[str, FiniteTime | FixedTime] = {"finite-time": FiniteTime(), "fixed-time": FixedTime()}
-"""Controllers whose ``velocity_gain`` is tied to Table 6, with the gains they are shipped with."""
+"""Controllers with a ``velocity_gain`` fitted to Table 6, as shipped."""
 TOLERANCE = 1e-6  # relative, of the maximum
 MOST_EPISODES = 40
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the search found for one controller."""
+    """Result of the search for one controller."""
 
     controller: str
     published: tuple[float, ...]  # Table 6, per agent [N]
-    found: float  # velocity gain whose largest maximum is the largest published one [1/s]
-    shipped: float  # the dataclass's default [1/s]
-    at_found: tuple[float, ...]  # max |u|_inf per agent with the gain found [N]
-    at_shipped: tuple[float, ...]  # the same with the default [N]
-    episodes: int  # simulated by the search
+    found: float  # velocity gain that reproduces the largest published maximum [1/s]
+    shipped: float  # default velocity gain of the dataclass [1/s]
+    at_found: tuple[float, ...]  # max |u|_inf per agent with ``found`` [N]
+    at_shipped: tuple[float, ...]  # max |u|_inf per agent with ``shipped`` [N]
+    episodes: int  # number simulated by the search
 
     @property
     def errors(self) -> tuple[float, ...]:
-        """Relative error of the maxima per agent, with the gain found."""
+        """Relative error of each agent's maximum with the gain found."""
         return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_found, self.published, strict=True))
 
     @property
     def shipped_errors(self) -> tuple[float, ...]:
-        """Relative error of the maxima per agent, with the default gain."""
+        """Relative error of each agent's maximum with the default gain."""
         return tuple(reached / wanted - 1.0 for reached, wanted in zip(self.at_shipped, self.published, strict=True))
 
 
@@ -65,7 +65,7 @@ class CalibrationStudy:
     """One search per controller, and a table of gains and maxima.
 
     Raises:
-        ConfigurationError: unknown name.
+        ConfigurationError: an unknown controller name.
     """
 
     controllers: tuple[str, ...] = tuple(CALIBRATED)
@@ -82,7 +82,7 @@ class CalibrationStudy:
         return calibrate(*job, progress=partial(watch.progress, job.controller))
 
     def report(self, results: Sequence[Calibration], out: Path | None, progress: Progress = silent) -> Report:
-        """The table; this study leaves no file."""
+        """The table as text; this study writes no file."""
         return Report("\n".join(calibration_lines(results)), list(results))
 
 
@@ -93,17 +93,17 @@ def calibrate(
     *,
     progress: Callable[[int, int], None] | None = None,
 ) -> Calibration:
-    """Find the velocity gain that gives Table 6's largest maximum, with whole episodes under the scripted supervisor.
+    """Find the velocity gain that reproduces the largest maximum of Table 6 in whole episodes under the scripted supervisor.
 
     Args:
         name: a key of :data:`CALIBRATED`.
-        scenario: the case study by default; a shorter one must keep a switch between FM and FR.
+        scenario: the case study by default; a shorter scenario must keep a switch between FM and FR.
         tolerance: relative error of the maximum at which the search ends.
-        progress: called after every episode of the search with their number and the most there may be.
+        progress: called after every episode of the search with the number of episodes so far and the most allowed.
 
     Raises:
-        ConfigurationError: unknown name, a tolerance that is not positive, or a scenario with another number of agents.
-        SimulationError: no gain from a quarter of to four times the default gives the maximum, or a run diverged.
+        ConfigurationError: an unknown name, a tolerance that is not positive, or a number of agents other than Table 6's.
+        SimulationError: no gain between a quarter and four times the default reproduces the maximum, or a run diverged.
     """
     if name not in CALIBRATED:
         raise unknown("calibrated controller", name, CALIBRATED)
@@ -134,7 +134,7 @@ def maxima(controller: FiniteTime | FixedTime, scenario: Scenario) -> tuple[floa
 
 
 def calibration_lines(results: Sequence[Calibration]) -> list[str]:
-    """A Markdown table with two rows per controller, the gain found and the gain shipped, below the published maxima."""
+    """A Markdown table: per controller the published maxima, then one row each for the gain found and the gain shipped."""
     lines = [
         "| controller | velocity gain, 1/s | max ‖u‖∞ per agent, N | relative error per agent |",
         "|---|---:|---:|---:|",
@@ -156,7 +156,7 @@ def _slashed(numbers: Sequence[float], form: str) -> str:
 
 
 def _root(function: Callable[[float], float], low: float, high: float, tolerance: float) -> float:
-    """Where an increasing function is within ``tolerance`` of zero: false position, halving the weight of an end that stays."""
+    """Root of an increasing function to ``tolerance``: false position that halves the value at the end that stays."""
     at_low, at_high = function(low), function(high)
     if at_low > 0.0 or at_high < 0.0:
         raise SimulationError(f"no gain from {low:g} to {high:g} /s gives the published maximum")

@@ -1,7 +1,7 @@
-"""Jobs and results as bytes, and back: no pickle, no constructor runs, and every number comes back bit for bit.
+"""Serializes jobs and results to bytes and back: no pickle, no constructor calls, and every number is restored bit for bit.
 
-A record is a JSON text, whose nested values are marked by type, followed by the arrays' bytes. Equal values of equal types give
-equal bytes, so that the bytes of a job are its canonical form.
+A record is a JSON text, with nested values tagged by type, followed by the bytes of the arrays. Equal values of equal types give
+equal bytes, so the bytes of a job are its canonical form.
 """
 
 import dataclasses
@@ -19,13 +19,13 @@ import numpy as np
 from marlbc_mj.util.errors import ConfigurationError
 
 _MARK = "~"
-_NUMBERS = "biufcSU"  # kinds of NumPy's types that are kept
+_NUMBERS = "biufcSU"  # NumPy dtype kinds that can be stored
 _LENGTH = struct.Struct("<I")
 _PACKAGE = __name__.partition(".")[0]
 
 
 class Encoder:
-    """Encodes one value, and notes which types and texts are in it."""
+    """Encodes one value, and collects the types and strings that it contains."""
 
     def __init__(self) -> None:
         self.types: set[type] = set()
@@ -37,7 +37,7 @@ class Encoder:
         """The value as bytes.
 
         Raises:
-            ConfigurationError: something in it is no data, a function for example.
+            ConfigurationError: it contains something that is not data, for example a function.
         """
         text = json.dumps(self._plain(value), separators=(",", ":"), ensure_ascii=False, allow_nan=False)
         head = text.encode("utf-8", "surrogatepass")
@@ -88,10 +88,10 @@ def to_bytes(value: Any) -> bytes:
 
 
 def from_bytes(data: bytes) -> Any:
-    """The value that :func:`to_bytes` made bytes of. Only dataclasses and named tuples are made, and without their constructors.
+    """The value that :func:`to_bytes` encoded. Dataclasses and named tuples are rebuilt without calling their constructors.
 
     Raises:
-        ConfigurationError: bytes of something else, or a type that is not there any more.
+        ConfigurationError: the bytes are not such a record, or one of its types no longer exists.
     """
     try:
         (length,) = _LENGTH.unpack_from(data)
@@ -136,7 +136,7 @@ def _object(plain: dict[str, Any], arrays: memoryview) -> Any:
 
 
 def _type(name: str) -> type:
-    """A type by its name: one of this package, or of a module that is loaded already."""
+    """A type by its name, from this package or from a module that is already loaded."""
     module, _, path = name.partition(":")
     found: Any = sys.modules.get(module)
     if found is None and module.partition(".")[0] == _PACKAGE:
@@ -149,7 +149,7 @@ def _type(name: str) -> type:
 
 
 def _field_names(kind: type) -> tuple[str, ...] | None:
-    """Names of the fields of a dataclass or named tuple; None for another type."""
+    """Field names of a dataclass or named tuple; None for any other type."""
     if dataclasses.is_dataclass(kind):
         return tuple(field.name for field in dataclasses.fields(kind))
     return kind._fields if issubclass(kind, tuple) and hasattr(kind, "_fields") else None
@@ -163,4 +163,4 @@ _MADE: dict[str, Callable[[dict[str, Any], memoryview], Any]] = {
     "scalar": lambda plain, arrays: _array_of(plain, arrays)[()],
     "path": lambda plain, _: Path(plain["v"]),
 }
-"""What makes the value of a marked entry; other marks are names of types."""
+"""Decoders of tagged entries; any other tag is the name of a type."""

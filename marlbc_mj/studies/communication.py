@@ -1,4 +1,4 @@
-"""Costs of communication for a distributed supervisor, and the time that agents take to agree."""
+"""The cost of imperfect communication for a distributed supervisor, and the time that agents need to agree."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,21 +22,21 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
-RANGES = (np.inf, 2.0, 1.2)  # in distances between neighbors
+RANGES = (np.inf, 2.0, 1.2)  # in multiples of the neighbor distance
 DELAYS = (0.0, 0.1, 0.3)  # [s]
 LOSSES = (0.0, 0.2, 0.5)
 
 
 class NetworkCase(NamedTuple):
-    """How a team communicates in one row of the table."""
+    """Communication of a team in one row of the table."""
 
-    range: float  # in distances between neighbors
+    range: float  # in multiples of the neighbor distance
     delay: float  # [s]
-    loss: float
+    loss: float  # share of messages
     silent: bool = False  # whether the first agent never sends
 
     def settings(self, scenario: Scenario) -> Communication:
-        """In metres, for the team of a scenario."""
+        """The communication settings for the team of a scenario, with the range in metres."""
         reach = self.range * neighbor_distance(scenario)
         return Communication(range=reach, delay=self.delay, loss=self.loss, silent=(0,) if self.silent else ())
 
@@ -46,11 +46,11 @@ CASES = (
     NetworkCase(np.inf, 0.0, 0.0, silent=True),
     NetworkCase(1.2, 0.1, 0.2, silent=True),
 )
-"""Every range, delay and loss; then a silent agent, with good and with bad communication."""
+"""Every combination of range, delay and loss; then a silent agent under good and under poor communication."""
 
 
 def neighbor_distance(scenario: Scenario) -> float:
-    """Greatest distance of a slot of the formation from the nearest other one [m]."""
+    """Greatest distance from a slot of the first formation to its nearest neighbor [m]."""
     slots = scenario.formations[0]
     gaps = np.linalg.norm(slots[:, None] - slots[None], axis=-1) + np.diag(np.full(len(slots), np.inf))
     return float(gaps.min(axis=1).max())
@@ -69,10 +69,10 @@ class CommunicationStudy:
 
     def __post_init__(self) -> None:
         make_supervisor(self.supervisor, self.controller)
-        self.jobs()  # a case that a mission cannot have is refused here
+        self.jobs()  # raises for a case that a mission does not support
 
     def pairs(self) -> list[tuple[Scenario, NetworkCase]]:
-        """Mission and case of every job."""
+        """The mission and case of every job."""
         return list(product(self.missions, self.cases))
 
     def jobs(self) -> list[DrawsJob]:
@@ -92,7 +92,7 @@ class CommunicationStudy:
 
 
 def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | None]) -> dict[str, Any]:
-    """The numbers of one row; shares have Wilson's interval beside them."""
+    """The numbers of one row; success and violation come with Wilson intervals."""
     rates = outcome_rates(metrics, mission)
     flown = [one for one in metrics if one is not None]
     shares = {name: rates[name] for name in ("success", "violation", "reached", "collided")}
@@ -108,7 +108,7 @@ def case_row(mission: Scenario, case: NetworkCase, metrics: Sequence[Metrics | N
 
 
 def case_table(rows: Sequence[dict[str, Any]]) -> Table:
-    """Rows of :func:`case_row` for people."""
+    """Rows of :func:`case_row`, formatted as a table."""
     columns = (
         *(Column("", name, unit) for name, unit in (("mission", ""), ("range", "neighbor distances"), ("delay", "s"))),
         *(Column("", name, unit) for name, unit in (("loss", "%"), ("silent", ""), ("success", "%"), ("violation", "%"))),
@@ -134,16 +134,16 @@ TEAMS = (
     ("64 agents in a grid, neighbors 6 m apart", grid(64, 6.0), 9.0),
     ("64 agents in a column, 3 m apart", column(grid(64, 6.0), 3.0), 4.0),
 )
-"""Name, places (N, 2) [m] and range [m] of teams that stand still."""
+"""Name, positions (N, 2) [m] and range [m] of teams at rest."""
 RATE = 0.05  # between two broadcasts [s]
-AGREED = 0.01  # agreement of consensus: every estimate is that close to the mean of all places [m]
-PATIENCE = 4000  # mission steps after which nobody waits any longer
+AGREED = 0.01  # consensus is reached when every estimate is this close to the mean position [m]
+PATIENCE = 4000  # mission steps after which the measurement gives up
 
 
 def time_to_agree(place: np.ndarray, settings: Communication, seed: int = 0) -> float:
-    """How long agents at places (N, 2) [m], which say where they are, take to agree [s]; infinite beyond ``PATIENCE``.
+    """Time until agents at positions (N, 2) [m] that broadcast their own agree [s]; infinite beyond ``PATIENCE``.
 
-    Under flooding everyone must know all places, under consensus everyone's estimate of their mean must be within ``AGREED``.
+    Under flooding every agent must know all positions; under consensus every estimate of their mean must be within ``AGREED``.
     """
     radio = Radio(settings, len(place), RATE)
     layer: Layer = Consensus(radio) if settings.protocol == "consensus" else Flooding(radio)
@@ -158,7 +158,7 @@ def time_to_agree(place: np.ndarray, settings: Communication, seed: int = 0) -> 
 
 
 def agreement_table() -> Table:
-    """Both protocols on all ``TEAMS``, without loss and with a fifth of the messages lost."""
+    """Times to agree under both protocols for all ``TEAMS``, without loss and with a fifth of the messages lost."""
     rows = []
     for (name, place, reach), loss in product(TEAMS, (0.0, 0.2)):
         times = [

@@ -1,6 +1,6 @@
-"""How long supervisors take to decide: per mission step of a mission of each family, and per decision of a large team.
+"""How long supervisors take to decide: per mission step on each mission family, and per decision for large teams.
 
-``python -m marlbc_mj.studies.decision_times [SEED]``. Times are by the clock, of one thread: nothing else should run.
+Run ``python -m marlbc_mj.studies.decision_times [SEED]``. Times are wall-clock times on one thread: run nothing else meanwhile.
 """
 
 import sys
@@ -22,15 +22,15 @@ from marlbc_mj.util.method_names import display_name
 
 DECIDERS = ("marlms-general", "lookahead", "rollout", "mpcms")
 TEAM_SIZES = (4, 16, 64)
-LARGEST_WAY = 260.0  # of teams of 64, whose column needs it [m]
+LARGEST_WAY = 260.0  # for teams of 64, which need this length for their column [m]
 TURN = 200
-"""Mission steps of one supervisor after which the next one flies: many, so that its data stay in the processor's caches."""
+"""Mission steps of one supervisor before the next takes its turn: many, so that its data stay in the processor's caches."""
 TIMED_DECISIONS = 60
-"""Decisions of a large team that are measured."""
+"""Number of decisions of a large team that are measured."""
 
 
 class DecisionTimes(NamedTuple):
-    """What a supervisor took in the mission steps of one mission, the first left out, in which code is loaded [ms]."""
+    """Decision times of a supervisor over one mission, without the first mission step, which also loads code [ms]."""
 
     mean: float
     median: float
@@ -38,13 +38,13 @@ class DecisionTimes(NamedTuple):
 
 
 def timed_mission(family: str, agents: int) -> Scenario:
-    """A held-out mission of a wedge under the set-based composition."""
+    """A held-out mission of a wedge team under the set-based composition."""
     way = {"long_way": LARGEST_WAY} if agents >= TEAM_SIZES[-1] else {}
     return team_mission(family, "wedge", agents, composition="set-based", split="test", **way)
 
 
 def flight_times(scenario: Scenario, supervisor: str, seed: int) -> Iterator[float]:
-    """Times that a supervisor takes in the mission steps of one mission but the first, one team alone [ms]."""
+    """Decision time of a single team in every mission step of one mission except the first [ms]."""
     world, decider = World(scenario), make_supervisor(supervisor)
     observation, memory = world.reset(seed), decider.start(scenario, 1)
     for step in range(scenario.mission_steps):
@@ -57,7 +57,7 @@ def flight_times(scenario: Scenario, supervisor: str, seed: int) -> Iterator[flo
 
 
 def per_mission_step(family: str, seed: int) -> dict[str, DecisionTimes]:
-    """Of each supervisor over one mission. They fly in turns, so that all see the same changes of the machine's speed."""
+    """Decision times of each supervisor over one mission. They take turns, so that changes of the machine's speed affect all."""
     flights = {name: flight_times(timed_mission(family, TEAM_SIZES[0]), name, seed) for name in DECIDERS}
     taken: dict[str, list[float]] = {name: [] for name in flights}
     for _ in range(0, timed_mission(family, TEAM_SIZES[0]).mission_steps, TURN):
@@ -70,7 +70,7 @@ def per_mission_step(family: str, seed: int) -> dict[str, DecisionTimes]:
 
 
 def per_decision(agents: int, seed: int) -> float:
-    """Median of what the general policy takes for the decisions of a wedge in a field [ms]."""
+    """Median decision time of the general policy for a wedge team in a field [ms]."""
     scenario = timed_mission("field", agents)
     every = decision_steps(scenario, make_sight(scenario))
     taken = islice(flight_times(scenario, DECIDERS[0], seed), every - 1, TIMED_DECISIONS * every, every)
@@ -78,7 +78,7 @@ def per_decision(agents: int, seed: int) -> float:
 
 
 def report_times() -> None:
-    """Print all times, and how many times as fast as a search the policy is."""
+    """Print all times, and each supervisor's mean as a multiple of the policy's."""
     seed = int(sys.argv[1]) if len(sys.argv) > 1 else 90_000
     for family in GROUNDS:
         found = per_mission_step(family, seed)

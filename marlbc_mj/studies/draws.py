@@ -1,4 +1,4 @@
-"""Every method on the same draws around a scenario: a job is one method on up to a hundred seeds, many at a time."""
+"""Every method on the same draws around a scenario: a job is one method on up to 100 seeds, many of them simulated together."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -24,13 +24,13 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.progress import Progress, silent
 
 CASE_STUDY_PERTURBATION = Perturbation(start_spread=1.0, obstacle_spread=0.5, drag_scale=(0.0, 2.0))
-"""Starts within 1 m, obstacles within 0.5 m per axis, drag from none to twice the published: for scenarios without their own.
+"""For scenarios without their own: starts within 1 m, obstacles within 0.5 m per axis, drag from zero to twice the published one.
 
-A slot of the case study passes its points at 1 m and the gate is 8 m wide, so 0.5 m moves when a supervisor has to act, not
-whether the mission can be done. A schedule fixed in time may violate then; that is an outcome.
+In the case study slots pass the point obstacles at 1 m, and the gate is 8 m wide. So 0.5 m changes when a supervisor has to
+act, not whether the mission is feasible. A schedule fixed in time may then violate the safe distance; that is an outcome.
 """
 SEEDS_PER_JOB = 100
-"""Few enough that a study has more jobs than workers, and that repeating a job is quick."""
+"""Small enough that a study has more jobs than workers and that repeating a job is quick."""
 
 
 class DrawsJob(NamedTuple):
@@ -45,21 +45,21 @@ class DrawsJob(NamedTuple):
 
 @dataclass(frozen=True)
 class DrawsStudy:
-    """Methods on the draws of a scenario, compared in tables with intervals. What a method does depends on no other method.
+    """Methods on the same draws of a scenario, compared in tables with intervals. No method's runs depend on the other methods.
 
     Raises:
         ConfigurationError: unknown names, no or repeated methods or seeds.
     """
 
     scenario: Scenario
-    """With the perturbation that is drawn from."""
+    """The scenario, with the perturbation that draws are made from."""
     methods: tuple[tuple[str, str], ...]
     """Names of supervisor and controller."""
     seeds: tuple[int, ...]
     against: str | None = None
     """Key of the method that others are compared with; None: the first."""
     config: BenchConfig | None = None
-    """What was asked for, for the report."""
+    """The settings of the benchmark, for the report."""
 
     def __post_init__(self) -> None:
         keys = [method_key(*method) for method in self.methods]
@@ -100,12 +100,12 @@ class DrawsStudy:
 
 
 def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
-    """The whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
+    """Run the whole matrix on ``config.seeds`` draws around the scenario; writes tables with intervals, no logs and no videos.
 
-    Until all have ended, a page and tables of the methods that have are in ``out/.jobs/so_far``.
+    Until all methods have ended, ``out/.jobs/so_far`` holds a page and tables of those that have.
 
     Raises:
-        ConfigurationError: a setting or the output folder; nothing is written then.
+        ConfigurationError: an invalid setting or output folder; nothing is written then.
     """
     seeds = seed_range(config.seeds or 0, config.seed)
     study = DrawsStudy(perturbed(scenario), tuple(config.methods), seeds, config.against, config)
@@ -122,7 +122,7 @@ def run_bench_seeds(scenario: Scenario, config: BenchConfig, out: Path, *, progr
 
 
 def growing_page(study: DrawsStudy, out: Path, facts: Mapping[str, Any]) -> Callable[[DrawsJob, MethodRuns], None]:
-    """For ``ended``: a page of the methods of which every job has ended."""
+    """A callback for ``ended`` that keeps a page of the methods whose jobs have all ended."""
     parts = dict[tuple[str, int], MethodRuns]()  # by method and first seed
     own = {key: [(key, job.seeds[0]) for job in jobs] for key, jobs in groupby(study.jobs(), _key)}
 
@@ -158,12 +158,12 @@ def run_methods(
     A run that fails, or a method that cannot start in this scenario, is kept with its reason.
 
     Args:
-        scenario: drawn from as :func:`perturbed` says.
+        scenario: the scenario to draw from, with the perturbation that :func:`perturbed` gives it.
         methods: names of supervisor and controller.
         seeds: one draw each, the same for every method.
-        progress: called with the method, how many seeds of it are done and how many there are.
-        reference: the key of the method that others are compared with; by default the first.
-        workers: processes that share the methods; decision times are best measured with one.
+        progress: called with the method, the number of its seeds that are done and their total.
+        reference: key of the method that others are compared with; the first by default.
+        workers: processes that run the jobs; decision times are best measured with one.
 
     Raises:
         ConfigurationError: unknown names, no or repeated methods or seeds; nothing has been run then.
@@ -174,25 +174,25 @@ def run_methods(
 
 
 def perturbed(scenario: Scenario) -> Scenario:
-    """The scenario, with the case study's perturbation if it has none of its own and draws no layout."""
+    """The scenario; with the case study's perturbation if it has none of its own and draws no layouts."""
     if scenario.perturbation != Perturbation() or scenario.layout is not None:
         return scenario
     return replace(scenario, perturbation=CASE_STUDY_PERTURBATION)
 
 
 def with_drag_range(scenario: Scenario, drag_range: tuple[float, float]) -> Scenario:
-    """The scenario with the case study's perturbation, whose disturbance is multiplied by a draw from ``drag_range``."""
+    """The scenario with the case study's perturbation, but its disturbance multiplied by a draw from ``drag_range``."""
     return replace(scenario, perturbation=replace(CASE_STUDY_PERTURBATION, drag_scale=drag_range))
 
 
 def fly_draws(job: DrawsJob, progress: Progress = silent) -> MethodRuns:
-    """One method on the seeds of a job; ``progress`` is called for every seed."""
+    """Run one method on the seeds of a job; ``progress`` is called after every seed."""
     runs = evaluate_batch(job.scenario, job.seeds, job.supervisor, job.controller, shield=job.shield, progress=progress)
     return MethodRuns(job.supervisor, job.controller, runs)
 
 
 def tallied(methods: Sequence[tuple[str, str]], total: int, progress: Progress) -> Progress:
-    """Progress of whole methods, ``total`` seeds each, from that of their jobs, which tell every seed once."""
+    """A progress callback that sums the jobs of each method, which report every seed once, up to ``total`` seeds per method."""
     keys, done = {method_key(*method) for method in methods}, Counter[str]()
 
     def tell(what: str, part: float, of: float) -> None:

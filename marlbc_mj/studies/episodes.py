@@ -1,4 +1,4 @@
-"""One episode of one method: prepared, flown, logged, and checked for a law that stays at its force limit."""
+"""One episode of one method: prepared, simulated, logged, and checked for a law that stays at its force limit."""
 
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -20,7 +20,7 @@ from marlbc_mj.util.errors import MarlbcError, SimulationError
 from marlbc_mj.util.progress import Progress, silent
 
 STUCK = 0.1
-"""A limited law whose force is at its limit throughout this last share of an episode has failed: saturated forever."""
+"""A limited law fails as "saturated forever" if its force is at the limit throughout this last share of an episode."""
 TELL_EVERY = 50  # mission steps
 
 
@@ -31,20 +31,20 @@ class EpisodeJob(NamedTuple):
     supervisor: str
     controller: str
     seed: int
-    shield: bool = False  # whether agents have a shield, of the scenario's own numbers
+    shield: bool = False  # whether agents have a shield, with the scenario's own numbers
 
     @property
     def key(self) -> str:
-        """The method's name in every file."""
+        """The method's key, by which files name it."""
         return method_key(self.supervisor, self.controller)
 
 
 class Stopwatch:
-    """A supervisor that has started already, with the time of its solver.
+    """A supervisor that has already started, and the time spent in its solver.
 
-    Its first ``start`` gives the memory that it was made with, so that a check whether a supervisor can start and the episode
-    share one start, which may assemble a whole MuJoCo model. Memory may tell, as ``solver_ms``, how long a network or solver took
-    in the last decision [ms].
+    The constructor starts it, and the first call of ``start`` returns that memory: the check that it can start and the episode
+    share one start, which may assemble a whole MuJoCo model. The memory may report, as ``solver_ms``, how long a network or
+    solver took in the last decision [ms].
     """
 
     def __init__(self, supervisor: Supervisor, scenario: Scenario) -> None:
@@ -53,11 +53,11 @@ class Stopwatch:
         self.memory: list[Any] = [start_supervisor(supervisor, scenario, 1)]
 
     def start(self, scenario: Scenario, teams: int) -> Any:
-        """The supervisor's memory."""
+        """The supervisor's initial memory."""
         return self.memory.pop() if self.memory else self.supervisor.start(scenario, teams)
 
     def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
-        """The supervisor's orders."""
+        """The supervisor's decision and its memory."""
         orders, memory = ask_supervisor(self.supervisor, observation, memory)
         spent = getattr(memory, "solver_ms", None)
         if spent is not None:
@@ -65,13 +65,13 @@ class Stopwatch:
         return orders, memory
 
     def share(self, decision_ms: np.ndarray) -> float | None:
-        """Solver's time over the whole decisions' (M,); None where the supervisor did not tell."""
+        """Solver time as a share of the decision times (M,); None if the supervisor does not report it."""
         return sum(self.solver_ms) / float(decision_ms.sum()) if self.solver_ms else None
 
 
 @dataclass(frozen=True)
 class Flight:
-    """A method that is ready to fly one episode."""
+    """A method that is ready to run one episode."""
 
     job: EpisodeJob
     law: Controller
@@ -80,12 +80,12 @@ class Flight:
 
 
 def name_method(job: EpisodeJob) -> tuple[Controller, Supervisor]:
-    """Controller and supervisor of these names; ConfigurationError for unknown ones."""
+    """The controller and supervisor that a job names; ConfigurationError for an unknown name."""
     return make_controller(job.controller), make_supervisor(job.supervisor, job.controller)
 
 
 def prepare(job: EpisodeJob, law: Controller, supervisor: Supervisor) -> Flight:
-    """World and memory of one episode, each made once.
+    """Create the world of one episode and start its supervisor.
 
     Raises:
         ConfigurationError: the controller or the supervisor does not suit the scenario.
@@ -95,10 +95,10 @@ def prepare(job: EpisodeJob, law: Controller, supervisor: Supervisor) -> Flight:
 
 
 def fly(flight: Flight, folder: Path | None, progress: Progress = silent, *, overwrite: bool = False) -> Result:
-    """The episode, logged to ``folder/logs`` if there is a folder; an episode that cannot be finished has failed.
+    """Run the episode, logging to ``folder/logs`` if a folder is given. One that cannot be finished gives a failed result.
 
     Raises:
-        ConfigurationError: a log that may not be written.
+        ConfigurationError: the log must not be written there.
     """
     job, scenario = flight.job, flight.job.scenario
     names = (job.supervisor, job.controller)
@@ -114,10 +114,10 @@ def fly(flight: Flight, folder: Path | None, progress: Progress = silent, *, ove
 
 
 def fly_or_fail(job: EpisodeJob, folder: Path | None, progress: Progress = silent) -> Result:
-    """:func:`prepare` and :func:`fly`; a method that cannot start has failed, too.
+    """Call :func:`prepare` and :func:`fly`; a method that cannot start gives a failed result, too.
 
     Raises:
-        ConfigurationError: unknown names, or a log that may not be written.
+        ConfigurationError: unknown names, or the log must not be written there.
     """
     law, supervisor = name_method(job)
     try:
@@ -128,7 +128,7 @@ def fly_or_fail(job: EpisodeJob, folder: Path | None, progress: Progress = silen
 
 
 def _frame_observer(job: EpisodeJob, log: LogWriter | None, progress: Progress) -> Callable[[Frame], None]:
-    """What is done with every frame: it goes into the log, and its time is reported now and then."""
+    """A callback that logs every frame and reports progress every ``TELL_EVERY`` mission steps."""
 
     def observe(frame: Frame) -> None:
         if log is not None:

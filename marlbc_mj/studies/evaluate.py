@@ -1,4 +1,4 @@
-"""Supervisors on held-out layouts of a scenario family: how often the mission succeeds, and why it fails otherwise."""
+"""Supervisors on held-out layouts of a scenario family: how often missions succeed, and why the others fail."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,14 +13,14 @@ from marlbc_mj.supervisors import UNLEARNED
 from marlbc_mj.util.progress import Progress
 
 AGAINST = "fsams-hysteresis"
-"""The supervisor that others are compared with, where it is one of those that run."""
+"""The supervisor that others are compared with, if it is among those that run."""
 
 
 def run_evaluation(scenario: Scenario, config: BenchConfig, out: Path, *, progress: Progress | None = None) -> SeedResults:
-    """The methods of :func:`evaluation` on layouts that no training draws; writes what ``bench --seeds`` writes.
+    """Run the methods of :func:`evaluation` on layouts never used in training; writes the same files as ``bench --seeds``.
 
     Raises:
-        ConfigurationError: a scenario that draws no layouts, a setting, or the output folder; nothing is written then.
+        ConfigurationError: a scenario that draws no layouts, an invalid setting or output folder; nothing is written then.
     """
     return run_bench_seeds(held_out(scenario), config, out, progress=progress)
 
@@ -36,10 +36,10 @@ def evaluation(
     overwrite: bool = False,
     shield: bool = False,
 ) -> BenchConfig:
-    """Supervisors with one controller on ``seeds`` layouts, from ``seed`` on; by default every supervisor without learning.
+    """Settings for supervisors with one controller on ``seeds`` layouts from ``seed`` on; by default all unlearned supervisors.
 
     Raises:
-        ConfigurationError: unknown or repeated names, or a number that cannot be.
+        ConfigurationError: unknown or repeated names, or a number out of range.
     """
     names = UNLEARNED if supervisors is None else tuple(supervisors)
     against = AGAINST if AGAINST in names or not names else names[0]

@@ -1,16 +1,16 @@
-"""The double-integrator setting of GCBF+ (Zhang, So, Garg & Fan 2024, github.com/MIT-REALM/gcbfplus) as a scenario of ours.
+"""The double-integrator setting of GCBF+ (Zhang, So, Garg & Fan 2024, github.com/MIT-REALM/gcbfplus) as a scenario here.
 
-Eight agents of radius 0.05 in a square of 4 by 4 with eight rectangles; each has a goal of its own. An agent has reached it once
-it was within two radii of it, and has failed once it touched an agent or a rectangle. Here lengths are ten times theirs, so that
-the radius is that of the point mass, and times are the same: the mass is 1 kg, 100 N per axis make their 10 per second squared,
-references are no faster than 5 m/s, their limit of the velocity. What differs:
+Eight agents of radius 0.05 move among eight rectangles in a square of 4 by 4, each to its own goal. An agent reaches its goal
+once it is within two radii of it, and fails once it touches an agent or a rectangle. Here lengths are ten times theirs, so that
+the radius is that of the point mass, and times are the same. The mass is 1 kg, 100 N per axis correspond to their acceleration
+limit of 10 per second squared, and references are at most 5 m/s, their velocity limit. Differences:
 
-- their velocity is cut at its limit per axis; here the reference is bounded, and force alone moves an agent;
-- they step by 30 ms, 256 or 1024 times; here decisions are 30 ms apart, and forces and physics 5 ms;
-- rectangles are covered by discs, which jut out by up to 0.1 m; collisions are judged by the rectangles themselves;
-- our rule sees obstacles within 3 m and agents likewise, their policy 5 m, by 32 rays.
+- they clip the velocity at its limit per axis; here the reference is bounded, and only forces move an agent;
+- they make 256 or 1024 steps of 30 ms; here decisions are 30 ms apart, and control and physics run every 5 ms;
+- rectangles are covered by discs, which stick out by up to 0.1 m; collisions are judged by the rectangles themselves;
+- our rule senses obstacles and agents within 3 m, their policy senses within 5 m, by 32 rays.
 
-Draws follow their rules, not their random numbers.
+Layouts are drawn by their rules, but not with their random numbers.
 """
 
 import sys
@@ -29,29 +29,29 @@ from marlbc_mj.supervisors import make_supervisor
 
 AGENTS, BOXES = 8, 8
 SIDE = 40.0  # of the square [m]
-AGENT_RADIUS = 0.5  # of an agent [m]
-LEAST_GAP = 4.0 * AGENT_RADIUS  # of starts from each other and from rectangles; goals likewise [m]
+AGENT_RADIUS = 0.5  # [m]
+LEAST_GAP = 4.0 * AGENT_RADIUS  # between starts, and from starts to rectangles; the same for goals [m]
 SIDES = (1.0, 5.0)  # of a rectangle [m]
 STEP = 0.03  # [s]
 HORIZONS = (256, 1024)  # steps
-EDGE_DISC = 0.25  # radius of the discs inside a rectangle that make its edge, before they are made to cover it [m]
+EDGE_DISC = 0.25  # radius of the discs along a rectangle's edge, before they are enlarged to cover it [m]
 
 
 class Box(NamedTuple):
     """A rectangle."""
 
     middle: np.ndarray  # (2,) [m]
-    half: np.ndarray  # (2,) half of its sides [m]
+    half: np.ndarray  # (2,) half side lengths [m]
     angle: float  # [rad]
 
     def distance(self, places: np.ndarray) -> np.ndarray:
-        """(...) distance of ``places`` (..., 2) [m] from it, 0 inside."""
+        """(...) distance of ``places`` (..., 2) [m] from the rectangle; 0 inside."""
         cosine, sine = np.cos(self.angle), np.sin(self.angle)
         local = (places - self.middle) @ np.array([[cosine, -sine], [sine, cosine]])
         return np.asarray(np.linalg.norm(np.maximum(np.abs(local) - self.half, 0.0), axis=-1))
 
     def discs(self) -> list[Obstacle]:
-        """Discs along its edge that cover it but for its inside, where nobody gets."""
+        """Discs along its edge; they leave the interior uncovered, which no agent can reach."""
         inner = self.half - EDGE_DISC
         sides = [np.linspace(-half, half, int(np.ceil(2.0 * half / EDGE_DISC)) + 1) for half in inner]
         long = [(x, sign * inner[1]) for x in sides[0] for sign in (-1.0, 1.0)]
@@ -62,7 +62,7 @@ class Box(NamedTuple):
 
 
 class GoalDraw(NamedTuple):
-    """One draw."""
+    """Starts, goals and rectangles of one draw."""
 
     starts: np.ndarray  # (N, 2) [m]
     goals: np.ndarray  # (N, 2) [m]
@@ -70,12 +70,12 @@ class GoalDraw(NamedTuple):
 
 
 class GoalShares(NamedTuple):
-    """How it ended within a number of steps: shares with Wilson's 95 % interval."""
+    """Outcomes within a number of steps: shares with 95 % Wilson intervals."""
 
     steps: int
     reached: Estimate  # of agents
-    safe: Estimate  # of agents: touched nothing
-    success: Estimate  # of agents: both
+    safe: Estimate  # of agents that touched nothing
+    success: Estimate  # of agents that reached their goal and touched nothing
     teams: Estimate  # of teams in which every agent succeeded
 
 
@@ -88,7 +88,7 @@ def draw_goals(rng: np.random.Generator) -> GoalDraw:
 
 
 def _places(rng: np.random.Generator, boxes: tuple[Box, ...]) -> np.ndarray:
-    """(N, 2) places, each at least LEAST_GAP from the others and from all rectangles."""
+    """(N, 2) random positions, each more than LEAST_GAP from the others and from all rectangles."""
     found: list[np.ndarray] = []
     while len(found) < AGENTS:
         place = rng.uniform(0.0, SIDE, 2)
@@ -99,7 +99,7 @@ def _places(rng: np.random.Generator, boxes: tuple[Box, ...]) -> np.ndarray:
 
 
 def goal_scenario(drawn: GoalDraw) -> Scenario:
-    """FM is the formation of all goals around their mean, which stands still: everyone goes to its own."""
+    """The scenario of a draw: the slots of FM are the goals around their fixed mean, so each agent goes to its own goal."""
     middle = drawn.goals.mean(axis=0)
     slots = points(drawn.goals - middle)
     return Scenario(
@@ -121,8 +121,8 @@ def goal_scenario(drawn: GoalDraw) -> Scenario:
 
 
 def fly_to_goals(seed: int, supervisor: str = "fixed", *, shield: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """When each agent of a draw first had its goal, and at which substep it first touched something: (N,) mission steps each;
-    infinite: never.
+    """Times at which each agent of a draw first reached its goal and first touched something: (N,) each, in mission steps, the
+    second to the substep; infinite if never.
     """
     drawn = draw_goals(np.random.default_rng(seed))
     world = World(goal_scenario(drawn), record=True, shield=shield)
@@ -134,12 +134,12 @@ def fly_to_goals(seed: int, supervisor: str = "fixed", *, shield: bool = True) -
 
 
 def _first(events: np.ndarray) -> np.ndarray:
-    """(N,) index of the first true in ``events`` (M, N), infinite where there is none."""
+    """(N,) index of the first true entry in each column of ``events`` (M, N); infinite if there is none."""
     return np.where(events.any(axis=0), events.argmax(axis=0), np.inf)
 
 
 def goal_shares(ends: list[tuple[np.ndarray, np.ndarray]], steps: int) -> GoalShares:
-    """Shares of what :func:`fly_to_goals` gave, within a number of steps."""
+    """Shares of the outcomes that :func:`fly_to_goals` returned, within a number of steps."""
     reached, touched = (np.array(rows) <= steps for rows in zip(*ends, strict=True))
     success = reached & ~touched
     return GoalShares(

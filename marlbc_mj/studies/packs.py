@@ -1,7 +1,7 @@
-"""Packs: files to which small records are appended, each under its key and with a checksum. A torn record is dropped.
+"""Packs: files to which small records are appended, each with its key and a checksum. A torn record is dropped.
 
-One process writes a pack, others may read it meanwhile. Whatever stops the writer, kill −9 and a full disk included, all records
-but the last one are whole, and the last one is found to be torn.
+One process writes a pack while others may read it. Whatever stops the writer, kill −9 and a full disk included, every record
+before the last is whole, and a torn last record is detected.
 """
 
 import os
@@ -19,13 +19,13 @@ from marlbc_mj.util.files import writing
 
 MAGIC = b"MJr1"
 _HEAD = struct.Struct("<4s32sQI")  # magic, key, length of the payload, CRC-32 of key and payload
-LARGEST_PACK = 256 * 2**20  # size from which another pack is begun [bytes]
-SYNC_EVERY = 1.0  # between two flushes to the disk [s]
+LARGEST_PACK = 256 * 2**20  # size at which a new pack is started [bytes]
+SYNC_EVERY = 1.0  # time between two flushes to the disk [s]
 _PREFIX, PACK_SUFFIX = "results-", ".pack"
 
 
 class Packed(NamedTuple):
-    """Place of a record's payload."""
+    """The location of a record's payload."""
 
     key: str
     """64 hexadecimal digits."""
@@ -34,14 +34,14 @@ class Packed(NamedTuple):
     length: int  # of the payload [bytes]
 
     def payload(self) -> bytes:
-        """What was stored."""
+        """The stored bytes, decompressed."""
         with self.path.open("rb") as file:
             file.seek(self.start)
             return zstandard.ZstdDecompressor().decompress(file.read(self.length))
 
 
 def entries(path: Path, begin: int = 0) -> Iterator[Packed]:
-    """All whole records of a pack from a place on. What is damaged is passed over."""
+    """All whole records of a pack from the offset ``begin`` on; damaged parts are skipped."""
     with path.open("rb") as file:
         while (entry := _entry(path, file, begin)) is not None or (begin := _next_magic(file, begin + 1)) > 0:
             if entry is not None:
@@ -50,7 +50,7 @@ def entries(path: Path, begin: int = 0) -> Iterator[Packed]:
 
 
 def _entry(path: Path, file: BinaryIO, begin: int) -> Packed | None:
-    """The record at a place; None where there is no whole one."""
+    """The record at the offset ``begin``; None if there is no whole one."""
     file.seek(begin)
     head = file.read(_HEAD.size)
     if len(head) < _HEAD.size or not head.startswith(MAGIC):
@@ -63,14 +63,14 @@ def _entry(path: Path, file: BinaryIO, begin: int) -> Packed | None:
 
 
 def _next_magic(file: BinaryIO, begin: int) -> int:
-    """The next place from ``begin`` on where a record may begin, or −1."""
+    """The next offset from ``begin`` on at which a record may start, or −1."""
     file.seek(begin)
     found = file.read().find(MAGIC)
     return begin + found if found >= 0 else -1
 
 
 class PackWriter:
-    """Appends records to a pack, behind the last whole one."""
+    """Appends records to a pack, after the last whole one."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -90,14 +90,14 @@ class PackWriter:
 
     @property
     def full(self) -> bool:
-        """Whether another pack should be begun."""
+        """Whether a new pack should be started."""
         return self._end >= LARGEST_PACK
 
     def add(self, key: str, payload: bytes) -> Packed:
-        """Append a record; on the disk within about a second, or when the pack is closed.
+        """Append a record; later calls flush it to the disk after about a second, and :meth:`close` always does.
 
         Raises:
-            NoSpaceError: the disk is full; the pack is as it was before.
+            NoSpaceError: the disk is full; the pack is unchanged.
         """
         packed = zstandard.ZstdCompressor().compress(payload)
         name = bytes.fromhex(key)
@@ -132,12 +132,12 @@ def _write_all(file: int, data: bytes) -> None:
 
 
 def packs(folder: Path) -> list[Path]:
-    """The packs of a folder that :func:`next_pack` named, the last one last."""
+    """The packs of a folder that :func:`next_pack` named, in their order."""
     return sorted(folder.glob(f"{_PREFIX}*{PACK_SUFFIX}"))
 
 
 def next_pack(folder: Path) -> Path:
-    """The pack to append to: the last one, or another one where that is full."""
+    """The pack to append to: the last one, or a new one if that is full."""
     there = packs(folder)
     if there and there[-1].stat().st_size < LARGEST_PACK:
         return there[-1]

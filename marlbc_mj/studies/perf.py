@@ -31,11 +31,11 @@ from marlbc_mj.util.provenance import provenance
 
 BARE = "bare mj_step"
 BATCH = 64  # worlds of the physics comparison
-BATCHES = (1, 64, 1024)  # worlds of the mission-step figures
+BATCHES = (1, 64, 1024)  # numbers of worlds for the mission-step figures
 SUPERVISED = ("fsams", "fms", "marlms")
 """Supervisors that decide for many worlds in one call."""
 SUPERVISED_WORLDS = 1024
-SUPERVISED_STEPS = 10  # mission steps in one measurement, as many as a decision of marlms holds for
+SUPERVISED_STEPS = 10  # mission steps in one measurement: one decision interval of marlms
 BURST = 12_800  # physics steps in one measurement of a variant
 PYTHON_STEPS = 20  # mission steps in one measurement of the Python loops
 
@@ -49,7 +49,7 @@ def _no_law(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class _Idle:
-    """A controller that does nothing: what the loop costs around a law."""
+    """A controller that does nothing, to measure the cost of the loop around a law."""
 
     limited: bool = True
     linear_gains: tuple[float, float] | None = None
@@ -69,18 +69,18 @@ LOOP_PARTS: dict[str, tuple[Controller, Disturbance]] = {
     "SORLC's compensator": (SORLC(basis="off"), PaperDrag()),
     "SORLC's networks, inputs in range": (SORLC(basis="scaled"), PaperDrag()),
 }
-"""Closed loops, each with one thing more than the one before it, by that thing."""
+"""Closed loops by the part that each adds to the one before it."""
 
 
 class _PlainSORLC(SORLC):
-    """SORLC as the Python interpreter runs it: what the law costs without compilation."""
+    """SORLC run by the Python interpreter, to measure the law without compilation."""
 
     law = staticmethod(plain(SORLC.law))
 
 
 @compiled
 def _bare_serial(step, model, data, substeps):
-    """A mission step of bare physics: every world its substeps, one world after the other, as the closed loop does."""
+    """A mission step of bare physics: all substeps of one world, then of the next, as in the closed loop."""
     for b in range(data.shape[0]):
         for _ in range(substeps):
             call_step(step, model, data[b])
@@ -94,7 +94,7 @@ def _bare_parallel(step, model, data, substeps):
 
 
 class Fleet:
-    """Worlds spread evenly over the mission, so that one burst of steps samples all of it."""
+    """Worlds at stages spread evenly over the mission, so that one burst of steps samples all of it."""
 
     def __init__(
         self,
@@ -112,7 +112,7 @@ class Fleet:
             self._spread(World(scenario, controller, worlds=min(worlds, BATCH)), scenario.mission_steps)
 
     def _spread(self, source: World, steps: int) -> None:
-        """Reset one world after the other while all of them run; more worlds than that are copies of these."""
+        """Run all source worlds, resetting them one by one so that their stages differ, and copy them to this fleet's worlds."""
         stages = source.worlds
         copies = self.world.worlds // stages
         for stage in range(stages):
@@ -123,12 +123,12 @@ class Fleet:
             self.world.copy_world(source, b // copies, b)
 
     def advance(self, steps: int) -> None:
-        """``steps`` calls of ``World.step``; a finished world starts again."""
+        """Call ``World.step`` ``steps`` times; a finished world starts again."""
         for _ in range(steps):
             self.world.step(self._next_orders())
 
     def advance_compiled(self, steps: int) -> None:
-        """The same through the compiled call alone."""
+        """Like :meth:`advance`, but through the compiled call alone."""
         for _ in range(steps):
             self.world.advance(self._next_orders())
 
@@ -150,7 +150,7 @@ class SupervisedFleet(Fleet):
         self.supervisor, self.memory = supervisor, supervisor.start(scenario, worlds)
 
     def advance(self, steps: int) -> None:
-        """``steps`` decisions, each with its ``World.step``; a finished world starts again."""
+        """Make ``steps`` decisions, each followed by ``World.step``; a finished world starts again."""
         for _ in range(steps):
             self._restart_finished()
             decision, self.memory = self.supervisor.decide(self.world.observe(), self.memory)
@@ -183,7 +183,7 @@ class PerfJob(NamedTuple):
 
 @dataclass(frozen=True)
 class PerfStudy:
-    """All figures of ``marlbc perf``. Its jobs must have the machine to themselves: one after the other.
+    """All figures of ``marlbc perf``. Each job needs the machine to itself, so they must run one after another.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
@@ -201,13 +201,13 @@ class PerfStudy:
         return PERF_PARTS[job.part](threads_measured(), job.rounds, watch.progress)
 
     def gather(self, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """The figures of all jobs as the file has them."""
+        """The figures of all jobs, merged as in the output file."""
         figures = {name: value for result in results for name, value in result.items() if name != "ratios"}
         ratios = {name: value for result in results for name, value in result.get("ratios", {}).items()}
         return {**figures, "ratios": ratios, "rounds": self.rounds}
 
     def report(self, results: Sequence[dict[str, Any]], out: Path | None, progress: Progress = silent) -> Report:
-        """The figures as lines; ``out`` is a JSON file here."""
+        """The figures as lines of text; ``out`` is a JSON file here, not a folder."""
         figures = self.gather(results)
         if out is not None:
             write_json(out, {**figures, **provenance()})
@@ -215,7 +215,7 @@ class PerfStudy:
 
 
 def measure_perf(rounds: int = 9, progress: Progress = silent) -> dict[str, Any]:
-    """All figures of ``marlbc perf``: medians over ``rounds``, and the ratios as medians of per-round ratios.
+    """Measure all figures of ``marlbc perf``: medians over ``rounds``; ratios are medians of per-round ratios.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
@@ -225,12 +225,12 @@ def measure_perf(rounds: int = 9, progress: Progress = silent) -> dict[str, Any]
 
 
 def threads_measured() -> tuple[int, ...]:
-    """One thread, and two where the machine has them."""
+    """Numbers of threads to measure: one, and two where the machine has them."""
     return (1, 2) if numba.config.NUMBA_NUM_THREADS >= 2 else (1,)
 
 
 def measure_physics(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Physics steps per second by threads: bare MuJoCo, the closed loop, and the Python loop."""
+    """Physics steps per second: bare MuJoCo and the closed loop by number of threads, and the Python loop."""
     progress("physics steps: bare, closed loop, Python loop", 0, 1)
     scenario = paper()
     orders = scripted_orders(scenario)
@@ -268,7 +268,7 @@ def measure_physics(threads: tuple[int, ...], rounds: int, progress: Progress = 
 
 
 def measure_loop(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Processor time of one physics step of a team, bare and in the loops of LOOP_PARTS, on one thread."""
+    """Processor time of one physics step of a team on one thread: of bare MuJoCo, and added by each part of LOOP_PARTS."""
     progress("where the time of the closed loop goes", 0, 1)
     orders, steps = scripted_orders(paper()), BURST // (BATCH * paper().substeps)
     fleets = {
@@ -286,7 +286,7 @@ def measure_loop(threads: tuple[int, ...], rounds: int, progress: Progress = sil
 
 
 def measure_missions(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Mission steps per second by batch size and threads."""
+    """Mission steps per second by batch size and number of threads."""
     progress("mission steps by batch size", 0, 1)
     scenario = paper()
     orders = scripted_orders(scenario)
@@ -299,7 +299,7 @@ def measure_missions(threads: tuple[int, ...], rounds: int, progress: Progress =
 
 
 def measure_supervised(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Mission steps per second of many worlds, on one thread, with a supervisor that observes and decides before each."""
+    """Mission steps per second of many worlds on one thread, with a supervisor that observes and decides before each step."""
     progress("mission steps with a supervisor", 0, 1)
     scenario = paper()
     orders = scripted_orders(scenario)
@@ -322,7 +322,7 @@ PERF_PARTS: dict[str, Callable[[tuple[int, ...], int, Progress], dict[str, Any]]
     "episode": measure_episode,
     "training": measure_training,
 }
-"""What is measured, in this order."""
+"""The measurements, in the order in which they run."""
 
 
 def perf_lines(figures: dict[str, Any]) -> list[str]:

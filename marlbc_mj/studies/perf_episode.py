@@ -1,4 +1,4 @@
-"""How long a whole episode of one world takes on this machine, and its log."""
+"""How long a whole episode of one world, and writing its log, takes on this machine."""
 
 import tempfile
 from collections.abc import Callable
@@ -20,8 +20,8 @@ from marlbc_mj.util.progress import Progress, silent
 
 
 def measure_episode(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Seconds for a whole 100 s episode of one world: its supervisor deciding at every mission step, all orders known
-    beforehand, and writing its log at mission rate. One thread, whatever ``threads`` says.
+    """Seconds for a whole 100 s episode of one world: with a supervisor deciding at every mission step, with all orders known in
+    advance, and for writing its log at mission rate. Always on one thread; ``threads`` is ignored.
     """
     progress("one episode, and its log", 0, 1)
     scenario = paper()

@@ -1,4 +1,4 @@
-"""How fast learning is on this machine: the environment alone, a training run, where its time goes, and a learned decision."""
+"""How fast learning is on this machine: the environment alone, a training run and its profile, and a learned decision."""
 
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -23,22 +23,22 @@ from marlbc_mj.training.config import TrainConfig, make_config
 from marlbc_mj.training.run import make_trainer
 from marlbc_mj.util.progress import Progress, silent
 
-WORLDS = 256  # of the environment alone
-DECISIONS = 10  # of all worlds, in one measurement
-PROFILED = 40  # decisions that the profile is taken over
+WORLDS = 256  # when the environment is measured alone
+DECISIONS = 10  # per world in one measurement
+PROFILED = 40  # decisions covered by the profile
 REST = "rest"
 
 
 def training_config(threads: int) -> TrainConfig:
-    """What is measured: the fast preset."""
+    """The configuration that is measured: the fast preset."""
     return make_config("fast", threads=threads)
 
 
 def measure_training(threads: tuple[int, ...], rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Figures and ratios of learning, each for every number of ``threads``.
+    """Figures and ratios of learning for every number of ``threads``.
 
-    The environment has the preset's interval, actions and starts, and random actions; a training run is measured past its
-    warm-up. The ends of exploring starts are spread, so that every measurement has its share of new episodes.
+    The environment uses the preset's interval, actions and starts, and takes random actions. A training run is measured after its
+    warm-up. The ends of exploring starts are spread, so that every measurement includes its share of new episodes.
     """
     configs = {n: training_config(n) for n in threads}
     environments = {n: _environment(config) for n, config in configs.items()}
@@ -89,14 +89,14 @@ def _environment(config: TrainConfig) -> FormationBatch:
 
 
 def spread(batch: FormationBatch, rng: np.random.Generator) -> None:
-    """Cut the exploring starts that all worlds begin with at different times; those that follow stay apart by themselves."""
+    """End the first exploring episodes of the worlds at different times; later ones then stay out of step by themselves."""
     exploring = batch.cut < batch.scenario.mission_steps
     left = batch.cut - batch.world.state.steps
     batch.cut = batch.cut - np.where(exploring, rng.integers(np.maximum(left, 1)), 0)
 
 
 def warm_up(trainer: BaseTrainer) -> None:
-    """Advance until there have been updates."""
+    """Advance until the first updates have been made."""
     while not trainer.updates:
         trainer.advance()
 
@@ -112,9 +112,9 @@ def _learn(trainer: BaseTrainer, decisions: int) -> None:
 
 
 class PartClock:
-    """Seconds by part of a program. Parts may call each other: only the innermost one's time runs.
+    """Seconds spent in each part of a program. Parts may call each other: only the innermost one is counted.
 
-    ``seconds`` are those of the thread that made the clock; ``aside``, of one other thread, whose parts must not call each other.
+    ``seconds`` counts the thread that made the clock, and ``aside`` one other thread, in which parts must not call each other.
     """
 
     def __init__(self) -> None:
@@ -125,7 +125,7 @@ class PartClock:
         self.since = perf_counter()
 
     def turn_to(self, part: str) -> str:
-        """Count for ``part`` from now on; returns what was counted for before."""
+        """Count time for ``part`` from now on; returns the part counted before."""
         now, before = perf_counter(), self.part
         self.seconds[before] += now - self.since
         self.part, self.since = part, now
@@ -133,7 +133,7 @@ class PartClock:
 
     @contextmanager
     def timing(self, owner: Any, names: tuple[str, ...], part: str) -> Iterator[None]:
-        """Count the methods ``names`` of one object for ``part`` within the block; ``__call__`` works as well."""
+        """Count the methods ``names`` of one object, ``__call__`` included, for ``part`` within the block."""
         self.seconds.setdefault(part, 0.0)
         kind = type(owner)
         owner.__class__ = type(kind.__name__, (kind,), {name: self._timed(getattr(kind, name), part) for name in names})
@@ -160,12 +160,12 @@ class PartClock:
 
 
 def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, float]]:
-    """Shares of the wall time of training with a replay buffer: of the thread that simulates, and of the one that learns
+    """Shares of the wall time of training with a replay buffer: in the thread that simulates, and in the one that learns
     meanwhile, if there is one.
 
-    Simulation is the worlds' steps and resets; state the state vectors; exploration the hash codes, temperatures and random
-    orders; replay what is stored and drawn; waiting is for updates that take longer than the worlds; the rest the greedy choice,
-    rewards and leniency.
+    Parts: "simulation" is the worlds' steps and resets, "state" the state vectors, "exploration" the hash codes, temperatures and
+    random orders, "replay" storing and sampling, "waiting" the wait for updates that take longer than the simulation, and "rest"
+    the greedy choice, rewards and leniency.
     """
     parts = (
         (trainer.batch.world, ("advance", "reset", "place"), "simulation"),
@@ -193,9 +193,9 @@ def profile(trainer: Any, decisions: int) -> tuple[dict[str, float], dict[str, f
 
 
 def _measure_decisions(trainer: BaseTrainer, episodes: int) -> dict[str, dict[str, float]]:
-    """Microseconds of ``Learned.decide``, median and 99th percentile: of the mission steps at which it decides, and of all.
+    """Median and 99th percentile of ``Learned.decide``'s time [us]: at the mission steps at which it decides, and at all steps.
 
-    The networks are untrained; what they decide does not change what a decision takes.
+    The networks are untrained; the outcome of a decision does not affect its duration.
     """
     scenario, config = trainer.scenario, trainer.config
     tied = signature(scenario, config.state, config.actions, config.interval)

@@ -1,9 +1,9 @@
 """Studies: independent jobs, each a pure function of its configuration, and a report made from their results.
 
-A job is data: everything that its result depends on, so that it can run in this process, in another one or on another machine, in
-any order, and so that a result that is there already is found again. A result is data too. Data are None, numbers, texts, paths,
-arrays, and lists, tuples, dicts, dataclasses and named tuples of data, see :mod:`marlbc_mj.studies.codec`. Only large files, logs
-and checkpoints, go into a folder beside it. :mod:`marlbc_mj.studies.runner` runs the jobs of any study.
+A job is data and holds everything that its result depends on. So jobs can run in any order, in this process, in another one or on
+another machine, and a stored result can be found again. A result is data too. Data are None, numbers, strings, paths, arrays, and
+lists, tuples, dicts, dataclasses and named tuples of data, see :mod:`marlbc_mj.studies.codec`. Only large files, such as logs and
+checkpoints, go into a separate folder. :mod:`marlbc_mj.studies.runner` runs the jobs of any study.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +17,7 @@ ResultT = TypeVar("ResultT")
 
 
 class Stopped(Exception):
-    """A job or a study that was asked to stop, and whose state is saved."""
+    """A job or a study stopped on request, with its state saved."""
 
     def __init__(self, signal: int = 0) -> None:
         super().__init__(signal)
@@ -25,29 +25,29 @@ class Stopped(Exception):
 
 
 def never() -> bool:
-    """The stop request of a job that nobody will stop."""
+    """The ``stopping`` callback of a job that is never asked to stop."""
     return False
 
 
 class Watch(NamedTuple):
-    """Services for a job besides its configuration; its result does not depend on them."""
+    """Services available to a running job; its result must not depend on them."""
 
     progress: Progress = silent
     stopping: Callable[[], bool] = never
-    """Whether the job should save itself and raise :class:`Stopped`; one that cannot need not ask."""
+    """Returns whether the job should save its state and raise :class:`Stopped`; jobs that cannot do so may ignore it."""
     folder: Path | None = None
-    """Where the job's large files go, under names that no other job of the study uses; empty at first. None: nowhere."""
+    """Folder for the job's large files, empty at first; file names must be unique within the study. None: write none."""
 
 
 class Report(NamedTuple):
     """The text and data that a study reports."""
 
     text: str = ""
-    """For the terminal."""
+    """Text for the terminal."""
     document: Any = None
-    """The same as data, of the kinds that results are made of."""
+    """The same report as data, of the kinds allowed in results."""
     problems: tuple[str, ...] = ()
-    """Outputs that could not be written, a video without GL for example; one line each."""
+    """Outputs that could not be written, for example a video without GL; one line each."""
 
 
 class Study(Protocol[JobT, ResultT]):
@@ -57,17 +57,17 @@ class Study(Protocol[JobT, ResultT]):
         """All jobs, in the order of the report.
 
         Raises:
-            ConfigurationError: a setting that cannot be run; nothing has been run or written then.
+            ConfigurationError: a setting that cannot be run; nothing has been run or written.
         """
         ...
 
     def run(self, job: JobT, watch: Watch) -> ResultT:
-        """The job's result. A failure that belongs in the report is a result; any other is raised and ends the study."""
+        """Run one job. A failure that belongs in the report is returned as a result; any other is raised and ends the study."""
         ...
 
-    # A study whose results or files depend on more than the job, a setting of its own for example, has a further method
-    # ``describe(job)``, which returns all of it as data, the job among it; a result is found again only by the same.
+    # If results or files depend on more than the job, for example on a setting of the study, the study also has a method
+    # ``describe(job)``. It returns all of that as data, including the job, and stored results are looked up by it.
 
     def report(self, results: Sequence[ResultT], out: Path | None, progress: Progress = silent) -> Report:
-        """Write what the study leaves into ``out``, where that is given, and say what came out."""
+        """Write the study's output files into ``out``, if given, and return the report."""
         ...

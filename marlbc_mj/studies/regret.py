@@ -1,7 +1,8 @@
-"""How much of the best known return supervisors reach: for every layout a search, without a time limit, for the best schedule.
+"""The share of the best known return that supervisors reach, with the best schedule of every layout found by an offline search.
 
-The search knows the layout and plays every candidate to its end on the simulator, see :mod:`marlbc_mj.supervisors.oracle`. It
-begins with the best that a supervisor flew, so it finds nothing worse. What it finds is a lower bound of what can be reached.
+The search knows the layout and simulates every candidate schedule to its end, see :mod:`marlbc_mj.supervisors.oracle`. It starts
+from the best schedule that a supervisor flew, so it never ends with a worse one. Its result is a lower bound of the best possible
+return.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ from marlbc_mj.util.provenance import provenance
 
 
 class RegretJob(NamedTuple):
-    """One layout: who flies it, and how long is searched."""
+    """One layout, with the supervisors to run on it and the budget of the search."""
 
     mission: str
     seed: int
@@ -42,18 +43,18 @@ class RegretJob(NamedTuple):
 
 
 class LayoutReturns(NamedTuple):
-    """Returns on one layout."""
+    """Returns reached on one layout."""
 
-    best: float  # of the best schedule known that violates nowhere
-    flown: tuple[float, ...]  # of each supervisor, whether it violated or not
+    best: float  # of the best known schedule without a violation
+    flown: tuple[float, ...]  # of each supervisor, with or without violations
 
 
 @dataclass(frozen=True)
 class RegretStudy:
-    """Supervisors and a search on held-out layouts of families whose obstacles are at rest, under the set-based composition.
+    """Supervisors and a search on held-out layouts of families with obstacles at rest, under the set-based composition.
 
     Raises:
-        ConfigurationError: no missions or supervisors, unknown ones, obstacles that move, no layouts, or a budget below one
+        ConfigurationError: no or unknown missions or supervisors, obstacles that move, no layouts, or a budget below one
             population.
     """
 
@@ -63,7 +64,7 @@ class RegretStudy:
     seed: int = 90_000
     """Seed of the first layout."""
     budget: int = 512
-    """Episodes that the search may simulate on each."""
+    """Episodes that the search may simulate on each layout."""
     controller: str = "sorlc"
 
     def __post_init__(self) -> None:
@@ -79,7 +80,7 @@ class RegretStudy:
         seed_range(self.layouts, self.seed)
 
     def jobs(self) -> list[RegretJob]:
-        """Layout by layout, so that a study that is stopped has all missions."""
+        """All jobs, ordered by layout first, so that a stopped study covers all missions."""
         return [
             RegretJob(mission, seed, self.supervisors, self.controller, self.budget)
             for seed in seed_range(self.layouts, self.seed)
@@ -100,7 +101,7 @@ class RegretStudy:
         return LayoutReturns(found.total, tuple(total for _, total, _ in flown))
 
     def report(self, results: Sequence[LayoutReturns], out: Path | None, progress: Progress = silent) -> Report:
-        """Write regret.csv, regret.md and the configuration."""
+        """Write regret.csv, regret.md and config.json."""
         rows = [
             {
                 "mission": job.mission,
@@ -119,10 +120,10 @@ class RegretStudy:
 
 
 def frozen(scenario: Scenario, seed: int) -> Scenario:
-    """The instance of a scenario that a seed draws, as a scenario that draws nothing.
+    """The instance that a seed draws, as a scenario in which nothing is random.
 
     Raises:
-        ConfigurationError: obstacles move, which the search cannot plan around.
+        ConfigurationError: the scenario has obstacles that move, which the search cannot plan around.
     """
     draw = scenario.draw_of(seed)
     if len(draw.motions):
@@ -137,7 +138,7 @@ def frozen(scenario: Scenario, seed: int) -> Scenario:
 
 
 def regret_table(rows: Sequence[dict[str, Any]], supervisors: Sequence[str]) -> Table:
-    """Per mission the median of the best known returns, and of every supervisor's share of the best of its layout."""
+    """Per mission: the median best known return, and each supervisor's median and least share of the best of a layout."""
     cells = []
     for mission in dict.fromkeys(row["mission"] for row in rows):
         lines = [row for row in rows if row["mission"] == mission]

@@ -1,4 +1,4 @@
-"""The checklist for a robot: each requirement of a mission, tried on the robot itself."""
+"""The checklist for a robot: every requirement of a mission, tested on the robot itself."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -18,10 +18,10 @@ from marlbc_mj.studies.robot_truth import Truth, compare, try_laws
 from marlbc_mj.util.errors import MarlbcError
 from marlbc_mj.util.text import one_line
 
-DURATION = 8.0  # of the step test [s]
-SETTLED, OVERSHOOT = 0.1, 0.35  # of the robot's length unit: error at the end, excursion beyond the reference
-MASSES = 0.01  # that a force along x and one along y may move, relative to each other
-_HEIGHT, TILT = 0.05, 35.0  # that a flying robot keeps [m], [deg]
+DURATION = 8.0  # duration of the step test [s]
+SETTLED, OVERSHOOT = 0.1, 0.35  # largest final error and overshoot allowed, in the robot's length unit
+MASSES = 0.01  # largest relative difference between the masses moved along x and y
+_HEIGHT, TILT = 0.05, 35.0  # largest change of height [m] and largest tilt [deg] allowed
 
 
 _KINDS = {
@@ -30,7 +30,7 @@ _KINDS = {
     "jacobian": mujoco.mjtJacobian,
     "solver": mujoco.mjtSolver,
 }
-"""Options whose values are names."""
+"""Options with named values, and their enumerations."""
 
 
 class Item(NamedTuple):
@@ -42,7 +42,7 @@ class Item(NamedTuple):
 
 
 def checklist(name: str) -> Iterator[Item]:
-    """Check a robot by name or path; stops at a failure that makes the rest meaningless."""
+    """Check a robot by name or path; stops at a failure that makes the remaining checks meaningless."""
     try:
         robot = make_robot(name)
         robot.spec()
@@ -104,7 +104,7 @@ def _limits(robot: Robot) -> Item:
 
 
 def _options(robot: Robot) -> Item:
-    """The file's options that a team's world takes over, and those that it cannot."""
+    """The MJCF options that the team's world keeps, and those that it cannot keep."""
     given, usual = robot.spec().option, mujoco.MjSpec().option
     kept = [
         f"{name} {_shown(name, getattr(given, name))}"
@@ -117,7 +117,7 @@ def _options(robot: Robot) -> Item:
 
 
 def _shown(name: str, value: Any) -> str:
-    """A value of an option as its MJCF has it: by its name where it has one."""
+    """The value of an option as written in MJCF, by name if it has one."""
     if name in _KINDS:
         return str(_KINDS[name](int(value)).name).split("_")[1].lower()
     return " ".join(f"{float(x):g}" for x in np.ravel(value))
@@ -129,7 +129,7 @@ def _frame(robot: Robot) -> Item:
     upright = float(data.xmat[body][8])
     offset = data.subtree_com[body][:2] - data.xpos[body][:2]
     heading = float(np.degrees(np.arctan2(data.xmat[body][3], data.xmat[body][0])))
-    ahead = robot.direct or abs(heading) < 1.0  # motors push along the world's axes, however the body is turned
+    ahead = robot.direct or abs(heading) < 1.0  # motors push along the world's axes at any heading
     good = upright > 0.999 and ahead and float(np.hypot(*offset)) < robot.radius
     said = f"z up: {upright:.3f}, x along the world's: {heading:.1f} deg off, centre of mass {1e3 * np.hypot(*offset):.1f} mm off"
     return Item("frame", good, said)
@@ -163,7 +163,7 @@ def _attached(robot: Robot) -> Item:
 
 
 def step_scenario(robot: Robot, **changes: Any) -> Scenario:
-    """Two of the robot, far apart, with references that step by two length units along x and one along y, within its limits."""
+    """Two copies of the robot, far apart; references step by two length units along x and one along y, within its limits."""
     unit = robot.length
     slots = ((2.0 * unit, -20.0 * unit), (2.0 * unit, 20.0 * unit))
     brake, top = robot.acceleration_limit, robot.speed_limit
@@ -204,7 +204,7 @@ def _step_test(robot: Robot) -> Iterator[Item]:
 
 
 def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
-    """Possible causes of a step that is not followed, from forces and velocities (T, N, 2)."""
+    """The likely cause of a failed step test, from forces and velocities (T, N, 2)."""
     if float((force * v).sum()) < 0.0:
         return ": it moves against its force; are axes exchanged or reversed in its drive or its reading?"
     share = float((np.abs(force) > 0.99 * scenario.force_limit).any(axis=-1).mean())
@@ -214,7 +214,7 @@ def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
 
 
 def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
-    """p stays with the body, v is its velocity there, and the force is what MuJoCo's actuators gave."""
+    """Check that p is a point fixed to the body, v the velocity of that point, and the force that of MuJoCo's actuators."""
     robot = world.plan.robot
     offset = np.stack([truth.offset for truth in truths])
     astray = float(np.linalg.norm(offset - offset[0], axis=-1).max())
@@ -225,7 +225,7 @@ def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
     gaps = [float(truth.force_error.max()) for truth in truths[1:] if truth.force_error is not None]
     if gaps:
         most = max(float(np.abs(force).max()), 1e-9)
-        stages = world.plan.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4  # it leaves the forces of its last stage
+        stages = world.plan.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4  # data has the forces of its last stage
         within = float(np.abs(np.diff(force, axis=0)).max()) if stages else 0.0
         good = good and max(gaps) < 1e-3 * most + within
         said += f", force within {max(gaps):.3g} N of MuJoCo's actuators"
@@ -235,7 +235,7 @@ def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
 
 
 def _saturation(robot: Robot, world: World, force: np.ndarray) -> Item:
-    """The forces of the step stay within limits, and so do the controls when the law asks for a hundred times as much."""
+    """Check the limits of forces in the step test, and of actuators at its end and after one step at a hundredfold gain."""
     most = float(np.abs(force).max())
     hard = World(step_scenario(robot), replace(PD(*robot.gains), position_gain=100 * robot.gains[0], limited=False))
     orders = np.full((1, 2), hard.scenario.orders.index("FM"))
@@ -243,9 +243,10 @@ def _saturation(robot: Robot, world: World, force: np.ndarray) -> Item:
         hard.step(orders)
     except MarlbcError as error:
         return Item("saturation", False, f"a hundredfold gain: {error}")
-    model, data = world.plan.model, world.data[0]
+    model = world.plan.model
     limited = model.actuator_ctrllimited.astype(bool)
-    inside = bool((np.abs(data.actuator_force[limited]) <= np.abs(model.actuator_ctrlrange[limited]).max(axis=1) + 1e-9).all())
+    forces = np.abs([each.data[0].actuator_force[limited] for each in (world, hard)])
+    inside = bool((forces <= np.abs(model.actuator_ctrlrange[limited]).max(axis=1) + 1e-9).all())
     bound = world.scenario.force_limit * (1 + 1e-9)
     good = inside and (most <= bound if robot.direct else np.isfinite(most))
     return Item("saturation", good, f"largest force {most:.3g} N of {world.scenario.force_limit:.3g} N per axis")

@@ -1,4 +1,4 @@
-"""Every robot on the gate mission scaled to it, under three supervisors: one table, and stills and clips for a gallery."""
+"""Every robot on a gate mission of its own scale, under three supervisors: one table, and stills and clips for a gallery."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -34,7 +34,7 @@ GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
     "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
     "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
 }
-"""Supervisors of the benchmark, with lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to obey."""
+"""Supervisors of the benchmark, with lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to react."""
 
 GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
@@ -44,28 +44,28 @@ GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
 }
 """Controllers with the robot's gains per unit mass."""
 
-STILL_AT = (0.17, 0.58)  # shares of the mission: around the point, in the gate
-CLIP = (0.10, 0.66)  # shares of the mission
+STILL_AT = (0.17, 0.58)  # times of the stills as shares of the mission: near the point obstacle, in the gate
+CLIP = (0.10, 0.66)  # start and end of the clip as shares of the mission
 SHOWN = [name for name in ROBOTS if name != "point_mass"]
 
 
 class GateRow(NamedTuple):
-    """One robot under one supervisor."""
+    """The measurements of one robot under one supervisor."""
 
     robot: str
     supervisor: str
-    clearance: float  # least, of the point that is led, from an obstacle's surface [m]
+    clearance: float  # least distance from the controlled point to an obstacle's surface [m]
     safe_distance: float  # [m]
-    violation: float  # worst agent [s]
-    collisions: int  # mission steps at which robots touched each other or an obstacle
-    distance: float  # least between two agents [m]
+    violation: float  # violation time of the worst agent [s]
+    collisions: int  # mission steps with contact between robots, or of a robot with an obstacle
+    distance: float  # least distance between two agents [m]
     error: float  # RMS of the position error, worst agent [m]
-    saturation: float  # share of substeps, worst agent
-    switches: tuple[int, ...]
-    returned: float
-    height_error: float | None  # [m]
-    tilt: float | None  # [deg]
-    failure: str | None = None  # why the row means nothing
+    saturation: float  # share of saturated substeps, worst agent
+    switches: tuple[int, ...]  # per agent
+    returned: float  # return of the episode
+    height_error: float | None  # largest [m]
+    tilt: float | None  # largest [deg]
+    failure: str | None = None  # why the row is not valid
 
 
 class GateJob(NamedTuple):
@@ -74,7 +74,7 @@ class GateJob(NamedTuple):
     robot: str
     supervisor: str  # a key of GATE_SUPERVISORS
     controller: str  # a key of GATE_CONTROLLERS
-    shown: bool  # whether stills and a clip of it are drawn
+    shown: bool  # whether stills and a clip are rendered
 
 
 @dataclass(frozen=True)
@@ -134,13 +134,13 @@ def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateR
 
 
 def _failed_row(job: GateJob, reason: str) -> GateRow:
-    """The row of an episode that could not be finished."""
+    """The row of an episode that failed."""
     nan = float("nan")
     return GateRow(job.robot, job.supervisor, nan, nan, nan, 0, nan, nan, nan, (), nan, None, None, reason)
 
 
 def touching(world: World) -> bool:
-    """Whether a robot of world 0 touches another body than its own and the ground."""
+    """Whether a robot of world 0 touches anything other than itself and the ground."""
     model, data = world.plan.model, world.data[0]
     roots = model.body_rootid[model.geom_bodyid[data.contact.geom]]
     return bool(((roots[:, 0] != roots[:, 1]) & (roots > 0).all(axis=1)).any())
@@ -173,11 +173,11 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
 
 
 LOST = 10.0
-"""Tracking error, in a robot's length units, beyond which it is not on its mission any more; also the fall of a body."""
+"""Largest tracking error and largest change of height, in the robot's length units; beyond either a robot is lost."""
 
 
 def _lost(error: float, world: World) -> str | None:
-    """Why an episode says nothing about supervisors, or None: the robot does not follow its reference, or has left the ground."""
+    """Why an episode says nothing about supervisors: a robot lost its reference, or rose or fell too far; None if valid."""
     robot, model = world.plan.robot, world.plan.model
     if not error < LOST * robot.length:
         return f"lost: {error:.3g} m from its reference (RMS), {error / robot.length:.3g} length units; see `marlbc robot check`"
@@ -224,7 +224,7 @@ def run_gates(
     engine: EngineName = "local",
     progress: Progress = silent,
 ) -> Conclusion[GateRow]:
-    """Fly every robot under every supervisor, and leave gate.md, gate.json, and stills and clips of the first supervisor.
+    """Run every robot under every supervisor; writes gate.md, gate.json, and stills and clips of the first supervisor.
 
     Raises:
         ConfigurationError: an unknown name, a missing package, or a folder that cannot be written.
@@ -235,7 +235,7 @@ def run_gates(
 
 
 def show(trajectory: Trajectory, controller: Controller, folder: Path, name: str) -> None:
-    """Two stills and a short clip of an episode, seen close."""
+    """Render two stills and a short clip of an episode with the close camera."""
     log = from_trajectory(trajectory, controller)
     duration = trajectory.scenario.duration
     for k, share in enumerate(STILL_AT, 1):

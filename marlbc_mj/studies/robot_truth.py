@@ -1,4 +1,4 @@
-"""What a robot reports against what MuJoCo itself has: p, v and force of every agent, and laws that keep within their arrays."""
+"""Checks of a robot's laws: reported p, v and force against MuJoCo's own values, and no access outside their arrays."""
 
 from collections.abc import Callable
 from types import CellType, FunctionType
@@ -15,18 +15,18 @@ from marlbc_mj.robots.motors import effects, posed
 
 
 class Truth(NamedTuple):
-    """The agents of one world at one instant, as MuJoCo has them and as the robot reports them."""
+    """Differences between what MuJoCo computes and what robots report, for the agents of one world at one instant."""
 
-    offset: np.ndarray  # (N, 2) of p from the body's place, in the body's frame [m]
-    velocity_error: np.ndarray  # (N,) of v from the body's velocity at p [m/s]
-    force_error: np.ndarray | None  # (N,) of the force from MuJoCo's actuators' [N]; None where wheels or legs are between
-    height: np.ndarray  # (N,) of the body [m]
+    offset: np.ndarray  # (N, 2) p relative to the body's origin, in the body's frame [m]
+    velocity_error: np.ndarray  # (N,) of v against the body's velocity at p [m/s]
+    force_error: np.ndarray | None  # (N,) against the actuators' force in MuJoCo [N]; None with wheels or legs in between
+    height: np.ndarray  # (N,) height of the body [m]
 
 
 def compare(world: World) -> Truth:
-    """What world 0 reports now against ``xpos``, ``cvel`` and ``qfrc_actuator``."""
+    """Compare the current state of world 0 with ``xpos``, ``cvel`` and ``qfrc_actuator``."""
     model, data = world.plan.model, world.data[0]
-    now = mujoco.MjData(model)  # mj_step leaves xpos and cvel at the state before it
+    now = mujoco.MjData(model)  # mj_step leaves xpos and cvel at the previous state
     now.qpos[:], now.qvel[:] = data.qpos, data.qvel
     mujoco.mj_kinematics(model, now)
     mujoco.mj_comPos(model, now)
@@ -46,7 +46,7 @@ def compare(world: World) -> Truth:
 
 
 def _pushes_base_only(world: World) -> bool:
-    """Whether every actuator acts on the base's own joints, so that its planar force can be read there."""
+    """Whether every actuator acts only on the base's own joints, so that its planar force can be read there."""
     model, first = world.plan.model, world.plan.plant.qvel_index
     own = set(model.dof_bodyid[first.ravel()].tolist())
     inside = np.isin(model.dof_bodyid, list(own))
@@ -57,9 +57,9 @@ def _pushes_base_only(world: World) -> bool:
 
 
 def try_laws(robot: Robot) -> str | None:
-    """Run drive and reading as plain Python with every index checked; what is wrong, or None.
+    """Run drive and reading as plain Python, which checks every index; returns a description of the error, or None.
 
-    Compiled code does not check indices: it would read and write memory that is not the law's.
+    Compiled code does not check indices: it would read and write outside the law's arrays.
     """
     if robot.drive is None or robot.reading is None:
         return None
@@ -83,7 +83,7 @@ def try_laws(robot: Robot) -> str | None:
 
 
 def all_plain(law: Callable[..., Any], seen: dict[int, laws.Law] | None = None) -> laws.Law:
-    """A law as plain Python, down to every compiled helper that it calls."""
+    """A law as plain Python, including every compiled helper that it calls."""
     seen = {} if seen is None else seen
     function = laws.plain(law)
     if not isinstance(function, FunctionType):

@@ -1,24 +1,25 @@
-"""The one runner of all studies: it finds what is done already, has an engine run the rest, and makes the report.
+"""The runner of all studies: it looks up the jobs that are already done, has an engine run the rest, and makes the report.
 
 A study is a list of jobs, each a pure function of its configuration (:mod:`~marlbc_mj.studies.protocol`).
 
 **Addresses.** A job's key is a hash of its configuration and of the code that runs it (:mod:`~marlbc_mj.studies.addresses`).
-Under one key there is one result, whoever computes it, where and when. So whether a job is done is one look-up, a longer study
-takes over the results of a shorter one, and a changed setting or source finds nothing instead of something wrong.
+A key has one result, no matter where, when and by which process it is computed. So one look-up tells whether a job is done, a
+longer study reuses the results of a shorter one, and after a change of a setting or of the code no outdated result is found.
 
-**Storage.** Each result is appended to a pack under its key (:mod:`~marlbc_mj.studies.packs`), a file for as many results as
-256 MiB hold. A record that is whole is the mark that its job is done. A torn one, of a process that was killed or a disk that was
-full, is cut off by the next run. Values are stored without pickle and come back bit for bit (:mod:`~marlbc_mj.studies.codec`).
-Large files of a job lie in a folder of its own until it ends, then get its key as their name in one rename. Only the process of
-the study writes packs, and it holds the lock of the folder: a second run is refused.
+**Storage.** Each result is appended under its key to a pack, a file of up to about 256 MiB (:mod:`~marlbc_mj.studies.packs`).
+A whole record marks its job as done. A torn record, left by a killed process or a full disk, is cut off by the next run. Values
+are stored without pickle and restored bit for bit (:mod:`~marlbc_mj.studies.codec`). A job's large files are in a temporary
+folder until it ends; then one rename gives the folder the job's key as its name. Only the study's process writes packs. It holds
+the lock of the folder, so a second run is refused.
 
-**The folder.** ``OUT/.jobs`` holds all this while a run has not ended (:mod:`~marlbc_mj.studies.store`). The report is made from
-all results in another folder, which replaces OUT in one rename; only then is the run finished and ``.jobs`` gone. What OUT held
-before, with ``--overwrite``, stays until then. So the same command, at any time, either goes on, or is told that OUT is finished.
+**The folder.** ``OUT/.jobs`` holds all this while a run is unfinished (:mod:`~marlbc_mj.studies.store`). The report is written
+from all results into another folder, which replaces OUT in one rename; only then is the run finished and ``.jobs`` removed. With
+``--overwrite``, the previous contents of OUT stay until then. So the same command either resumes the run or is refused because
+OUT is finished.
 
-**Engines** move work and keep nothing: processes of this machine, Ray's tasks, SLURM's arrays
-(:mod:`~marlbc_mj.studies.engines`). They yield results as they come, in any order; the report has them in the order of the jobs.
-An engine tries a job again whose worker died. A job that raises ends the study, after what runs beside it has been stored.
+**Engines** move work and store nothing: processes on this machine, Ray tasks, SLURM arrays (:mod:`~marlbc_mj.studies.engines`).
+They yield results in any order as jobs end; the report has them in the order of the jobs. An engine retries a job when its worker
+dies. A job that raises an error ends the study, after the jobs that run beside it have been stored.
 """
 
 from collections import Counter
@@ -38,7 +39,7 @@ from marlbc_mj.util.progress import Progress, note, silent
 
 
 class Conclusion(NamedTuple, Generic[ResultT]):
-    """Results and report of a study that ran to its end."""
+    """Results and report of a finished study."""
 
     results: list[ResultT]
     """One per job, in the order of the jobs."""
@@ -46,10 +47,10 @@ class Conclusion(NamedTuple, Generic[ResultT]):
 
 
 class Means(NamedTuple):
-    """Engine and workers; no result depends on them."""
+    """The engine and the number of workers; no result depends on them."""
 
     workers: int = 1
-    """Processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array."""
+    """Processes on this machine, CPUs of a Ray instance started for this study, or tasks of a SLURM array."""
     engine: str = "local"
     """A key of ENGINES."""
 
@@ -64,22 +65,22 @@ def run_study(
     progress: Progress = silent,
     ended: Callable[[JobT, ResultT], None] | None = None,
 ) -> Conclusion[ResultT]:
-    """Run all jobs that are not done, and write the report into ``out``, whole or not at all; None: nothing is written.
+    """Run all jobs that are not done, and write the report into ``out``, whole or not at all.
 
-    What is done is kept in ``out``, whatever stops this, and the same call goes on from there.
+    Finished jobs are kept in ``out`` whatever interrupts the run, and the same call resumes from there.
 
     Args:
-        study: whose jobs are run.
-        out: folder of the report.
-        overwrite: whether ``out`` may hold a finished report, which is replaced at the end, or results that are of no use here.
-        workers: processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array.
+        study: the study to run.
+        out: folder of the report; None: nothing is written.
+        overwrite: whether ``out`` may hold a finished report, which is replaced at the end, or results that cannot be used here.
+        workers: processes on this machine, CPUs of a Ray instance started for this study, or tasks of a SLURM array.
         engine: where jobs run, a key of ENGINES.
-        progress: called with what a job tells, where the engine passes that on, and with how many jobs are done.
-        ended: called with a job and its result as soon as it ends, also of those that were done.
+        progress: called with the progress of jobs, if the engine passes it on, and with the number of jobs done.
+        ended: called with each job and its result as soon as it ends, and with those that were already done.
 
     Raises:
-        ConfigurationError: a setting, ``out`` cannot be written or is in use, or the engine cannot be used.
-        SimulationError: of a job, or a worker died again and again.
+        ConfigurationError: an invalid setting, ``out`` cannot be written or is in use, or the engine cannot be used.
+        SimulationError: a job raised it, or a worker died too often.
     """
     if out is None:
         results = run_jobs(study, workers=workers, engine=engine, progress=progress, ended=ended)
@@ -112,20 +113,20 @@ def run_jobs(
     ended: Callable[[JobT, ResultT], None] | None = None,
     stop: StopRequest | None = None,
 ) -> list[ResultT]:
-    """Results of all jobs, in the order of the jobs; nothing is stored.
+    """Run all jobs and return their results, in the order of the jobs; nothing is stored.
 
     Args:
-        study: whose jobs are run.
+        study: the study to run.
         workers: see :func:`run_study`.
         engine: see :func:`run_study`.
         progress: see :func:`run_study`.
         ended: see :func:`run_study`.
-        stop: for jobs that save themselves: asked between them and, where a job asks, within; None: Ctrl-C interrupts at once.
+        stop: stop request for jobs that save their state, checked between jobs and by the jobs; None: Ctrl-C interrupts at once.
 
     Raises:
-        ConfigurationError: fewer than one worker, or of a job.
-        SimulationError: of a job, or a worker died again and again.
-        Stopped: ``stop`` was set; what had begun is saved.
+        ConfigurationError: fewer than one worker, or raised by a job.
+        SimulationError: raised by a job, or a worker died too often.
+        Stopped: ``stop`` was set; the state of jobs that had started is saved.
     """
     jobs = study.jobs()
     results = _Run(study, jobs, [""] * len(jobs), None, ended).results(Means(workers, engine), Ears(progress, stop))
@@ -135,7 +136,7 @@ def run_jobs(
 
 
 def counting(jobs: Sequence[JobT], stage: Callable[[JobT], str], progress: Progress) -> Callable[[JobT, object], None]:
-    """For ``ended``: tells after every job how many of the same ``stage`` are done, and how many there are."""
+    """A callback for ``ended`` that reports after every job how many jobs of its ``stage`` are done, and their total."""
     total, done = Counter(map(stage, jobs)), Counter[str]()
 
     def tell(job: JobT, _: object) -> None:
@@ -147,7 +148,7 @@ def counting(jobs: Sequence[JobT], stage: Callable[[JobT], str], progress: Progr
 
 
 class _Run(NamedTuple):
-    """The jobs of one study, their keys, and where results are kept."""
+    """The jobs of one study, their keys, and the store for results."""
 
     study: Study[Any, Any]
     jobs: Sequence[Any]
@@ -156,7 +157,7 @@ class _Run(NamedTuple):
     ended: Callable[[Any, Any], None] | None
 
     def results(self, means: Means, ears: Ears) -> list[Any]:
-        """Results in the order of the jobs; fewer where the study was stopped."""
+        """Results in the order of the jobs; fewer if the study was stopped."""
         engine = make_engine(means.engine, means.workers)
         found = {place: self.store.result(key) for place, key in self._found()} if self.store is not None else {}
         for place, result in found.items():
@@ -175,7 +176,7 @@ class _Run(NamedTuple):
         return [found[place] for place in sorted(found)]
 
     def _found(self) -> list[tuple[int, str]]:
-        """Places and keys of the jobs that are done."""
+        """Indices and keys of the jobs that are already done."""
         assert self.store is not None
         return [(place, key) for place, key in enumerate(self.keys) if key in self.store.kept]
 
@@ -185,7 +186,7 @@ class _Run(NamedTuple):
 
 
 class _Count:
-    """Tells how many jobs are done, and how often a worker died."""
+    """Reports how many jobs are done, and how often a worker died."""
 
     def __init__(self, total: int, done: int, progress: Progress) -> None:
         self.total, self.done, self.again, self.progress = total, done, 0, progress
@@ -197,16 +198,16 @@ class _Count:
         self.progress("jobs", self.done, self.total)
 
     def retried(self, reason: str) -> None:
-        """A worker died, and what it did is done again."""
+        """Report that a worker died and that its work is repeated."""
         self.again += 1
         note(f"{reason}; what it did is done again ({self.again} so far)")
 
 
 def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Path, overwrite: bool) -> None:
-    """Report which results of an unfinished run are used and which are not.
+    """Report which results of an unfinished run are reused, drop all if none can be, and describe this run in the store.
 
     Raises:
-        ConfigurationError: nothing of it is of use here, and it may not be removed.
+        ConfigurationError: none of the results can be used here, and they must not be removed without ``overwrite``.
     """
     before = store.about()
     wanted = set(keys)

@@ -1,7 +1,7 @@
-"""Safety and performance of supervisors on missions that they were not tuned for: families of missions under both compositions,
-shield on and off.
+"""Safety and performance of supervisors on missions that they were not tuned for: mission families under both compositions, with
+and without a shield.
 
-Of every layout few numbers are kept, see :mod:`marlbc_mj.results.layouts`.
+Only a few numbers are kept per layout, see :mod:`marlbc_mj.results.layouts`.
 """
 
 from collections.abc import Sequence
@@ -30,9 +30,9 @@ from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
 GROUNDS = ("field", "forest", "gates", "corridor", "traffic")
-"""Families with layouts to draw."""
+"""Mission families that draw layouts."""
 DRAG_DRAWS = {"paper-drag-0": (0.0, 0), "paper-drag-2": (2.0, 67), "paper-drag-5": (5.0, 134)}
-"""Draws around the case study: the factor of the drag and the first seed of each."""
+"""Draws around the case study: drag factor and first seed of each."""
 DRAWS_EACH = 67
 ORDER_GIVERS = (
     "fixed",
@@ -48,16 +48,16 @@ ORDER_GIVERS = (
     "marlms",
     "marlms-general",
 )
-"""Supervisors whose orders are composed, under either composition; the last one refuses all but the set-based one."""
+"""Supervisors that give orders, run under either composition; the last one supports the set-based composition only."""
 SEARCHES = ("mpcms", "rollout")
-"""Supervisors that take seconds a layout."""
+"""Supervisors that take seconds per layout."""
 LINES = "-lines"
-"""Ending of a team that comes to its column along the slots' lines."""
+"""Suffix of the name of a team that approaches its column along the lines of its slots."""
 FIRST_SEED = 80_000
 
 
 class SafetyJob(NamedTuple):
-    """The cells of one supervisor on some layouts of one mission, under one composition: they differ in the shield."""
+    """The cells of one supervisor on some layouts of one mission under one composition; they differ only in the shield."""
 
     cells: tuple[MissionCell, ...]
     controller: str
@@ -69,18 +69,18 @@ class SafetyStudy:
     """Every supervisor on every mission, under every composition, without a shield and with one.
 
     Raises:
-        ConfigurationError: no missions or supervisors, unknown ones, or numbers below 1.
+        ConfigurationError: an empty setting, an unknown name, or a number below 1.
     """
 
     missions: tuple[str, ...] = GROUNDS
-    """Scenarios that draw layouts, of which held-out ones are taken, or draws of :data:`DRAG_DRAWS`."""
+    """Scenarios that draw layouts, of which the held-out ones are used, or keys of :data:`DRAG_DRAWS`."""
     supervisors: tuple[str, ...] = (*ORDER_GIVERS, *VELOCITY_GIVERS)
     compositions: tuple[str, ...] = COMPOSITIONS
     shields: tuple[bool, ...] = (False, True)
     layouts: int = 1000
-    """Per cell; :data:`DRAG_DRAWS` have 67 each."""
+    """Layouts per cell; at most 67 for missions of :data:`DRAG_DRAWS`."""
     searched: int = 100
-    """Per cell of a supervisor that searches."""
+    """Layouts per cell of a supervisor of :data:`SEARCHES`, at most."""
     seed: int = FIRST_SEED
     controller: str = "sorlc"
 
@@ -100,7 +100,7 @@ class SafetyStudy:
             ground(mission)
 
     def cells(self) -> list[MissionCell]:
-        """All cells, mission by mission; a supervisor that gives velocities has one composition."""
+        """All cells, mission by mission; supervisors that give velocities run under their own composition only."""
         return [
             MissionCell(mission, composition, shield, supervisor)
             for mission in self.missions
@@ -127,7 +127,7 @@ class SafetyStudy:
         return seed_range(count, first)
 
     def run(self, job: SafetyJob, watch: Watch) -> tuple[Marks, ...]:
-        """Marks of every cell. A shield that changes nothing is as good as none, to the bit: such a layout is flown once."""
+        """Marks of every cell. A run in which the shield never acts is identical to one without it, so its layout runs once."""
         first = job.cells[0]
         alone = fly_cell(first, job.controller, job.seeds[:1], silent)[0]
         decision_ms = np.nan if alone.metrics is None else float(alone.metrics["team"]["decision_ms_median"])
@@ -155,7 +155,7 @@ class SafetyStudy:
 
 
 def fly_cell(cell: MissionCell, controller: str, seeds: Sequence[int], progress: Progress) -> tuple[SeedRun, ...]:
-    """Some layouts of a cell; none where there are no seeds."""
+    """Run the layouts of a cell with these seeds; no runs for no seeds."""
     if not seeds:
         return ()
     label = " ".join((cell.mission, cell.composition, "shielded" if cell.shield else "free", display_name(cell.supervisor)))
@@ -171,9 +171,9 @@ def fly_cell(cell: MissionCell, controller: str, seeds: Sequence[int], progress:
 
 
 def ground(name: str) -> Scenario:
-    """The scenario of a mission: held-out layouts of a family, ``gates``, or of a family with a team, ``gates-grid-9``, see
-    :mod:`marlbc_mj.scenarios.teams`; or draws around the case study. A team whose name ends in ``-lines`` comes to its column
-    along the slots' lines.
+    """The scenario of a mission: held-out layouts of a family (``gates``) or of a family with a team (``gates-grid-9``, see
+    :mod:`marlbc_mj.scenarios.teams`), or draws around the case study. A team with the suffix ``-lines`` approaches its column
+    along the lines of its slots.
 
     Raises:
         ConfigurationError: an unknown scenario or team, or a scenario that draws no layouts.

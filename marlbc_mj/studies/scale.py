@@ -1,9 +1,9 @@
 """Cost of teams from 4 to 256 agents: time per agent and mission step, and memory of a world.
 
-Every size runs the same mission: a grid formation among discs, as many per agent at every size, each agent under OA>AA>FM, so
-that every mission step asks for the nearest obstacle and the nearest neighbor of everybody. Sizes take turns within one process,
-so ratios hold on a machine that is not quiet. Small teams are batched until a burst holds as many agents as the largest, so that
-a figure is that of the loop, not of its call.
+Every size runs the same mission: a grid formation among discs, with the same number of discs per agent. All agents are under
+OA>AA>FM, so every mission step looks up the nearest obstacle and the nearest neighbor of every agent. Sizes take turns within one
+process, so that ratios are reliable on a machine with other load. Small teams are batched to as many agents as the largest team,
+so that the time measured is that of the loop, not of the call.
 """
 
 import gc
@@ -37,19 +37,19 @@ SIZES = (4, 8, 16, 32, 64, 128, 256)
 SCALED_SUPERVISORS = ("fsams", "fms", "layered")
 DISCS = 1  # per agent
 AGENT_STEPS = 2560  # agents x mission steps in one burst
-MEMORY_AGENTS = 2048  # agents in all worlds together whose memory is measured
-LEAST_WORLDS = 64  # so that what a plan leaves behind is small beside them
+MEMORY_AGENTS = 2048  # total number of agents of the worlds whose memory is measured
+LEAST_WORLDS = 64  # enough to make leftover memory of plans negligible
 
 
 def mission(agents: int) -> Scenario:
-    """A grid of agents on a way with one disc per agent, dense enough that queries matter at every size."""
+    """A grid of agents on a route with one disc per agent, dense enough that nearest-thing queries matter at every size."""
     length = float(30.0 + 12.0 * np.ceil(np.sqrt(agents)))
     discs = Field(obstacles=DISCS * agents, radius=(0.3, 0.6), gap=2.5)
     return discs.build(name=f"scale-{agents}", agents=agents, formation="grid", length=length)
 
 
 class SizedTeams:
-    """Worlds of one size, all agents under OA>AA>FM."""
+    """Worlds of one team size, with all agents under OA>AA>FM."""
 
     def __init__(self, agents: int) -> None:
         self.scenario = mission(agents)
@@ -61,20 +61,20 @@ class SizedTeams:
         self.memories = {name: supervisor.start(self.scenario, 1) for name, supervisor in self.supervisors.items()}
 
     def advance(self) -> None:
-        """One burst; a finished mission starts again."""
+        """Run one burst of mission steps; a finished mission starts again."""
         for _ in range(self.steps):
             if self.world.state.steps[0] >= self.scenario.mission_steps:
                 self.world.reset()
             self.world.advance(self.orders)
 
     def decide(self, name: str) -> None:
-        """One decision of a supervisor for one team, in the state where it is."""
+        """Make one decision of a supervisor for one team, in its current state."""
         seen = Observation(*(field[:1] for field in self.world.observe()))
         _, self.memories[name] = self.supervisors[name].decide(seen, self.memories[name])
 
 
 class ScaleJob(NamedTuple):
-    """One kind of figure, for every size."""
+    """One group of measurements, at every team size."""
 
     part: str  # a key of SCALE_PARTS
     rounds: int
@@ -82,7 +82,7 @@ class ScaleJob(NamedTuple):
 
 @dataclass(frozen=True)
 class ScaleStudy:
-    """All figures of ``marlbc scale``. Its jobs must have the machine to themselves: one after the other.
+    """All figures of ``marlbc scale``. Each job needs the machine to itself, so they must run one after another.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
@@ -100,11 +100,11 @@ class ScaleStudy:
         return SCALE_PARTS[job.part](job.rounds, watch.progress)
 
     def describe(self, job: ScaleJob) -> tuple[ScaleJob, str]:
-        """A figure is one of this processor."""
+        """The job and the processor, since figures are valid for this processor only."""
         return job, cpu()
 
     def gather(self, results: Sequence[dict[str, Any]]) -> dict[str, Any]:
-        """The figures of all jobs as the file has them."""
+        """The figures of all jobs, merged as in the output file."""
         return {**{name: value for result in results for name, value in result.items()}, "rounds": self.rounds}
 
     def report(self, results: Sequence[dict[str, Any]], out: Path | None, progress: Progress = silent) -> Report:
@@ -117,7 +117,7 @@ class ScaleStudy:
 def run_scale(
     rounds: int, out: Path | None, *, overwrite: bool = False, progress: Progress = silent
 ) -> Conclusion[dict[str, Any]]:
-    """Measure all figures; leaves scale.md, scale.json and figures/scale.{pdf,png} in ``out``.
+    """Measure all figures; writes scale.md, scale.json and figures/scale.{pdf,png} into ``out``.
 
     Raises:
         ConfigurationError: fewer than 5 rounds, or ``out`` cannot be written.
@@ -126,7 +126,7 @@ def run_scale(
 
 
 def measure_times(rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Time of mission steps and decisions: medians over ``rounds``, growth as the median of per-round ratios."""
+    """Times of mission steps and decisions: medians over ``rounds``; growth is the median of per-round ratios."""
     progress("missions from 4 to 256 agents", 0, 2)
     teams = {agents: SizedTeams(agents) for agents in SIZES}
     taken = interleaved({agents: team.advance for agents, team in teams.items()}, rounds)
@@ -146,7 +146,7 @@ def measure_times(rounds: int, progress: Progress = silent) -> dict[str, Any]:
 
 
 def measure_memory(rounds: int, progress: Progress = silent) -> dict[str, Any]:
-    """Memory of a world and per agent [KiB]; measured once, whatever ``rounds`` says."""
+    """Memory per world and per agent [KiB]; measured once, ``rounds`` is ignored."""
     progress("memory", 0, 1)
     memory = {agents: _memory(agents) for agents in SIZES}
     return {
@@ -156,7 +156,7 @@ def measure_memory(rounds: int, progress: Progress = silent) -> dict[str, Any]:
 
 
 SCALE_PARTS: dict[str, Callable[[int, Progress], dict[str, Any]]] = {"times": measure_times, "memory": measure_memory}
-"""What is measured, in this order."""
+"""The measurements, in the order in which they run."""
 
 
 _MEMORY = """
@@ -180,7 +180,7 @@ print((resident() - middle - (middle - before)) / worlds)
 
 
 def _memory(agents: int) -> float:
-    """Resident memory [bytes] of one more world of so many agents, its plan not counted, in a process of its own."""
+    """Resident memory added by one more world of this team size, without its plan, measured in a separate process [bytes]."""
     worlds = max(LEAST_WORLDS, MEMORY_AGENTS // agents)
     run = subprocess.run([sys.executable, "-c", _MEMORY, str(agents), str(worlds)], capture_output=True, text=True, check=True)
     return float(run.stdout)
@@ -194,7 +194,7 @@ def resident() -> int:
 
 
 def scale_table(figures: dict[str, Any]) -> Table:
-    """One row per size."""
+    """The figures as a table with one row per team size."""
     columns = (
         Column("", "agents"),
         Column("mission step", "µs per agent"),
@@ -217,7 +217,7 @@ def scale_table(figures: dict[str, Any]) -> Table:
 
 
 def write_scale(figures: dict[str, Any], folder: Path) -> None:
-    """scale.md, scale.json and figures/scale.{pdf,png}."""
+    """Write scale.md, scale.json and figures/scale.{pdf,png}."""
     (folder / "scale.md").write_text(to_markdown(scale_table(figures)), encoding="utf-8")
     write_json(folder / "scale.json", {**figures, **provenance()})
     (folder / "figures").mkdir()
@@ -228,7 +228,7 @@ def write_scale(figures: dict[str, Any], folder: Path) -> None:
 
 
 def _figure(figures: dict[str, Any]) -> Any:
-    """Time and memory per agent over team size."""
+    """Plots of the time per agent and the memory of a world over team size."""
     figure, panels = pl.panels(pl.DOUBLE, 2.2, 1, 2, pl.Margins(across=0.75))
     times, memory = panels[0]
     sizes = list(SIZES)

@@ -1,10 +1,10 @@
-"""Time cost of shield and set-based composition: ratios of a mission step at 4, 16 and 64 agents, in turns in one process.
+"""Time cost of the shield and of the set-based composition: ratios of a mission step's time at 4, 16 and 64 agents.
 
-``python -m marlbc_mj.studies.shield_cost [ROUNDS]``. Every agent flies OA>AA>FM in a grid formation among as many discs. *Far*
-has no obstacle and a formation so wide that nothing is ever within reach: what the shield's early exit costs. A team with a
-shield flies elsewhere than one without, where a mission step may cost another time: so the last ratios are those of mission steps
-that begin in the same states, from all over a mission with a shield. Times are those of the processor, on one thread, so that
-other programs change them little.
+Run ``python -m marlbc_mj.studies.shield_cost [ROUNDS]``. All agents are under OA>AA>FM in a grid formation among one disc per
+agent, and variants take turns in one process. *Far* has no obstacles and a formation so wide that nothing is ever within reach,
+which isolates the cost of the shield's early exit. A team with a shield takes another path than one without, on which a mission
+step may take a different time. So the last ratios compare mission steps from the same states, sampled over a mission with a
+shield. Times are processor times on one thread, so that other programs affect them little.
 """
 
 import sys
@@ -24,16 +24,16 @@ from marlbc_mj.studies.timing import check_rounds, interleaved, ratio
 
 COST_SIZES = (4, 16, 64)
 BURST_AGENT_STEPS = 4096  # agents x mission steps in one burst
-STATES_APART = 20  # mission steps between two states that both begin in
-STEPS_EACH = 4  # mission steps from each state
-REPEATS = 5  # of which the fastest counts
+STATES_APART = 20  # mission steps between two states that both teams start from
+STEPS_EACH = 4  # mission steps timed from each state
+REPEATS = 5  # runs from each state; the fastest counts
 COST_VARIANTS = {
     "plain": ("null-space", False),
     "shield": ("null-space", True),
     "set-based": ("set-based", False),
     "set-based, shield": ("set-based", True),
 }
-"""Composition, and whether there is a shield."""
+"""The composition, and whether there is a shield, of each variant."""
 
 
 class CostTeam:
@@ -46,26 +46,26 @@ class CostTeam:
         self.steps = max(1, BURST_AGENT_STEPS // (self.world.worlds * agents))
 
     def advance(self, steps: int | None = None) -> None:
-        """Mission steps, or one burst."""
+        """Run ``steps`` mission steps; one burst by default."""
         for _ in range(self.steps if steps is None else steps):
             if self.world.state.steps[0] >= self.world.scenario.mission_steps:
                 self.world.reset()
             self.world.advance(self.orders)
 
     def changed(self) -> float:
-        """Share of agent substeps that the shield has changed since the mission began."""
+        """Share of agent substeps in which the shield has changed a force since the mission began."""
         state, substeps = self.world.state, self.world.scenario.substeps
         total = state.interventions.size * max(1, int(state.steps[0])) * substeps
         return float(state.interventions.sum() / total) if total else 0.0
 
 
 def far_mission(agents: int) -> Scenario:
-    """Nothing is ever near: no obstacle, and slots 60 m apart."""
+    """A mission in which nothing is ever near: no obstacles, and slots 60 m apart."""
     return make_scenario("open", agents=agents, formation="grid", spacing=60.0, column_spacing=60.0, agent_distance=2.5)
 
 
 def ratio_on_same_states(scenario: Scenario) -> float:
-    """Time of a mission step with a shield, divided by that without one, over states along a mission with a shield."""
+    """Ratio of a mission step's time with a shield to that without, from the same states along a mission with a shield."""
     shielded, free = CostTeam(scenario, True), CostTeam(scenario, False)
     least: dict[CostTeam, float] = {shielded: 0.0, free: 0.0}
     for _ in range(0, scenario.mission_steps - max(STATES_APART, STEPS_EACH), STATES_APART):
@@ -85,13 +85,13 @@ def ratio_on_same_states(scenario: Scenario) -> float:
 
 
 def put_in_state(world: World, state: Mapping[str, np.ndarray]) -> None:
-    """Restore a snapshot, but for what the world has no room for: the counts of a shield that it lacks."""
+    """Restore a snapshot, except entries of another shape: the shield counts of a world without a shield."""
     own = world.snapshot()
     world.restore({name: state[name] if state[name].shape == own[name].shape else own[name] for name in own})
 
 
 def measure_costs(rounds: int, sizes: tuple[int, ...] = COST_SIZES) -> dict[int, dict[str, Any]]:
-    """By size: ratios to the plain mission step, its time [us] per agent, and the share of substeps that shields changed.
+    """By team size: ratios to the plain mission step, its time per agent [us], and the share of substeps that the shield changed.
 
     Raises:
         ConfigurationError: fewer than 5 rounds.
@@ -120,7 +120,7 @@ def measure_costs(rounds: int, sizes: tuple[int, ...] = COST_SIZES) -> dict[int,
 
 
 def report_costs() -> None:
-    """Print the ratios."""
+    """Print the ratios for every team size."""
     costs = measure_costs(int(sys.argv[1]) if len(sys.argv) > 1 else 15)
     for agents, cost in costs.items():
         ratios = ", ".join(f"{name} {value:.3f}" for name, value in cost["ratios"].items())

@@ -1,9 +1,9 @@
-"""How much of what could be safe does the safe set S leave out? S against the viability kernel of (d, c) on a grid.
+"""How conservative is the safe set S? Its share of the viability kernel of (d, c), computed on a grid.
 
-d is the clearance from a wall and c the closing speed: d' = -c, c' = -(u + f) / m with |u| <= U chosen well and |f| <= B(|c|)
-chosen badly. The kernel is where d >= 0 can be kept for ever: V >= 0 for the value of Hamilton, Jacobi and Isaacs, V = min(d,
-max_u min_f V(next)), iterated on the grid until it rests. ``python -m marlbc_mj.studies.shield_kernel`` prints the share of the
-kernel that S is.
+d is the clearance from a wall and c the closing speed: d' = -c, c' = -(u + f) / m, with the best |u| <= U and the worst
+|f| <= B(|c|). The kernel is the set from which d >= 0 can be kept forever: V >= 0 for the Hamilton-Jacobi-Isaacs value V = min(d,
+max_u min_f V(next)), iterated on the grid until it converges. ``python -m marlbc_mj.studies.shield_kernel`` prints the share of
+the kernel that S covers.
 """
 
 from typing import NamedTuple
@@ -12,15 +12,15 @@ import numpy as np
 
 from marlbc_mj.core.stopping import ForceBound, ShieldNumbers, braking, stopping_distance
 
-PUSHES = (-1.0, 0.0, 1.0)  # of u and of f, in parts of their limits
+PUSHES = (-1.0, 0.0, 1.0)  # values of u and f tried, as fractions of their limits
 
 
 class KernelShares(NamedTuple):
-    """Of the states of a grid, on which V rests after ``rounds``."""
+    """Comparison of S with the kernel on the nodes of a grid."""
 
     kernel: int  # nodes with V >= 0
     safe: int  # nodes in S
-    outside: int  # nodes in S whose V is below minus one cell
+    outside: int  # nodes in S with V < -(one cell of d)
     worst: float  # least V in S [m]
     share: float  # safe / kernel
 
@@ -39,7 +39,7 @@ def kernel_shares(bound: ForceBound, fastest: float = 14.0, deepest: float = 1.5
 
 
 def rest_value(numbers: ShieldNumbers, bound: ForceBound, d: np.ndarray, c: np.ndarray, step: float) -> np.ndarray:
-    """V on the grid d x c, by iteration with steps of ``step`` [s]; linear between nodes, d itself beyond the deepest."""
+    """V on the grid d x c, iterated to convergence with time steps of ``step`` [s]; interpolated linearly between nodes."""
     pull = np.array([bound.at(abs(each)) for each in c.tolist()]) / numbers.mass
     value, before = np.repeat(d[:, None], len(c), axis=1), None
     while before is None or np.abs(value - before).max() > 1e-9:
@@ -56,7 +56,7 @@ def rest_value(numbers: ShieldNumbers, bound: ForceBound, d: np.ndarray, c: np.n
 
 
 def _interpolated(value: np.ndarray, d: np.ndarray, c: np.ndarray, depth: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """V at ``depth`` (D, C) and ``speed`` (C,); below d = 0 it is the depth itself, which is lost already."""
+    """V at ``depth`` (D, C) and ``speed`` (C,), clipped to the grid; below d = 0, which is already unsafe, at most the depth."""
     x = np.clip((speed - c[0]) / (c[1] - c[0]), 0.0, len(c) - 1.0)
     y = np.clip((depth - d[0]) / (d[1] - d[0]), 0.0, len(d) - 1.0)
     i, j = np.minimum(x.astype(int), len(c) - 2), np.minimum(y.astype(int), len(d) - 2)
@@ -68,7 +68,7 @@ def _interpolated(value: np.ndarray, d: np.ndarray, c: np.ndarray, depth: np.nda
 
 
 def exact_share(bound: ForceBound, fastest: float = 14.0, deepest: float = 1.5, points: int = 4001) -> float:
-    """The same share in closed form: to brake is best, so the kernel is d >= the integral of c / a_b(c) from 0."""
+    """The same share in closed form: braking is optimal, so the kernel is d >= integral of c / a_b(c) from 0 to c."""
     numbers = ShieldNumbers(200.0, 200.0, 1.0, *bound, np.inf, 0.0, 0.0, 0.0)
     c = np.linspace(0.0, fastest, points)
     rates = c / np.array([braking(numbers, each) for each in c.tolist()])
@@ -80,7 +80,7 @@ def exact_share(bound: ForceBound, fastest: float = 14.0, deepest: float = 1.5, 
 
 
 def report_kernel() -> None:
-    """Print the shares for some disturbances."""
+    """Print the shares for several disturbances."""
     drag = float(np.sqrt(2.0))
     bounds = {"none": ForceBound(), "drag x 1": ForceBound(linear=drag), "drag x 5": ForceBound(linear=5 * drag)}
     for name, bound in {**bounds, "wind of 20 N": ForceBound(20.0, 1.0)}.items():

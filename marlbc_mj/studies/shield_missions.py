@@ -1,9 +1,10 @@
-"""Does a shield ever fail in a mission? Many missions of every family and size, under hostile supervisors.
+"""Does a shield ever fail in a mission? Many missions of every family and team size, under hostile supervisors.
 
 ``python -m marlbc_mj.studies.shield_missions [--missions N] [--seconds S] [--agents 2,4,8] [--families field,forest] [--seed K]``
-draws layouts that no training seed draws. In every other mission all agents are sent against an obstacle or another agent at
-15 m/s; in the others orders are drawn at random, agent by agent. A mission fails if a clearance is at the safe distance or below,
-or two agents touch, at any substep. Where obstacles move nothing is guaranteed: those missions are counted apart.
+draws layouts that are never used in training. Batches of 16 missions alternate: in the first, third and so on, every agent is
+sent against an obstacle or another agent at 15 m/s; in the others every agent gets random orders. A mission fails if, at any
+substep, a clearance is at most the safe distance or two agents touch. With moving obstacles nothing is guaranteed; those missions
+are counted separately.
 """
 
 import argparse
@@ -25,9 +26,9 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import FAMILIES, Scenario, held_out, make_scenario
 from marlbc_mj.util.errors import ConfigurationError
 
-ATTACK_SPEED = 15.0  # of references that attack [m/s]
-CHANGE = 20  # mission steps between two changes of mind
-TOGETHER = 16  # missions that run together
+ATTACK_SPEED = 15.0  # reference speed of agents that attack [m/s]
+CHANGE = 20  # mission steps between two draws of orders and targets
+TOGETHER = 16  # missions simulated together
 CONFIDENCE = 3.0  # no failure in n missions bounds the rate by 3 / n at 95 %
 
 
@@ -36,20 +37,20 @@ class ShieldedMission:
     """Outcomes of the missions of one family and size."""
 
     missions: int = 0
-    violations: int = 0  # missions
-    touches: int = 0  # missions
-    interventions: float = 0.0  # agent substeps
-    substeps: float = 0.0  # agent substeps in all
+    violations: int = 0  # missions with a violation
+    touches: int = 0  # missions in which agents touched, but without a violation
+    interventions: float = 0.0  # agent substeps that the shield changed
+    substeps: float = 0.0  # agent substeps in total
     breaches: Any = 0.0  # (A,) agent substeps in which an assumption did not hold
 
     @property
     def failed(self) -> int:
-        """Missions with a violation or a touch, at most."""
+        """Number of missions with a violation or a touch."""
         return self.violations + self.touches
 
 
 def hostile_velocities(world: World, targets: np.ndarray) -> np.ndarray:
-    """(B, N, 2) towards obstacles or, beyond those, towards other agents: ``targets`` (B, N)."""
+    """(B, N, 2) velocities [m/s] towards ``targets`` (B, N): indices of obstacles, then of agents."""
     at, obstacles = world.state.position, world.state.obstacles[:, :, :2]
     ends = np.concatenate([obstacles, at], axis=1)
     way = np.take_along_axis(ends, targets[..., None], axis=1) - at
@@ -57,7 +58,7 @@ def hostile_velocities(world: World, targets: np.ndarray) -> np.ndarray:
 
 
 def run_missions(scenario: Scenario, missions: int, seed: int, shield: Shield | bool | None = True) -> ShieldedMission:
-    """Missions of one scenario, each with its own draw; half of them attack, the others have orders at random."""
+    """Run missions of one scenario, each with its own draw; batches alternate between attacks and random orders."""
     cell, rng = ShieldedMission(breaches=np.zeros(len(ASSUMPTIONS))), np.random.default_rng(seed)
     for first in range(0, missions, TOGETHER):
         worlds = min(TOGETHER, missions - first)
@@ -77,7 +78,7 @@ def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Shiel
         for _ in range(min(CHANGE, scenario.mission_steps - first)):
             velocity = hostile_velocities(world, targets) if attack else None
             if attack:
-                world.state.reference[:] = world.state.position  # no memory of where it could not go
+                world.state.reference[:] = world.state.position  # forget a reference that the agent could not follow
             record = world.step(orders, velocity).record
             assert record is not None
             at += [record.position[:, 1:], world.state.position[:, None].copy()]
@@ -94,7 +95,7 @@ def _run_batch(world: World, rng: np.random.Generator, attack: bool, cell: Shiel
 
 
 def _violations(world: World, first: int, at: np.ndarray) -> np.ndarray:
-    """(B,) whether anyone was too near to an obstacle ``at`` (B, T, N, 2), after each substep from mission step ``first`` on."""
+    """(B,) whether any agent was too near to an obstacle at positions ``at`` (B, T, N, 2), one per substep from ``first`` on."""
     scenario, state = world.scenario, world.state
     times = first * scenario.mission_step + (1 + np.arange(at.shape[1])) * scenario.substep
     found = np.zeros(len(at), dtype=bool)
@@ -108,7 +109,7 @@ def _violations(world: World, first: int, at: np.ndarray) -> np.ndarray:
 
 
 def mission_of(family: str, agents: int, seconds: float) -> Scenario:
-    """A mission of a family, its layouts held out where it draws any, of at most ``seconds``."""
+    """A mission of a family that lasts at most ``seconds``, on held-out layouts if the family draws layouts."""
     scenario = make_scenario(family, agents=agents, formation="circle" if family == "exchange" else "grid")
     if scenario.layout is not None:
         scenario = held_out(scenario)
@@ -117,7 +118,7 @@ def mission_of(family: str, agents: int, seconds: float) -> Scenario:
 
 
 def report_missions(arguments: Sequence[str] | None = None) -> None:
-    """Print a row per family and size, and what all together say."""
+    """Print a row per family and size, and a bound of the failure rate from all missions with obstacles at rest."""
     parser = argparse.ArgumentParser(description="Missions with a shield, under hostile supervisors.")
     parser.add_argument("--missions", type=int, default=64)
     parser.add_argument("--seconds", type=float, default=1e9)

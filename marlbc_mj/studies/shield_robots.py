@@ -1,7 +1,7 @@
-"""What a shield may assume of a robot: how it answers forces within a substep, and how far it is from its reference.
+"""What a shield may assume about a robot: its response to forces within a substep, and its distance from its reference.
 
-``python -m marlbc_mj.studies.shield_robots ROBOT... [--steps N]`` drives four of each with random forces and with references that
-go as far as their limits allow, and prints the greatest numbers seen. They are measured, not proved.
+``python -m marlbc_mj.studies.shield_robots ROBOT... [--steps N]`` drives four of each with random references up to their limits,
+and prints the greatest values seen. They are measured, not proved.
 """
 
 import sys
@@ -16,19 +16,19 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Scenario, make_scenario
 
-LAG_WINDOW = 8  # substeps over which a lag is told from a lasting error
+LAG_WINDOW = 8  # substeps over which a lag is distinguished from a lasting error
 
 
 class ForceAnswer(NamedTuple):
-    """m (v+ - v) / h - u of all substeps, friction against the motion left out."""
+    """The force error m (v+ - v) / h - u over all substeps, without friction against the motion."""
 
-    worst: float  # in one substep [N]
-    lasting: float  # mean over LAG_WINDOW substeps [N]
-    slip: float  # greatest sum over up to LAG_WINDOW substeps beyond what lasts, as a velocity [m/s]
+    worst: float  # greatest in one substep [N]
+    lasting: float  # greatest mean over LAG_WINDOW substeps [N]
+    slip: float  # half the greatest sum over at most LAG_WINDOW substeps in excess of ``lasting``, as a velocity [m/s]
 
 
 def alone(robot: str) -> Scenario:
-    """Four of a robot far from each other and from everything."""
+    """A mission of one kind of robot, with the robots far from each other and no obstacles."""
     unit = make_robot(robot).length
     scenario = make_scenario("robot_gate", robot=robot)
     starts = tuple((200.0 * unit * k, 0.0) for k in range(scenario.agents))
@@ -36,7 +36,7 @@ def alone(robot: str) -> Scenario:
 
 
 def force_answer(robot: str, friction: float, steps: int, seed: int = 0) -> ForceAnswer:
-    """Random references within a robot's limits, as a supervisor of velocities gives them, and full braking in between."""
+    """Measure the force error under random reference velocities within a robot's limits, stops and reversals included."""
     scenario = alone(robot)
     world = World(scenario, PD(*make_robot(robot).gains), record=True)
     rng, mass, h = np.random.default_rng(seed), scenario.mass, scenario.substep
@@ -52,7 +52,7 @@ def force_answer(robot: str, friction: float, steps: int, seed: int = 0) -> Forc
     speed = np.maximum(np.linalg.norm(after, axis=-1, keepdims=True), 1e-12)
     taken = np.clip(-(error * after).sum(axis=-1, keepdims=True) / speed, 0.0, friction)
     error += taken * after / speed
-    error = error[200:]  # the robot has come to rest on the ground by then
+    error = error[200:]  # by then the robot has settled on the ground
     sums = np.cumsum(np.concatenate([np.zeros((1, *error.shape[1:])), error]), axis=0)
     mean = np.linalg.norm(sums[LAG_WINDOW:] - sums[:-LAG_WINDOW], axis=-1) / LAG_WINDOW
     worst, lasting = float(np.linalg.norm(error, axis=-1).max()), float(mean.max())
@@ -61,7 +61,7 @@ def force_answer(robot: str, friction: float, steps: int, seed: int = 0) -> Forc
 
 
 def random_velocities(scenario: Scenario, steps: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
-    """(N, 2) for every mission step: full speed somewhere, stops and reversals, changed now and then."""
+    """(N, 2) velocities for every mission step, redrawn every 15 steps: random directions at full, half or zero speed."""
     velocity = np.zeros((scenario.agents, 2))
     for step in range(steps):
         if step % 15 == 0:
@@ -84,7 +84,7 @@ def tube_of(robot: str, controller: Controller, steps: int, seed: int = 0) -> fl
 
 
 def report_robots() -> None:
-    """Print what was measured."""
+    """Print the measurements of the robots named on the command line."""
     steps = 2000
     names = [name for name in sys.argv[1:] if not name.startswith("--")]
     if "--steps" in sys.argv:

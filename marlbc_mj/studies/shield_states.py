@@ -1,6 +1,7 @@
 """Does any force lead out of the shield's safe set? Random states on its edge, hostile forces, and f in the worst direction.
 
-``python -m marlbc_mj.studies.shield_states [STATES]`` tries 10^7 states by default, and two shields that are wrong on purpose.
+``python -m marlbc_mj.studies.shield_states [STATES]`` tries 10^7 states by default for each of several shields, of which three
+are wrong on purpose.
 """
 
 import sys
@@ -29,22 +30,22 @@ ASSUMED = len(ASSUMPTIONS)
 
 
 class Trial(NamedTuple):
-    """A plant, and what its shield believes of it."""
+    """A plant, and what its shield believes about it."""
 
     bound: ForceBound  # of f
     speed_cap: float  # [m/s]
     force_limit: float = 200.0  # [N]
     mass: float = 1.0  # [kg]
     substep: float = 0.005  # [s]
-    things: int = 1  # obstacles and neighbors that press at once, at most
-    obstacle_speed: float = 0.0  # of obstacles that move, at most; 0: they are at rest [m/s]
-    obstacle_acceleration: float = 0.0  # of those [m/s^2]
-    believed_acceleration: float | None = None  # None: theirs itself [m/s^2]
-    believed: ForceBound | None = None  # None: the bound itself
-    believed_force: float | None = None  # None: the limit itself [N]
+    things: int = 1  # most obstacles and neighbors that press at once
+    obstacle_speed: float = 0.0  # greatest speed of obstacles; 0: they are at rest [m/s]
+    obstacle_acceleration: float = 0.0  # greatest acceleration of moving obstacles [m/s^2]
+    believed_acceleration: float | None = None  # what the shield believes it is; None: the true one [m/s^2]
+    believed: ForceBound | None = None  # what the shield believes the bound is; None: the true one
+    believed_force: float | None = None  # what the shield believes the limit is; None: the true one [N]
 
     def numbers(self) -> ShieldNumbers:
-        """The shield's: it keeps 0.5 m from obstacles and 1 m between agents."""
+        """The numbers of the shield, which keeps 0.5 m from obstacles and 1 m between agents."""
         believed = self.bound if self.believed is None else self.believed
         force = self.force_limit if self.believed_force is None else self.believed_force
         acceleration = self.obstacle_acceleration if self.believed_acceleration is None else self.believed_acceleration
@@ -52,14 +53,14 @@ class Trial(NamedTuple):
         return numbers._replace(obstacle_speed=self.obstacle_speed, obstacle_acceleration=acceleration)
 
     def truth(self) -> ShieldNumbers:
-        """The plant's."""
+        """The same numbers with the true values of the plant."""
         return self._replace(believed=None, believed_force=None, believed_acceleration=None).numbers()
 
 
 def leave_rate(trial: Trial, states: int, seed: int = 0) -> float:
-    """Share of random states on the edge of S that one substep leads out of it.
+    """Share of random states on the edge of S from which one substep leads out of it.
 
-    With several things the :func:`drift` of a retreat is let pass, which the margin of a shield leaves room for.
+    With several things, the :func:`retreat_drift` is tolerated, for which a shield's margin leaves room.
     """
     return float(_leave_rate(trial.numbers(), trial.truth(), trial.substep, trial.things, states, np.random.default_rng(seed)))
 
@@ -94,7 +95,7 @@ def _leave_rate(numbers, truth, h, things, states, rng):
 
 @compiled
 def _draw_state(rng, numbers, h, things, view):
-    """Two agents and obstacles, all with a gap that is 0 or small: the edge of S. Speeds of every size."""
+    """Draw two agents and obstacles with gaps that are 0 or small, so that the state is on the edge of S. Speeds vary widely."""
     for i in range(2):
         speed = min(numbers.speed_cap * rng.random() ** rng.integers(1, 5), numbers.speed_cap)
         if rng.random() < 0.1:
@@ -120,7 +121,7 @@ def _draw_state(rng, numbers, h, things, view):
 
 @compiled
 def _place(rng, out, view, far, least):
-    """A place at the distance ``least`` from the first agent, which is at the origin, or a little more; or ``far``."""
+    """Put ``out`` at distance ``least`` or slightly more from the first agent, at the origin; at ``far`` if that is positive."""
     view.p[0, 0] = view.p[0, 1] = 0.0
     gap = 0.0 if rng.random() < 0.5 else 0.1 * rng.random() ** 4
     distance = far if far > 0.0 else least + gap
@@ -132,7 +133,7 @@ def _place(rng, out, view, far, least):
 
 @compiled
 def _move_obstacles(rng, truth, h, obstacles):
-    """Obstacles go on for a substep, and change their velocity as fast as they may, no faster than they may be."""
+    """Move obstacles for a substep at their greatest acceleration in a random direction, or at none if they would be too fast."""
     for k in range(obstacles.shape[0]):
         angle, change = 2.0 * np.pi * rng.random(), truth.obstacle_acceleration
         x, y = change * np.cos(angle), change * np.sin(angle)
@@ -146,7 +147,7 @@ def _move_obstacles(rng, truth, h, obstacles):
 
 @compiled
 def _draw_wish(rng, numbers, view, i, force):
-    """A force of any size up to twice the limit, often straight at a thing."""
+    """Draw a force of up to twice the limit, often straight at a thing."""
     size, angle = 2.0 * numbers.force_limit * rng.random(), 2.0 * np.pi * rng.random()
     k = rng.integers(0, view.obstacles.shape[0] + 2)
     force[0], force[1] = size * np.cos(angle), size * np.sin(angle)
@@ -157,7 +158,7 @@ def _draw_wish(rng, numbers, view, i, force):
 
 @compiled
 def _push(rng, numbers, truth, view, i, force):
-    """v+ of agent ``i``: actuators are as weak as they are, and f is at its bound, where it hurts most, or anywhere."""
+    """Set v+ of agent ``i``: the force is scaled to the true limit, and f is at its bound in the worst or a random direction."""
     per = view.h / truth.mass
     for axis in range(2):
         force[axis] *= truth.force_limit / numbers.force_limit
@@ -192,7 +193,7 @@ def _is_outside(numbers, view, allowed):
 
 
 def report_states() -> None:
-    """Print how many states were left, for the shield and for two wrong ones."""
+    """Print the share of states that leave S, for correct shields and for three wrong ones."""
     states = int(float(sys.argv[1])) if len(sys.argv) > 1 else 10_000_000
     drag = ForceBound(linear=5.0 * float(np.sqrt(2.0)))
     right = Trial(drag, speed_cap=14.0)

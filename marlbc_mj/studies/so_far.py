@@ -1,4 +1,4 @@
-"""The page of a run that has not ended: written anew as methods end, among the run's other files."""
+"""The page of an unfinished run: rewritten as methods end, in the folder of the run's temporary files."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,26 +10,26 @@ from marlbc_mj.util.files import JOBS_FOLDER, writing
 from marlbc_mj.util.progress import note
 
 EndedT = TypeVar("EndedT")
-REWRITE_AFTER = 1.0  # least time between two versions of the page [s]
-WRITING_SHARE = 0.1  # of the run's time, that writing it may take
+REWRITE_AFTER = 1.0  # least time between two rewrites of the page [s]
+WRITING_SHARE = 0.1  # greatest share of the run's time spent on writing the page
 
 
 class SoFar(Generic[EndedT]):
-    """The page and the tables of a run that has not ended; they grow as methods end.
+    """The page and tables of an unfinished run; they grow as methods end.
 
     Args:
-        out: folder of the run.
-        keys: of all methods, in the order in which they are shown.
-        write: writes the results that there are, of how many, into a folder.
+        out: output folder of the run.
+        keys: keys of all methods, in display order.
+        write: called with the results so far, the total number of methods, and the folder to write into.
     """
 
     def __init__(self, out: Path, keys: Sequence[str], write: Callable[[Sequence[EndedT], int, Path], None]) -> None:
         self.folder, self.keys, self.write = out / JOBS_FOLDER / "so_far", keys, write
         self.results: dict[str, EndedT] = {}
-        self._next = -math.inf  # earliest time of the next version [s]
+        self._next = -math.inf  # earliest time of the next rewrite [s]
 
     def add(self, key: str, result: EndedT) -> None:
-        """One more method has ended."""
+        """Add the result of a method that has ended, and rewrite the page if it is due."""
         self.results[key] = result
         if monotonic() < self._next and len(self.results) < len(self.keys):
             return

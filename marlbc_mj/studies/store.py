@@ -1,13 +1,13 @@
-"""The folder of a run that has not ended: results by key, and large files of the jobs, in ``OUT/.jobs``.
+"""The folder of an unfinished run: results by key, and large files of the jobs, in ``OUT/.jobs``.
 
-    OUT/.jobs/run.json             study, code version and number of jobs of the command that wrote last
+    OUT/.jobs/run.json             study, code version and number of jobs of the last command that ran here
     OUT/.jobs/lock                 locked by the process that runs the study
-    OUT/.jobs/results-NNNNNN.pack  results by key, see packs; a record that is whole is the mark that a job is done
+    OUT/.jobs/results-NNNNNN.pack  results by key, see packs; a whole record marks its job as done
     OUT/.jobs/files/KEY/           large files of a job, renamed to this when the job ended
-    OUT/.jobs/files/.begun-*/      those of a job that runs
-    OUT/.jobs/engine/              what an engine needs of the shared folder
+    OUT/.jobs/files/.begun-*/      large files of a running job
+    OUT/.jobs/engine/              files that an engine shares with its workers
 
-The report is made elsewhere and replaces OUT, with all of this, in one rename.
+The report is written to another folder, which then replaces OUT, including all of this, in one rename.
 """
 
 import json
@@ -31,26 +31,26 @@ _RUN, _LOCK, _FILES, _ENGINE = "run.json", "lock", "files", "engine"
 
 
 class RunStore:
-    """Results and large files of one unfinished run; made by :func:`open_store`."""
+    """Results and large files of one unfinished run; create it with :func:`open_store`."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.files = folder / _FILES
         self.engine = folder / _ENGINE
         self.kept = {entry.key: entry for pack in packs(folder) for entry in entries(pack)}
-        """Where the result of a key is."""
+        """Locations of the stored results by key."""
         self._writer: PackWriter | None = None
 
     def result(self, key: str) -> Any:
-        """A stored result."""
+        """The stored result of a job."""
         return codec.from_bytes(self.kept[key].payload())
 
     def keep(self, key: str, result: Any) -> None:
-        """Store a result.
+        """Store the result of a job.
 
         Raises:
             NoSpaceError: the disk is full.
-            ConfigurationError: the result is no data.
+            ConfigurationError: the result is not data.
         """
         if self._writer is None or self._writer.full:
             self.close()
@@ -66,13 +66,13 @@ class RunStore:
         shutil.rmtree(self.files, ignore_errors=True)
 
     def close(self) -> None:
-        """Flush what was stored to the disk."""
+        """Flush stored results to the disk and close the pack."""
         if self._writer is not None:
             self._writer.close()
             self._writer = None
 
     def begin(self, about: Mapping[str, Any]) -> None:
-        """Write the description of this run, and remove files of killed workers."""
+        """Write the description of this run, and remove the files that killed workers left."""
         with writing(self.folder):
             self.files.mkdir(exist_ok=True)
             for path in self.files.glob(f"{_BEGUN}*"):
@@ -80,10 +80,10 @@ class RunStore:
         write_json(self.folder / _RUN, {"schema": STORE_SCHEMA, **about})
 
     def about(self) -> dict[str, Any]:
-        """Description of the last run in this folder; empty where none has begun.
+        """Description of the last run in this folder; empty if there was none.
 
         Raises:
-            ConfigurationError: the folder was written by something else, or by another version.
+            ConfigurationError: the folder was written by another version or another program.
         """
         path = self.folder / _RUN
         if not path.exists():
@@ -95,7 +95,7 @@ class RunStore:
         raise ConfigurationError(f"{path} is of another version of marlbc, or of something else; remove {self.folder}")
 
     def place_files(self, keys: Mapping[str, Any], out: Path) -> None:
-        """Give the large files of the jobs of these keys a place in ``out``, each its own name; they stay here, too."""
+        """Link or copy the large files of these jobs into ``out`` under their own names; the store keeps them, too."""
         with writing(out):
             for folder in (self.files / key for key in keys if (self.files / key).is_dir()):
                 for path in sorted(each for each in folder.rglob("*") if not each.is_dir()):
@@ -107,7 +107,7 @@ class RunStore:
 
 @contextmanager
 def job_folder(files: Path | None, key: str) -> Iterator[Path | None]:
-    """A folder for the large files of one job, in any process: under the job's key once the block has ended without an error."""
+    """A temporary folder for the large files of one job, in any process; renamed to the job's key if the block succeeds."""
     if files is None:
         yield None
         return
@@ -129,11 +129,11 @@ def job_folder(files: Path | None, key: str) -> Iterator[Path | None]:
 
 @contextmanager
 def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
-    """The store of the run in ``out``, for this process alone; one in which nothing was kept is removed at the end.
+    """Open the store of the run in ``out`` for this process alone; an empty store is removed at the end.
 
     Raises:
-        ConfigurationError: ``out`` holds something that may not be replaced, is a file, cannot be written, or another process
-            runs a study there.
+        ConfigurationError: ``out`` holds something that must not be replaced, is a file, cannot be written, or is in use by
+            another process.
     """
     remove_orphans(out)
     check_folder(out, overwrite=overwrite)

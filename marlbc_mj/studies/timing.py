@@ -1,4 +1,4 @@
-"""Timing on a machine that is not quiet: variants take turns within one process, so that their ratios hold."""
+"""Timing on a machine with other load: variants take turns within one process, so that their ratios stay reliable."""
 
 from collections.abc import Callable
 from statistics import median
@@ -11,7 +11,7 @@ LEAST_ROUNDS = 5
 
 
 def check_rounds(rounds: int) -> None:
-    """Raise ConfigurationError for too few rounds."""
+    """Raise ConfigurationError if there are too few rounds for a median."""
     if rounds < LEAST_ROUNDS:
         raise ConfigurationError(f"rounds must be at least {LEAST_ROUNDS} for a median to mean something, got {rounds}")
 
@@ -25,9 +25,9 @@ def _seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:
 def interleaved(
     variants: dict[Any, Callable[[], None]], rounds: int, clock: Callable[[], float] = perf_counter
 ) -> dict[Any, list[float]]:
-    """Seconds of each variant in every round, variants in turn; one round before does not count.
+    """Seconds of each variant in every round; variants take turns, after one warm-up round that is not counted.
 
-    Of work on one thread, ``process_time`` as the clock leaves out the time for which other programs had the processor.
+    For work on one thread, the clock ``process_time`` excludes the time that other programs had the processor.
     """
     taken: dict[Any, list[float]] = {name: [] for name in variants}
     for round_ in range(rounds + 1):
@@ -39,5 +39,5 @@ def interleaved(
 
 
 def ratio(above: list[float], below: list[float]) -> float:
-    """Median of the ratios in each round."""
+    """Median of the per-round ratios ``above / below``."""
     return median(a / b for a, b in zip(above, below, strict=True))

@@ -1,7 +1,7 @@
-"""Which networks of the general policy to ship: success on validation layouts of 27 missions.
+"""Success of networks of the general policy on validation layouts of 27 missions, to choose the networks to ship.
 
 ``python -m marlbc_mj.studies.validation FILE... [--layouts N] [--seed K] [--missions NAME,...] [--margins X,...] [--dwell D]
-[--deadline F]`` flies the mean of the networks in the files, without a shield. Violations are counted at mission steps.
+[--deadline F]`` runs the mean of the networks in the files, without a shield. Violations are counted at mission steps.
 """
 
 import argparse
@@ -20,9 +20,9 @@ from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import MarlbcError, unknown
 
 POOR_NETWORK = NetworkCase(range=1.2, delay=0.1, loss=0.2, silent=True)
-"""Of missions with ``silent``: nobody hears the first agent, and the others miss a fifth of all messages."""
+"""Communication in ``silent`` missions: nobody hears the first agent, and a fifth of the other messages is lost."""
 _SILENT, _LINES = "silent", "lines"
-"""Ends of names: missions with :data:`POOR_NETWORK`, and those where FR comes to its slots along their lines."""
+"""Suffixes of mission names: with :data:`POOR_NETWORK`, and with FR approaching its slots along their lines."""
 VALIDATION_MISSIONS = (
     *(f"{family} wedge-4" for family in GROUNDS),
     *(f"{family} wedge-4 {_SILENT}" for family in ("field", "gates", "corridor")),
@@ -32,14 +32,14 @@ VALIDATION_MISSIONS = (
     *(f"forest {team}" for team in ("circle-8", "grid-9")),
     *(f"{family} line-6" for family in ("field", "forest")),
 )
-"""Names of the missions: family, team, and what is different."""
+"""Names of the missions: family, team, and suffixes for variants."""
 
 
 def validation_mission(name: str) -> Scenario:
     """The scenario of one of :data:`VALIDATION_MISSIONS`.
 
     Raises:
-        ConfigurationError: another name.
+        ConfigurationError: an unknown name.
     """
     if name not in VALIDATION_MISSIONS:
         raise unknown("validation mission", name, VALIDATION_MISSIONS)
@@ -50,7 +50,7 @@ def validation_mission(name: str) -> Scenario:
 
 
 def validate(arguments: Sequence[str] | None = None) -> None:
-    """Print what the mean of some networks does on every mission, and the successes together."""
+    """Print the outcomes of the mean of the networks on every mission, and the totals."""
     default = GeneralConfig()
     parser = argparse.ArgumentParser(prog="python -m marlbc_mj.studies.validation")
     parser.add_argument("files", nargs="+", type=Path)

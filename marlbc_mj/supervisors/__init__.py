@@ -70,35 +70,35 @@ SUPERVISORS: dict[str, tuple[Callable[..., Supervisor | OneTeamSupervisor], str]
     "orca": (ORCA, "reciprocal velocity obstacles on the formation's velocity (van den Berg)"),
     "cbf-qp": (CBFQP, "second-order barrier functions on the reference's acceleration (Ames)"),
 }
-"""Factory and one line of description by name."""
+"""Factory and one-line description of each supervisor, by name."""
 ORACLES = ("oracle", "oracle-schedule")
-"""Supervisors whose factories take the name of the controller that the schedule was found with."""
+"""Supervisors whose factories take the name of the controller with which the schedule was found."""
 LEARNED = ("marlms", "rlms")
-"""Supervisors that are shipped checkpoints; each has a model card in ``training/checkpoints``."""
+"""Supervisors loaded from shipped checkpoints; each has a model card in ``training/checkpoints``."""
 LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "orca", "cbf-qp")
-"""Supervisors for layouts that nobody has seen before, to be compared by ``marlbc evaluate``."""
+"""Baseline supervisors that need no prior knowledge of a layout; ``marlbc evaluate`` compares them."""
 ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS, "marlms-general")
-"""Supervisors that a benchmark runs where they are named, not by default: the first takes minutes an episode, the second is the
-oracle itself where nothing is perturbed, the others are no part of the paper's comparison."""
+"""Supervisors that a benchmark runs only if they are named. The first takes minutes per episode, the second is identical to the
+oracle if nothing is perturbed, and the others are not part of the paper's comparison."""
 VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
-"""Supervisors that give velocities, so that the composition does not matter."""
+"""Supervisors that return reference velocities, so the composition has no effect."""
 OWN = "own"
-"""Stands for a composition where a supervisor gives its own velocities."""
+"""Replaces the name of the composition for supervisors that return reference velocities."""
 UNLEARNED = tuple(name for name in SUPERVISORS if name not in (*LEARNED, *ON_REQUEST))
-"""Supervisors that nothing was trained for, without those on request."""
+"""Supervisors without training, except those in ``ON_REQUEST``."""
 
 CHECKPOINT_SUFFIX = ".safetensors"
-"""Suffix of checkpoints."""
+"""File suffix of checkpoints."""
 
 
 def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
-    """A supervisor with its default settings, by name; the oracle's schedule belongs to a ``controller``.
+    """Make a supervisor with its default settings from its name; ``controller`` selects the oracle's schedule.
 
-    The name may also be ``file.py:Name`` of a user's Python file, or the path of a checkpoint. A supervisor that decides for one
+    The name may also be ``file.py:Name`` for a user's Python file, or the path of a checkpoint. A supervisor that decides for one
     team is wrapped in :class:`OneTeam`.
 
     Raises:
-        ConfigurationError: unknown name, or a file that gives no supervisor.
+        ConfigurationError: unknown name, or the file does not define a supervisor.
     """
     if names_attribute(name):
         supervisor = made(name, Supervisor)

@@ -1,5 +1,5 @@
-"""The interface of mission supervisors: observations of B teams in, orders out, with or without velocities, at every mission
-step.
+"""The interface of mission supervisors: at every mission step, they map observations of B teams to orders, with or without
+reference velocities.
 """
 
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -14,45 +14,45 @@ from marlbc_mj.util.modules import guarded
 
 
 class Blend(NamedTuple):
-    """A decision that does not leave the reference velocities to the composition of orders (12).
+    """A decision with its own reference velocities, which replace those composed from the orders (12).
 
-    A one-team supervisor gives both without the leading axis.
+    A one-team supervisor returns both arrays without the leading axis.
     """
 
-    orders: np.ndarray  # (B, N) indices into ``scenario.orders``: the labels that switches are counted by
+    orders: np.ndarray  # (B, N) indices into ``scenario.orders``: labels by which switches are counted
     velocity: np.ndarray  # (B, N, 2) v_r for the mission step [m/s]
 
 
 Decision = np.ndarray | Blend
-"""(B, N) indices into ``scenario.orders``, whose composition (12) is v_r, or orders with a v_r of their own."""
+"""Either (B, N) indices into ``scenario.orders``, from which v_r is composed (12), or orders together with v_r."""
 
 
 @runtime_checkable
 class Supervisor(Protocol):
     """Maps observations to one priority order per agent, for B teams at once.
 
-    Implementations are frozen dataclasses; what is remembered travels outside. Teams do not interact: the orders of one are the
-    same whatever B is.
+    Implementations are frozen dataclasses; the caller keeps their memory. Teams do not interact: the orders of a team do not
+    depend on B.
     """
 
     def start(self, scenario: Scenario, teams: int) -> Any:
-        """Memory of B ``teams`` at the start of an episode; checks that the scenario suits this supervisor."""
+        """Memory of B ``teams`` at the start of an episode; checks that the supervisor supports the scenario."""
         ...
 
     def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
-        """Orders (B, N), alone or with reference velocities; and the memory for the next call."""
+        """Orders (B, N), alone or with reference velocities, and the memory for the next call."""
         ...
 
 
 class OneTeamSupervisor(Protocol):
-    """The simpler form, for one team; :func:`~marlbc_mj.supervisors.one_team.batched` makes a :class:`Supervisor` of it."""
+    """The simpler interface for one team; :func:`~marlbc_mj.supervisors.one_team.batched` turns it into a :class:`Supervisor`."""
 
     def start(self, scenario: Scenario) -> Any:
-        """Memory of one team at the start of an episode; checks that the scenario suits this supervisor."""
+        """Memory of one team at the start of an episode; checks that the supervisor supports the scenario."""
         ...
 
     def decide(self, observation: Observation, memory: Any) -> tuple[Decision, Any]:
-        """Orders (N,) for an :meth:`Observation.team`, alone or with velocities (N, 2); and the memory for the next call."""
+        """Orders (N,) for an :meth:`Observation.team`, alone or with velocities (N, 2), and the memory for the next call."""
         ...
 
 
@@ -60,17 +60,17 @@ def start_supervisor(supervisor: Supervisor, scenario: Scenario, teams: int) -> 
     """Memory of B ``teams`` at the start of an episode.
 
     Raises:
-        ConfigurationError: the supervisor does not suit the scenario, or its ``start`` fails.
+        ConfigurationError: the supervisor does not support the scenario, or its ``start`` fails.
     """
     return guarded(lambda: supervisor.start(scenario, teams), f"supervisor {type(supervisor).__name__}: start()")
 
 
 def ask_supervisor(supervisor: Supervisor | OneTeamSupervisor, observation: Observation, memory: Any) -> tuple[Decision, Any]:
-    """A supervisor's decision, which :func:`split_decision` checks, and its memory.
+    """A supervisor's decision, not yet checked by :func:`split_decision`, and its memory.
 
     Raises:
-        ConfigurationError: it does not return these two.
-        SimulationError: it raises an error.
+        ConfigurationError: ``decide`` does not return a pair of decision and memory.
+        SimulationError: ``decide`` raises an error.
     """
     name = type(supervisor).__name__
     answer: Any = guarded(lambda: supervisor.decide(observation, memory), f"supervisor {name}: decide()", SimulationError)
@@ -80,10 +80,10 @@ def ask_supervisor(supervisor: Supervisor | OneTeamSupervisor, observation: Obse
 
 
 def split_decision(decision: Decision, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray | None]:
-    """Orders of ``shape``, and the reference velocities [m/s] that come with them, if any do: one more axis, of length 2.
+    """Split a decision into orders of ``shape`` and reference velocities (..., 2) [m/s], or None if it has none.
 
     Raises:
-        ConfigurationError: anything else, orders of another shape or that are not integers for example.
+        ConfigurationError: orders that are not an array of integers, or orders or velocities of another shape.
     """
     orders, velocity = decision if isinstance(decision, Blend) else (decision, None)
     if not isinstance(orders, np.ndarray) or orders.dtype.kind not in "iu":
@@ -98,15 +98,15 @@ def split_decision(decision: Decision, shape: tuple[int, ...]) -> tuple[np.ndarr
 
 
 def _names(orders: Any) -> bool:
-    """Whether orders were given by their names."""
+    """Whether orders are given by name."""
     return isinstance(next(iter(np.asarray(orders, dtype=object).ravel()), None), str)
 
 
 def carry_out(world: World, decision: Decision) -> Step:
-    """One mission step of every world, under the decision of a supervisor for all of them.
+    """Run one mission step of every world under a supervisor's decision.
 
     Raises:
-        ConfigurationError: a decision that is none, see :func:`split_decision` and :meth:`World.step`.
+        ConfigurationError: an invalid decision, see :func:`split_decision` and :meth:`World.step`.
         SimulationError: a world diverged.
     """
     return world.step(*split_decision(decision, (world.worlds, world.scenario.agents)))

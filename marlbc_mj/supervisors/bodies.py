@@ -1,7 +1,8 @@
 """The common part of ORCA and CBF-QP: an agent's desired velocity, and the bodies that it has to avoid.
 
-Both move the reference itself (a :class:`~marlbc_mj.supervisors.base.Blend`), so both see bodies from where behaviors are
-evaluated: p_r in ``virtual`` mode. The desired velocity is v_c of one formation behavior, FM by default, of bounded length.
+Both move the reference itself (a :class:`~marlbc_mj.supervisors.base.Blend`), so they measure distances from the point where
+behaviors are evaluated: p_r in ``virtual`` mode. The desired velocity is v_c of one formation behavior, FM by default, with
+bounded length.
 """
 
 from typing import NamedTuple
@@ -18,37 +19,39 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 
 class Bodies(NamedTuple):
-    """Bodies of a scenario that agents avoid, and the distances that they keep."""
+    """Distances that agents keep from other bodies, and limits of their motion."""
 
-    agents: float  # wanted between the middles of two agents [m]
-    obstacles: float  # wanted clearance [m]
-    sight: float  # bodies whose gap beyond that is larger are ignored [m]
-    speed: float  # bound of velocities [m/s]
-    step: float  # between two decisions [s]
+    agents: float  # least distance wanted between the centers of two agents [m]
+    obstacles: float  # least clearance wanted from obstacles [m]
+    sight: float  # a body more than this beyond its wanted distance is ignored [m]
+    speed: float  # upper bound of speeds [m/s]
+    step: float  # time between two decisions [s]
 
 
 class Cruise(NamedTuple):
-    """Memory of a supervisor that gives velocities."""
+    """Memory of ORCA and CBF-QP."""
 
-    motion: Repertoire  # the formation behavior alone
+    motion: Repertoire  # contains only the formation behavior
     bodies: Bodies
-    velocity: np.ndarray | None  # (B, N, 2) given last [m/s]; None before the first decision
+    velocity: np.ndarray | None  # (B, N, 2) last reference velocities [m/s]; None before the first decision
 
 
 class Wish(NamedTuple):
-    """One moment of B teams."""
+    """Positions, velocities and desired velocities of B teams at one mission step."""
 
-    at: np.ndarray  # (B, N, 2) where each agent is [m]
-    velocity: np.ndarray  # (B, N, 2) how it moves [m/s]
-    wanted: np.ndarray  # (B, N, 2) v_c [m/s]
+    at: np.ndarray  # (B, N, 2) position of each agent or its reference [m]
+    velocity: np.ndarray  # (B, N, 2) last reference velocity; the measured one before the first decision [m/s]
+    wanted: np.ndarray  # (B, N, 2) v_c, bounded [m/s]
     obstacles: np.ndarray  # (B, K, 3), or (B, K, 5) where they move
 
 
 def make_cruise(scenario: Scenario, motion: str, margin: float, speed: float, sight: float) -> Cruise:
-    """Memory at the start of an episode. Agents keep d_AA apart, or two radii where no behavior says how much; all plus margin.
+    """Memory at the start of an episode.
+
+    Agents keep d_AA apart, or two robot radii if the scenario has no AA. The margin is added to all distances.
 
     Raises:
-        ConfigurationError: an unknown behavior, a margin that is negative, a speed or a sight that is not positive.
+        ConfigurationError: an unknown behavior, a negative margin, or a speed or sight that is not positive.
     """
     for name, value in (("speed", speed), ("sight", sight)):
         if not value > 0:
@@ -69,7 +72,7 @@ def make_cruise(scenario: Scenario, motion: str, margin: float, speed: float, si
 
 
 class Cruising:
-    """A supervisor that gives velocities, with these fields."""
+    """Base class of ORCA and CBF-QP, which have these fields."""
 
     motion: str
     margin: float
@@ -77,22 +80,22 @@ class Cruising:
     sight: float
 
     def start(self, scenario: Scenario, teams: int) -> Cruise:
-        """Nobody has moved yet.
+        """Initial memory, without a last velocity.
 
         Raises:
-            ConfigurationError: an unknown behavior, or a number that cannot be.
+            ConfigurationError: an unknown behavior, or an invalid number.
         """
         return make_cruise(scenario, self.motion, self.margin, self.speed, self.sight)
 
 
 def give(velocity: np.ndarray, memory: Cruise) -> tuple[Blend, Cruise]:
-    """Velocities (B, N, 2) [m/s] as a decision under the one label that never changes, and remembered."""
+    """Velocities (B, N, 2) [m/s] as a decision, labelled with the order of the formation behavior, and stored in the memory."""
     orders = np.full(velocity.shape[:2], memory.motion.orders[0])
     return Blend(orders, velocity), memory._replace(velocity=velocity)
 
 
 def wish_of(observation: Observation, memory: Cruise) -> Wish:
-    """Positions, velocities and desired velocities of all agents."""
+    """Positions, velocities and desired velocities of all agents, before a decision."""
     velocity = observation.velocity if memory.velocity is None else memory.velocity
     wanted = behavior_velocities(observation, memory.motion)[0]
     length = np.linalg.norm(wanted, axis=-1, keepdims=True)
@@ -103,7 +106,7 @@ def wish_of(observation: Observation, memory: Cruise) -> Wish:
 
 @allocation_free
 def relative(p, v, body, body_velocity, out):
-    """Position and velocity of a body relative to an agent at ``p`` (2,) [m], ``v`` [m/s]: ``out`` (2, 2); their distance [m]."""
+    """Write a body's position and velocity relative to an agent at ``p`` with ``v`` to ``out`` (2, 2); return the distance."""
     for axis in range(2):
         out[0, axis], out[1, axis] = body[axis] - p[axis], body_velocity[axis] - v[axis]
     return np.sqrt(out[0, 0] * out[0, 0] + out[0, 1] * out[0, 1])

@@ -1,21 +1,22 @@
 """CBF-QP: exponential control barrier functions of second order on accelerations (Ames et al. 2019; Nguyen & Sreenath 2016).
 
-Each agent is taken for a double integrator p'' = a. With h the distance that is left (to an obstacle d - d_OA - m, to another
-agent |p_i - p_j| - d_AA - m) and a double pole at -rho, every body asks for
+Each agent is modelled as a double integrator p'' = a. Let h be the remaining distance (d - d_OA - m to an obstacle,
+|p_i - p_j| - d_AA - m to another agent). With a double pole at -rho, every body imposes
 
     h'' + 2 rho h' + rho^2 h >= 0,   h' = n^T v,   h'' = n^T a + |v_t|^2 / D,
 
-v relative to the body, v_t its part across n and D the distance from the body's middle: once h and h' + rho h are not negative
-they never will be. That is a half-plane of accelerations; of two agents each takes half. Applied is
+where n is the body's outward normal, v the velocity relative to the body, v_t its part perpendicular to n and D the distance from
+the body's center. Under this constraint, h and h' + rho h remain non-negative once they are. It is a half-plane of accelerations;
+each of two agents takes half of it. The applied acceleration is
 
-    a = argmin |a - rate (v_c - v)|  subject to all of them and |a| <= A,
+    a = argmin |a - rate (v_c - v)|  subject to all half-planes and |a| <= A.
 
-the least greatest violation where they exclude each other.
+If they contradict each other, the greatest violation is minimized, that of obstacles first.
 
-What this means here: a supervisor gives reference *velocities*, not forces. The acceleration is integrated over the mission step,
-v_r = v + dt a, and v is the reference velocity that was given last, so the double integrator that is kept safe is the reference,
-a virtual agent, with the law held for dt. The measured agent is safe as far as it tracks: the margin is for its lag. Any
-controller may run below. As with ORCA there are no switches, and agents wait where the way is closed.
+Here a supervisor returns reference *velocities*, not forces. The acceleration is integrated over the mission step,
+v_r = v + dt a, where v is the previous reference velocity. So the double integrator that is kept safe is the reference, a virtual
+agent, with a held for dt. The measured agent is safe as far as it tracks the reference; the margin covers its lag. Any controller
+can track it. As with ORCA there are no switches, and agents wait where the way is closed.
 """
 
 from dataclasses import dataclass
@@ -40,11 +41,11 @@ class CBFQP(Cruising):
 
     motion: str = "FM"
     pole: float = 3.0  # rho [1/s]
-    rate: float = 4.0  # of the wish, rate (v_c - v) [1/s]
+    rate: float = 4.0  # gain of the desired acceleration rate (v_c - v) [1/s]
     acceleration: float = 20.0  # A [m/s^2]
     margin: float = 0.1  # m [m]
     speed: float = 6.0  # bound of v_c [m/s]
-    sight: float = 15.0  # gap beyond which a body is ignored [m]
+    sight: float = 15.0  # a body more than this beyond its wanted distance is ignored [m]
 
     def __post_init__(self) -> None:
         for name in ("pole", "rate", "acceleration"):
@@ -53,7 +54,7 @@ class CBFQP(Cruising):
                 raise ConfigurationError(f"CBFQP {name} must be positive and finite, got {value}")
 
     def decide(self, observation: Observation, memory: Cruise) -> tuple[Blend, Cruise]:
-        """One velocity per agent, the last one and what the acceleration adds to it."""
+        """One velocity per agent: the previous one plus the acceleration times the mission step."""
         wish = wish_of(observation, memory)
         acceleration = np.empty_like(wish.wanted)
         _accelerate(wish, memory.bodies, self.pole, self.rate, self.acceleration, acceleration)
@@ -63,15 +64,15 @@ class CBFQP(Cruising):
 
 @allocation_free
 def barrier_plane(between, distance, least, pole, share, plane):
-    """The half-plane of accelerations that one body permits: ``plane`` (3,) is n, c of n^T a >= c.
+    """The half-plane n^T a >= c of accelerations that one body permits, written to ``plane`` as n, c.
 
     Args:
         between: (2, 2) position [m] and velocity [m/s] of the body relative to the agent.
-        distance: D, of the two middles [m].
-        least: distance that is wanted, so that h = D - least [m].
+        distance: D between the two centers [m].
+        least: least distance wanted [m]; h = D - least.
         pole: rho [1/s].
-        share: of the constraint that the agent takes, 1/2 or 1.
-        plane: (3 or more,), written in place; the normal is (1, 0) where both middles are in one place.
+        share: share of the constraint that the agent takes, 1/2 or 1.
+        plane: (3 or more,), written in place; the normal is (1, 0) if both centers coincide.
     """
     n_x, n_y = (-between[0, 0] / distance, -between[0, 1] / distance) if distance > 0.0 else (1.0, 0.0)
     rate = -(n_x * between[1, 0] + n_y * between[1, 1])
@@ -83,7 +84,7 @@ def barrier_plane(between, distance, least, pole, share, plane):
 
 @compiled
 def _accelerate(wish, bodies, pole, rate, most, out):
-    """Accelerations (B, N, 2) [m/s^2] of all agents of all teams into ``out``."""
+    """Write the accelerations (B, N, 2) [m/s^2] of all agents of all teams to ``out``."""
     agents, obstacles = wish.at.shape[1], wish.obstacles.shape[1]
     planes = np.empty((2 * (agents + obstacles), 4))  # rows: normal, offset, level
     between, still, wanted = np.empty((2, 2)), np.zeros(2), np.empty(2)

@@ -1,19 +1,19 @@
 """The communication layer: the messages that every agent of B teams has heard from every other, step by step.
 
-A supervisor that decides agent by agent says at every mission step what each agent has to say, a short *message* of M numbers.
-The layer of the scenario (:class:`~marlbc_mj.core.communication.Communication`) carries it, by one of two protocols:
+At every mission step, a supervisor that decides per agent provides a short *message* of M numbers from each agent. The layer of
+the scenario (:class:`~marlbc_mj.core.communication.Communication`) carries it by one of two protocols:
 
-- **Flooding.** Everyone keeps the newest message of everyone, with the time at which its author sent it, and broadcasts that
-  whole table every period; of two entries the newer one wins. After as many periods as the graph's diameter everyone knows
-  everyone of its connected component. One hop takes one period, or the delay where that is longer.
-- **Consensus.** First-order dynamic average consensus (Kia et al. 2019): everyone keeps an estimate x of the mean message m,
+- **Flooding.** Every agent keeps the newest message of every agent, with the time at which its author sent it, and broadcasts
+  this whole table every period; of two entries the newer one wins. After as many hops as the graph's diameter, every agent knows
+  all others in its connected component. One hop takes one period, or the delay rounded up to whole periods if that is longer.
+- **Consensus.** First-order dynamic average consensus (Kia et al. 2019): every agent keeps an estimate x of the mean message m,
   x_i <- x_i - eps sum_j a_ij (x_i - x_j) + dm_i, with eps = 1 and Metropolis weights a_ij = 1 / (1 + max(d_i, d_j)). A pair
-  moves only if both the message and its acknowledgment arrive, both by the same amount, so whatever is lost, the sum of all x
-  stays the sum of all m. A round takes two delays, or the period where that is longer. What an agent hears "of j" is its own
-  estimate, whoever j is: means and sums can be read from it, least and greatest entries cannot.
+  exchanges only if both the message and its acknowledgment arrive, and both estimates then move by the same amount. So the sum
+  of all x remains the sum of all m, whatever is lost. A round takes two delays, or the period if that is longer. What an agent
+  hears "of j" is its own estimate for every j: it yields means and sums, but no minima or maxima.
 
-While a team is in parts, each part has what its members say and what was heard of the others before; the time stamps tell how old
-that is. The supervisor decides how to use it.
+While a team is disconnected, each part has the messages of its own members and those heard from the others before; time stamps
+give their age. The supervisor decides how to use them.
 """
 
 from dataclasses import dataclass
@@ -26,31 +26,31 @@ from marlbc_mj.core.imperfections import uniform
 from marlbc_mj.scenarios import Scenario
 
 NEVER_HEARD = -np.inf
-"""Time stamp of what was never heard [s]."""
+"""Time stamp of a message that was never heard [s]."""
 _NOT_YET = -1
-"""Mission step of a team that has not exchanged anything."""
+"""Last mission step of a team that has not exchanged any message yet."""
 
 
 class Knowledge(NamedTuple):
-    """Messages and stamps that agents have of each other."""
+    """Messages that agents have heard from each other, and their time stamps."""
 
-    heard: np.ndarray  # (B, N, N, M) row i: what agent i last heard of each agent, itself included; zeros where never
-    stamp: np.ndarray  # (B, N, N) when the author sent that [s]; NEVER_HEARD
+    heard: np.ndarray  # (B, N, N, M) row i: newest message of each agent that agent i knows, its own included; zeros if none
+    stamp: np.ndarray  # (B, N, N) when the author sent it [s]; NEVER_HEARD if none
 
 
 class Hearing(NamedTuple):
-    """Who hears whom at one moment of B teams, for logs."""
+    """Which agents of B teams hear each other at one moment, for logs."""
 
-    link: np.ndarray  # (B, N, N) bool: agent i is in range of j, which sends
-    age: np.ndarray  # (B, N, N) of what agent i knows of j, to the microsecond [s]; infinite where it knows nothing
+    link: np.ndarray  # (B, N, N) bool: agent i is in range of agent j, and j is not silent
+    age: np.ndarray  # (B, N, N) age of what agent i knows of j, rounded to 1e-6 [s]; infinite if it knows nothing
 
     def team(self, b: int) -> "Hearing":
-        """Of team ``b`` alone, (N, N) each."""
+        """The entries of team ``b``, (N, N) each."""
         return Hearing(self.link[b], self.age[b])
 
 
 def hearing(memory: Any, time: np.ndarray) -> Hearing | None:
-    """From the memory of a supervisor whose field ``network`` is that of a layer, at times (B,) [s]; None of any other."""
+    """The :class:`Hearing` at times (B,) [s] from a supervisor's memory; None if it has no layer's memory as ``network``."""
     network = getattr(memory, "network", None)
     if network is None:
         return None
@@ -58,64 +58,64 @@ def hearing(memory: Any, time: np.ndarray) -> Hearing | None:
 
 
 class Layer(Protocol):
-    """Carries messages; made by :func:`make_layer`. It holds no state: what is under way travels in the memory."""
+    """Carries messages; made by :func:`make_layer`. It holds no state: messages under way are part of the memory."""
 
     def start(self, teams: int, size: int) -> Any:
-        """Memory of B ``teams`` whose messages have M = ``size`` numbers; nothing has been heard.
+        """Initial memory of B ``teams`` with messages of M = ``size`` numbers; nothing has been heard.
 
-        It has fields ``link``, (B, N, N) bool, whether agent i was in range of j, which was not silent, at the last exchange, and
-        ``stamp`` as :class:`Knowledge` has it.
+        It has the fields ``link``, (B, N, N) bool, whether agent i was in range of j and j was not silent at the last exchange,
+        and ``stamp`` as in :class:`Knowledge`.
         """
         ...
 
     def exchange(
         self, time: np.ndarray, position: np.ndarray, message: np.ndarray, memory: Any, seed: np.ndarray | None = None
     ) -> tuple[Knowledge, Any]:
-        """One mission step: what arrives now is heard, and who is due broadcasts. To be called at every mission step.
+        """Deliver arriving messages and broadcast those that are due. Call it once per mission step.
 
-        A team whose time is not later than at its last exchange begins anew.
+        If a team's time is not later than at its last exchange, its memory is reset.
 
         Args:
             time: (B,) [s].
             position: (B, N, 2) [m].
-            message: (B, N, M) what each agent has to say now.
+            message: (B, N, M) current message of each agent.
             memory: from :meth:`start` or the last exchange.
-            seed: (B,) whose losses are drawn, ``observation.noise_seed``; zeros if it is left out.
+            seed: (B,) seeds of the message losses, ``observation.noise_seed``; zeros by default.
 
         Returns:
-            What every agent knows now, and the memory for the next exchange.
+            The knowledge of every agent now, and the memory for the next exchange.
         """
         ...
 
     def forget(self, memory: Any, teams: np.ndarray) -> Any:
-        """The memory, with ``teams`` (B,) bool as they start."""
+        """The memory with ``teams`` (B,) bool reset to their initial state."""
         ...
 
 
 def make_layer(scenario: Scenario) -> Layer:
-    """The layer of a scenario."""
+    """The communication layer of a scenario."""
     radio = Radio(scenario.communication, scenario.agents, scenario.mission_step)
     return Consensus(radio) if scenario.communication.protocol == "consensus" else Flooding(radio)
 
 
 @dataclass(frozen=True)
 class Radio:
-    """The common part of both protocols: links and losses."""
+    """The common part of both protocols: links and message losses."""
 
     communication: Communication
     agents: int
     mission_step: float  # [s]
 
     def steps(self, seconds: float) -> int:
-        """A time in whole mission steps."""
+        """A time rounded to whole mission steps."""
         return round(seconds / self.mission_step)
 
     def count(self, time: np.ndarray) -> np.ndarray:
-        """(B,) int64, mission steps at times (B,) [s]."""
+        """(B,) int64, number of the mission step at times (B,) [s]."""
         return np.rint(time / self.mission_step).astype(np.int64)
 
     def link(self, time: np.ndarray, position: np.ndarray) -> np.ndarray:
-        """(B, N, N) bool: whether agent i is in range of j, and j sends."""
+        """(B, N, N) bool: whether agent i is in range of j and j is not silent."""
         settings = self.communication
         near = within_range(position, settings.range)
         if not settings.silent:
@@ -125,7 +125,7 @@ class Radio:
         return np.asarray(near & ~mute[:, None, :])
 
     def arrives(self, count: np.ndarray, seed: np.ndarray | None) -> np.ndarray:
-        """(B, N, N) bool: whether what j sends to i at mission steps ``count`` (B,) is not lost."""
+        """(B, N, N) bool: whether a message from j to i, sent at mission steps ``count`` (B,), is not lost."""
         if self.communication.loss == 0.0:
             return np.ones((len(count), self.agents, self.agents), dtype=np.bool_)
         seeds = np.zeros(len(count), dtype=np.int64) if seed is None else seed
@@ -137,27 +137,27 @@ class Radio:
 
 
 class Broadcast(NamedTuple):
-    """The tables that agents of B teams sent at one mission step."""
+    """The tables that the agents of B teams broadcast at one mission step."""
 
-    arrival: np.ndarray  # (B,) int64, mission step at which they are heard
-    hears: np.ndarray  # (B, N, N) bool: whether agent i hears j's
-    knowledge: Knowledge  # as it was sent
+    arrival: np.ndarray  # (B,) int64, mission step at which they arrive
+    hears: np.ndarray  # (B, N, N) bool: whether agent i receives the table of j
+    knowledge: Knowledge  # contents of the tables when sent
 
 
 class Flood(NamedTuple):
-    """Memory of :class:`Flooding`. Arrays are never written to again, so that broadcasts under way can share them."""
+    """Memory of :class:`Flooding`. Its arrays are never modified, so that broadcasts under way can share them."""
 
     step: np.ndarray  # (B,) int64, mission step of the last exchange
     due: np.ndarray  # (B,) int64, mission step of the next broadcast
-    heard: np.ndarray  # of Knowledge
-    stamp: np.ndarray
-    link: np.ndarray  # (B, N, N) bool
+    heard: np.ndarray  # (B, N, N, M) as in Knowledge
+    stamp: np.ndarray  # (B, N, N) as in Knowledge [s]
+    link: np.ndarray  # (B, N, N) bool, see Layer.start
     under_way: tuple[Broadcast, ...] = ()
 
 
 @dataclass(frozen=True)
 class Flooding:
-    """Time-stamped flooding; see the module."""
+    """The protocol of time-stamped flooding; see the module."""
 
     radio: Radio
 
@@ -186,7 +186,7 @@ class Flooding:
         return knowledge, Flood(count, next_due, *knowledge, link, under_way)
 
     def _ideal(self, time: np.ndarray, position: np.ndarray, message: np.ndarray) -> tuple[Knowledge, Flood]:
-        """The limit of infinite range, no delay and no loss."""
+        """The exchange for infinite range, no delay and no loss."""
         pairs = (len(time), self.radio.agents, self.radio.agents)
         heard = np.broadcast_to(message[:, None], (*pairs, message.shape[2]))
         knowledge = Knowledge(heard, np.broadcast_to(time[:, None, None], pairs))
@@ -202,7 +202,7 @@ class Flooding:
 
 
 def _with_own(memory: Flood, time: np.ndarray, message: np.ndarray) -> Knowledge:
-    """What agents knew, and what each has to say now at ``time`` (B,) [s]."""
+    """The knowledge in ``memory``, with the agents' own entries replaced by their messages at ``time`` (B,) [s]."""
     heard, stamp = memory.heard.copy(), memory.stamp.copy()
     own = np.arange(message.shape[1])
     heard[:, own, own], stamp[:, own, own] = message, time[:, None]
@@ -212,7 +212,7 @@ def _with_own(memory: Flood, time: np.ndarray, message: np.ndarray) -> Knowledge
 def _deliver(
     knowledge: Knowledge, count: np.ndarray, under_way: tuple[Broadcast, ...]
 ) -> tuple[Knowledge, tuple[Broadcast, ...]]:
-    """What agents know after all broadcasts that have arrived by mission steps ``count`` (B,), and the others."""
+    """The knowledge after all broadcasts that arrive by mission steps ``count`` (B,), and the broadcasts still under way."""
     later = []
     for sent in under_way:
         arrived = sent.arrival <= count
@@ -227,10 +227,10 @@ def _deliver(
 
 
 def _newest(knowledge: Knowledge, sent: Knowledge, hears: np.ndarray) -> Knowledge:
-    """Of every agent's own entry and those of the tables that it ``hears`` (B, N, N), the newest."""
+    """The newest entries among each agent's own table and the tables in ``sent`` that it ``hears`` (B, N, N)."""
     if not hears.any():
         return knowledge
-    offered = np.where(hears[..., None], sent.stamp[:, None], NEVER_HEARD)  # (B, i, j, k): what j tells i of k
+    offered = np.where(hears[..., None], sent.stamp[:, None], NEVER_HEARD)  # (B, i, j, k): stamp of what j tells i about k
     newer = offered.max(axis=2) > knowledge.stamp
     teams, _, authors = np.nonzero(newer)
     senders = offered.argmax(axis=2)[newer]
@@ -244,11 +244,11 @@ def _newest(knowledge: Knowledge, sent: Knowledge, hears: np.ndarray) -> Knowled
 
 
 class Handshakes(NamedTuple):
-    """The round of B teams that is under way; after it has ended, one that changes nothing."""
+    """The round of B teams that is under way; once it has ended, ``met`` is False and ``change`` 0."""
 
-    arrival: np.ndarray  # (B,) int64, mission step at which acknowledgments are back
-    met: np.ndarray  # (B, N) bool: who shakes hands with somebody
-    change: np.ndarray  # (B, N, M) of the estimates
+    arrival: np.ndarray  # (B,) int64, mission step at which the acknowledgments arrive
+    met: np.ndarray  # (B, N) bool: agents with at least one successful handshake
+    change: np.ndarray  # (B, N, M) change of the estimates
 
 
 class Estimates(NamedTuple):
@@ -256,16 +256,16 @@ class Estimates(NamedTuple):
 
     step: np.ndarray  # (B,) int64, mission step of the last exchange
     due: np.ndarray  # (B,) int64, mission step of the next round
-    estimate: np.ndarray  # (B, N, M) x
-    message: np.ndarray  # (B, N, M) m at the last exchange
-    stamp: np.ndarray  # (B, N, N) own: now; of others: the agent's last handshake [s]
-    link: np.ndarray  # (B, N, N) bool
+    estimate: np.ndarray  # (B, N, M) estimate x of the mean message
+    message: np.ndarray  # (B, N, M) message m at the last exchange
+    stamp: np.ndarray  # (B, N, N) own entry: time of the last exchange; others: the agent's last handshake [s]
+    link: np.ndarray  # (B, N, N) bool, see Layer.start
     under_way: Handshakes
 
 
 @dataclass(frozen=True)
 class Consensus:
-    """Dynamic average consensus; see the module."""
+    """The protocol of dynamic average consensus; see the module."""
 
     radio: Radio
 
@@ -304,7 +304,7 @@ class Consensus:
 
 
 def _begin(shared: Estimates, arrives: np.ndarray, duration: int) -> Handshakes:
-    """A round of handshakes between neighbors whose message and acknowledgment both arrive, (B, N, N); it takes ``duration``."""
+    """A round of handshakes, ``duration`` mission steps long; ``arrives`` (B, N, N) tells which one-way messages are not lost."""
     link = shared.link & shared.link.transpose(0, 2, 1)
     degree = link.sum(axis=2)
     weight = 1.0 / (1.0 + np.maximum(degree[:, :, None], degree[:, None]))
@@ -315,7 +315,7 @@ def _begin(shared: Estimates, arrives: np.ndarray, duration: int) -> Handshakes:
 
 
 def _shake(shared: Estimates, time: np.ndarray) -> Estimates:
-    """The estimates of B teams after the round that is under way, where it has ended by ``time`` (B,) [s]."""
+    """The estimates of B teams, with the round under way applied where it has ended by ``time`` (B,) [s]."""
     arrival, met, change = shared.under_way
     ended = arrival <= shared.step
     estimate = shared.estimate + change * ended[:, None, None]
@@ -325,11 +325,11 @@ def _shake(shared: Estimates, time: np.ndarray) -> Estimates:
 
 
 def _forgotten(teams: np.ndarray, fresh: Flood | Estimates, memory: Flood | Estimates) -> dict[str, Any]:
-    """Arrays of a memory by name, those of ``teams`` (B,) as a ``fresh`` one has them."""
+    """The arrays of a memory by name, with the rows of ``teams`` (B,) taken from a ``fresh`` memory."""
     names = [name for name in memory._fields if name != "under_way"]
     return {name: _where(teams, getattr(fresh, name), getattr(memory, name)) for name in names}
 
 
 def _where(teams: np.ndarray, new: np.ndarray, old: np.ndarray) -> np.ndarray:
-    """``new`` for the ``teams`` (B,), ``old`` for the others, along the first axis."""
+    """Rows of ``new`` for ``teams`` (B,) bool, rows of ``old`` for the others."""
     return np.asarray(np.where(teams.reshape(-1, *[1] * (new.ndim - 1)), new, old))

@@ -1,14 +1,14 @@
-"""Look ahead without a center: every agent watches its own lane, tells the others, and decides from what it has heard.
+"""Look-ahead without a center: every agent watches its own lane, tells the others, and decides from what it has heard.
 
 The rule is that of :mod:`marlbc_mj.supervisors.lookahead`: the column while at least ``blocked`` lanes are blocked, else the
-formation. An agent knows the plan and the obstacles along its own lane. What it says is whether that lane is blocked and, under
-the null-space composition, whether its lane of the column is and whether it is shut in. The communication layer of the scenario
-carries it (:mod:`marlbc_mj.supervisors.communication`). Each agent counts those of whom it knows that they see such a thing,
-itself among them. What was said more than ``hold`` ago does not count.
+formation. An agent knows the plan and the obstacles along its own lane. Its message tells whether that lane is blocked and, under
+the null-space composition, also whether its lane of the column is blocked and whether it is shut in. The scenario's communication
+layer carries these votes (:mod:`marlbc_mj.supervisors.communication`). For each of them, an agent counts the agents that vote
+yes, itself included. Votes older than ``hold`` do not count.
 
-An agent that knows of fewer lanes than ``blocked`` asks for all of these: one that has heard of nobody goes by its own lane
-alone. So each connected component of the team decides for itself, and with ideal communication all decisions are those of the
-central rule.
+An agent that knows of fewer lanes than ``blocked`` forms the column only if all known lanes are blocked; without any message it
+decides by its own lane. So each connected component of the team decides for itself, and with ideal communication all decisions
+are those of the central rule.
 """
 
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ class Votes(NamedTuple):
 
     lanes: Lanes
     layer: Layer
-    motion: np.ndarray  # (B, N) of every agent, in force: IN_FORMATION or IN_COLUMN
+    motion: np.ndarray  # (B, N) motion in force of each agent: IN_FORMATION or IN_COLUMN
     network: Any  # the layer's memory
 
 
@@ -41,7 +41,7 @@ class DistributedLookAhead:
         ConfigurationError: a ``hold`` that is not positive.
     """
 
-    rule: LookAhead = field(default_factory=LookAhead)  # when a lane is blocked, and how many make a column
+    rule: LookAhead = field(default_factory=LookAhead)  # defines when a lane is blocked and how many blocked lanes make a column
     hold: float = 2.0  # how long a vote counts [s]
 
     def __post_init__(self) -> None:
@@ -49,7 +49,7 @@ class DistributedLookAhead:
             raise ConfigurationError(f"DistributedLookAhead hold must be positive, got {self.hold}")
 
     def start(self, scenario: Scenario, teams: int) -> Votes:
-        """Lanes, rule and layer of a scenario; nothing has been heard.
+        """Initial memory: all agents in formation, nothing has been heard.
 
         Raises:
             ConfigurationError: the scenario lacks an order.
@@ -59,7 +59,7 @@ class DistributedLookAhead:
         return Votes(lanes, layer, motion, layer.start(teams, lanes.sights))
 
     def decide(self, observation: Observation, memory: Votes) -> tuple[np.ndarray, Votes]:
-        """Motion and avoidance per agent."""
+        """Decide motion and avoidance per agent."""
         lanes, now = memory.lanes, observation.time
         own = self.rule.watch(observation, lanes).astype(np.float64)
         (heard, stamp), network = memory.layer.exchange(now, observation.position, own, memory.network, observation.noise_seed)
@@ -71,10 +71,10 @@ class DistributedLookAhead:
         """(B, N) motion of every agent.
 
         Args:
-            votes: (B, N, N, M) 0 or 1, what each agent heard of each that it sees; M as :meth:`LookAhead.watch` has it. Under
-                consensus each is the agent's estimate of their mean.
-            age: (B, N, N) of these votes [s].
-            last: (B, N) the motion in force.
+            votes: (B, N, N, M) 0 or 1, the last votes that each agent heard of each agent; M as in :meth:`LookAhead.watch`.
+                Under consensus, all are the agent's estimate of the mean vote.
+            age: (B, N, N) age of these votes [s].
+            last: (B, N) motion in force.
         """
         known = age <= self.hold + 1e-9
         enough = np.minimum(self.rule.blocked, known.sum(axis=2))

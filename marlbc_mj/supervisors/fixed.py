@@ -12,14 +12,14 @@ from marlbc_mj.scenarios import Scenario
 class FixedPriority:
     """The same constant ``order`` for every agent.
 
-    FM alone ignores obstacles under (12). OA>FM forbids every motion along the line to the nearest obstacle, however far that one
-    is (erratum 6): the team stops. Both show why decisions are needed.
+    Under (12), FM alone ignores obstacles, and OA>FM forbids every motion along the line to the nearest obstacle, however far
+    away it is (erratum 6), so the team stops. Both show why decisions are needed.
     """
 
     order: str = "FM"  # a priority order, or the command it gives
 
     def start(self, scenario: Scenario, teams: int) -> np.ndarray:
-        """(B, N) the orders of all mission steps.
+        """(B, N) orders for all mission steps.
 
         Raises:
             ConfigurationError: the scenario has no such order.
@@ -27,5 +27,5 @@ class FixedPriority:
         return np.full((teams, scenario.agents), scenario.orders.index(self.order))
 
     def decide(self, observation: Observation, memory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The order, again."""
+        """The same order at every mission step."""
         return memory.copy(), memory

@@ -1,11 +1,11 @@
-"""The older behavioral frameworks, rivals of priority orders and null-space composition together: each gives v_r itself.
+"""The older behavioral frameworks: baselines for priority orders with null-space composition. Each computes v_r itself.
 
-All three weigh the behaviors' own velocities (8)-(11), evaluated where the mission evaluates them (at p_r in ``virtual`` mode,
-else at the measured p), by each agent's measured clearance d; every agent decides for itself. The label that goes with a
-velocity is the order of the behavior that weighs most: OA>FM for OA, FR, FM. So a switch is a change of the dominant behavior;
-the velocity may change, even jump, without one, and no label says that its composition (12) is what moves the agent.
+All three weight the velocities (8)-(11) of the single behaviors by each agent's measured clearance d. The behaviors are evaluated
+where the mission evaluates them (at p_r in ``virtual`` mode, else at the measured p), and every agent decides for itself. Each
+velocity is labelled with the order of the behavior of greatest weight: OA>FM for OA, AA>FM for AA, else FR or FM. So a switch is
+a change of the dominant behavior. The velocity may change without one, even jump, and is not the composition (12) of its label.
 
-Their sources describe other robots and other behaviors. Each class says how its source is read here.
+The sources describe other robots and other behaviors. Each class states how its source is interpreted here.
 """
 
 from dataclasses import dataclass, replace
@@ -29,20 +29,20 @@ _LABELS = {"OA": "OA>FM", "AA": "AA>FM"}
 
 
 class Repertoire(NamedTuple):
-    """The behaviors that a framework blends, fixed for an episode; M behaviors: FM, FR, OA and perhaps AA."""
+    """The M behaviors that a framework blends, fixed for an episode: FM, FR, OA and possibly AA."""
 
-    alone: Behaviors  # of the scenario; order j is behavior j alone
+    alone: Behaviors  # the scenario's, but order j consists of behavior j alone
     orders: np.ndarray  # (M,) the order that labels each behavior
     safe_distance: float  # d_OA [m]
-    way: GiveWay  # to other agents
-    grid: np.ndarray  # scratch
+    way: GiveWay  # data for giving way to other agents
+    grid: np.ndarray  # scratch for grids of obstacles and team
 
 
 def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) -> Repertoire:
-    """FM, FR and OA of a scenario, with AA too if it is named.
+    """The behaviors of a scenario with the given ``names``.
 
     Raises:
-        ConfigurationError: the scenario lacks one of them.
+        ConfigurationError: the scenario lacks one of their orders.
     """
     orders = np.array([scenario.orders.index(_LABELS.get(name, name)) for name in names])
     place = [b.name for b in scenario.behaviors]
@@ -53,7 +53,7 @@ def repertoire(scenario: Scenario, names: tuple[str, ...] = ("FM", "FR", "OA")) 
 
 
 def evaluated_at(observation: Observation, memory: Repertoire) -> np.ndarray:
-    """(B, N, 2) where the mission evaluates behaviors [m]."""
+    """(B, N, 2) positions at which the mission evaluates behaviors [m]."""
     return np.ascontiguousarray(observation.reference if memory.alone.virtual else observation.position)
 
 
@@ -87,33 +87,33 @@ def _fill_normals(at, obstacles, normals):
 class Layered:
     """The highest active behavior has the agent to itself (Brooks 1986): OA if d <= d_OA, FR if d <= ``reach`` d_OA, else FM.
 
-    Subsumption of whole layers: those below are suppressed, not projected, so an agent that avoids an obstacle neither follows
-    the path nor keeps its slot meanwhile. OA brings it to d = d_OA, where OA is still active: it can rest there for good
-    while the path goes on. The regions are those of FSAMS as published. Where the scenario has agent avoidance, AA is the layer
-    above OA, active while a neighbor is within d_AA.
+    Lower layers are suppressed entirely, not projected, so an agent that avoids an obstacle neither follows the path nor keeps
+    its slot meanwhile. OA brings it to d = d_OA, where OA is still active: it can stay there forever while the path moves on.
+    The regions are those of FSAMS as published. If the scenario has agent avoidance, AA is the layer above OA, active while a
+    neighbor is within d_AA.
     """
 
-    reach: float = 2.0  # FR is active within this many d_OA
+    reach: float = 2.0  # clearance up to which FR is active, in d_OA
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.reach) and self.reach >= 1):
             raise ConfigurationError(f"Layered reach must be at least 1 and finite, got {self.reach}")
 
     def start(self, scenario: Scenario, teams: int) -> Repertoire:
-        """The scenario's behaviors."""
+        """Memory: the scenario's behaviors."""
         avoiding = any(b.name == "AA" for b in scenario.behaviors)
         return repertoire(scenario, ("FM", "FR", "OA", "AA") if avoiding else ("FM", "FR", "OA"))
 
     def weights(self, clearance: np.ndarray, safe_distance: float) -> np.ndarray:
-        """(3, B, N), 1 for the highest active of FM, FR and OA and 0 for the others, at clearances (B, N) [m]."""
+        """(3, B, N) weights of FM, FR and OA at clearances (B, N) [m]: 1 for the highest active one, 0 for the others."""
         near, within = clearance <= safe_distance, clearance <= self.reach * safe_distance
         return np.stack([~within, within & ~near, near]).astype(np.float64)
 
     def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
-        """One behavior per agent."""
+        """The velocity of one behavior per agent."""
         weights = self.weights(observation.clearance, memory.safe_distance)
         if len(memory.orders) > _AA:
-            close = crowded(observation, memory.way, reach=1.0)  # alone, AA has an agent stand still from d_AA on
+            close = crowded(observation, memory.way, reach=1.0)  # at d_AA and beyond, AA alone commands zero velocity
             weights = np.concatenate([weights * ~close, close[None].astype(np.float64)])
         velocities = behavior_velocities(observation, memory)
         return _blend(weights, velocities, memory), memory
@@ -123,22 +123,22 @@ class Layered:
 class FuzzyBlend:
     """v_r = sum mu_j v_j / sum mu_j (Vadakkepat et al. 2004): near -> OA, mid -> FR, far -> FM, with the sets of FMS.
 
-    The rules are those of FMS without the clearance rate. OA has no feed-forward: the share that it weighs is missing from the
-    path's velocity.
+    The rules are those of FMS without the clearance rate. OA contains no path velocity, so the blend follows the path more slowly
+    by the weight of OA.
     """
 
     def start(self, scenario: Scenario, teams: int) -> Repertoire:
-        """The scenario's behaviors."""
+        """Memory: the scenario's behaviors."""
         return repertoire(scenario)
 
     def weights(self, clearance: np.ndarray, safe_distance: float) -> np.ndarray:
-        """(3, B, N), mu_j / sum mu_j of FM, FR and OA at clearances (B, N) [m]."""
+        """(3, B, N) weights mu_j / sum mu_j of FM, FR and OA at clearances (B, N) [m]."""
         sets = memberships(clearance, np.zeros(clearance.shape), safe_distance)
         degrees = np.stack([sets.far, sets.mid, sets.near])
         return np.asarray(degrees / degrees.sum(axis=0))
 
     def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
-        """One mixture per agent."""
+        """One blended velocity per agent."""
         weights = self.weights(observation.clearance, memory.safe_distance)
         velocities = behavior_velocities(observation, memory)
         return _blend(weights, velocities, memory), memory
@@ -148,18 +148,18 @@ class FuzzyBlend:
 class MotorSchema:
     """v_r = p_cd' + ``speed`` x the sum of gain x magnitude x direction of all schemas (Arkin 1989; Balch and Arkin 1998).
 
-    Magnitudes lie in [0, 1]; nothing is projected. That of an obstacle, m, is 0 beyond the distance ``sphere``, rises linearly to
-    1 at ``saturation`` and stays 1 inside.
+    Magnitudes lie in [0, 1]; nothing is projected. The magnitude m of an obstacle is 0 beyond the distance ``sphere``, rises
+    linearly to 1 at ``saturation`` and is 1 below it.
 
-    - OA: along the outward normal, magnitude m.
-    - FM: the feedback of (10), cut at ``speed``: linear near the slot, of magnitude 1 from speed / Lambda = 1.25 m on. As it is,
-      the pull of a distant slot exceeds whatever an obstacle can set against it (case study: 57 s in violation instead of 2 s).
-    - FR: the feedback of (11), cut as FM's, times m, since a column is what an obstacle calls for. With ``reconstruct_always``
-      without m, the literal sum: the team then rests between its formations and holds neither (case study: return -188).
+    - OA: along the outward normal, with magnitude m.
+    - FM: the feedback of (10), limited to ``speed``: linear near the slot, of magnitude 1 from speed / Lambda = 1.25 m on.
+      Without the limit, the pull of a distant slot exceeds any repulsion (case study: 57 s in violation instead of 2 s).
+    - FR: the feedback of (11), limited likewise, times m, since only obstacles require a column. ``reconstruct_always`` omits m,
+      which is the literal sum: the team then settles between its two formations and holds neither (case study: return -188).
 
-    The path's velocity is added once; as a part of FM and of FR it would count up to 1.8 times. All schemas together make a loop
-    of 1.5 * 10 / 2 + 1.8 * 8 = 22 /s around the reference, which steps of 0.05 s hold (40 /s); with four times the speed they
-    do not.
+    The path velocity is added once; as a part of both FM and FR it would count up to 1.8 times. All schemas together give the
+    reference a loop gain of 1.5 * 10 / 2 + 1.8 * 8 = 22 /s, which is stable with steps of 0.05 s (limit: 40 /s). With four times
+    the speed it is not.
     """
 
     avoidance: float = 1.5  # gain of OA
@@ -167,8 +167,8 @@ class MotorSchema:
     reconstruction: float = 0.8  # gain of FR
     sphere: float = 4.0  # S, sphere of influence [m]
     saturation: float = 2.0  # R [m]
-    speed: float = 10.0  # of a schema at gain and magnitude 1 [m/s]
-    reconstruct_always: bool = False
+    speed: float = 10.0  # speed of a schema at gain and magnitude 1 [m/s]
+    reconstruct_always: bool = False  # FR also without an obstacle nearby
 
     def __post_init__(self) -> None:
         for name in ("avoidance", "formation", "reconstruction", "saturation", "sphere"):
@@ -181,21 +181,21 @@ class MotorSchema:
             raise ConfigurationError(f"MotorSchema sphere must be greater than saturation = {self.saturation}, got {self.sphere}")
 
     def start(self, scenario: Scenario, teams: int) -> Repertoire:
-        """The scenario's behaviors."""
+        """Memory: the scenario's behaviors."""
         return repertoire(scenario)
 
     def magnitude(self, clearance: np.ndarray) -> np.ndarray:
-        """(B, N) m in [0, 1] at clearances (B, N) [m]."""
+        """(B, N) magnitude m in [0, 1] at clearances (B, N) [m]."""
         return np.asarray(np.clip((self.sphere - clearance) / (self.sphere - self.saturation), 0.0, 1.0))
 
     def weights(self, clearance: np.ndarray) -> np.ndarray:
-        """(3, B, N), gain x magnitude of FM, FR and OA at clearances (B, N) [m]."""
+        """(3, B, N) weights, gain x magnitude, of FM, FR and OA at clearances (B, N) [m]."""
         near, always = self.magnitude(clearance), np.ones(clearance.shape)
         reconstruction = always if self.reconstruct_always else near
         return np.stack([self.formation * always, self.reconstruction * reconstruction, self.avoidance * near])
 
     def decide(self, observation: Observation, memory: Repertoire) -> tuple[Blend, Repertoire]:
-        """One sum per agent."""
+        """The sum of all schemas per agent."""
         weights = self.weights(observation.clearance)
         velocities, path_velocity = behavior_velocities(observation, memory), memory.alone.path[1]
         velocities[:_OA] = _cut(velocities[:_OA] - path_velocity, self.speed)
@@ -206,7 +206,7 @@ class MotorSchema:
 
 
 def _cut(velocities: np.ndarray, speed: float) -> np.ndarray:
-    """``velocities`` (..., 2) with those faster than ``speed`` shortened to it."""
+    """``velocities`` (..., 2), shortened to ``speed`` where they are faster."""
     length = np.linalg.norm(velocities, axis=-1, keepdims=True)
     return np.asarray(velocities * (speed / np.maximum(length, speed)))
 

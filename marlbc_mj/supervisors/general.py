@@ -1,13 +1,13 @@
 """``marlms-general``: one learned policy for every agent of every team, distributed (project).
 
-Every agent senses its own lanes, sends what it sensed and decides by itself between formation and column, from what it sensed
-and what it heard of the others; see :mod:`marlbc_mj.policies.general`. The shipped policy leaves avoidance to the composition,
-which must be the set-based one; a policy that was trained under the null-space composition decides about avoidance, too, and
+Every agent senses its own lanes, sends these features to the others, and decides between formation and column from its own
+features and those it has heard; see :mod:`marlbc_mj.policies.general`. The shipped policy leaves avoidance to the composition,
+which must be the set-based one. A policy that was trained under the null-space composition also decides about avoidance, and
 its agents give way to each other as under other supervisors.
 
-The communication layer of the scenario carries what is sent, at every mission step. With ideal communication everybody hears
-everybody at once, and nothing is exchanged between decisions. An agent that is cut off goes on by what it senses and by what it
-heard before; how old that is, and how many it has heard of, are among its inputs. So each connected component decides for itself.
+The scenario's communication layer carries the messages at every mission step. With ideal communication, all agents hear each
+other at once, and messages are computed only at decisions. An agent that is cut off continues with its own features and those
+heard before; their age and the number of agents heard are among its inputs. So each connected component decides for itself.
 """
 
 from dataclasses import dataclass
@@ -28,41 +28,41 @@ from marlbc_mj.supervisors.set_based_rule import avoids_by_itself
 
 
 class GeneralMemory(NamedTuple):
-    """B teams between two mission steps."""
+    """Memory of :class:`General` for B teams."""
 
     sight: Sight
-    orders: np.ndarray  # (A,) index into scenario.orders of every action
-    interval: int  # mission steps that a decision holds for
-    actions: np.ndarray  # (B, N) in force
-    way: GiveWay  # to other agents; none where the composition keeps them apart
+    orders: np.ndarray  # (A,) index into scenario.orders of each action
+    interval: int  # mission steps for which a decision holds
+    actions: np.ndarray  # (B, N) actions in force
+    way: GiveWay  # data for giving way to other agents; none if the composition does it
     layer: Layer | None = None  # None: communication is ideal
     network: Any = None  # the layer's memory
-    solver_ms: float = 0.0  # what inputs and network took in the last mission step [ms]
+    solver_ms: float = 0.0  # computing time of inputs and network in the last mission step [ms]
 
 
 @dataclass(frozen=True)
 class General:
     """The general policy as a supervisor; build it with :meth:`load`.
 
-    A decision holds for 1.2 settling times, counted by each team's own steps.
+    A decision holds for 1.2 settling times, counted in each team's own mission steps.
     """
 
     policy: GeneralPolicy
 
     @classmethod
     def load(cls, path: Path) -> "General":
-        """From a checkpoint.
+        """Load a policy from a checkpoint.
 
         Raises:
-            ConfigurationError: the file is missing, torn, changed, of other inputs, or not a checkpoint of a general policy.
+            ConfigurationError: the file is missing, incomplete or altered, of other inputs, or not of a general policy.
         """
         return cls(read_general(path)[0])
 
     def start(self, scenario: Scenario, teams: int) -> GeneralMemory:
-        """All teams in formation; nothing has been heard.
+        """Initial memory: all teams in formation, nothing has been heard.
 
         Raises:
-            ConfigurationError: another composition than the one it was trained under, no column, or a path at rest.
+            ConfigurationError: a composition other than the one of training, no column, or a path at rest.
         """
         orders, sight = orders_for(self.policy, scenario), make_sight(scenario)
         actions = np.full((teams, scenario.agents), FORMATION, dtype=np.int64)
@@ -74,7 +74,7 @@ class General:
         return memory._replace(layer=layer, network=layer.start(teams, SENT))
 
     def decide(self, observation: Observation, memory: GeneralMemory) -> tuple[np.ndarray, GeneralMemory]:
-        """An action for every agent: the one in force unless another is better by more than the margin."""
+        """Orders of the actions in force, which teams with a due decision choose anew; see :meth:`GeneralPolicy.decide`."""
         began, due = perf_counter(), observation.step % memory.interval == 0
         if memory.layer is None:
             memory = self._decide_due(observation, memory, due) if np.count_nonzero(due) else memory
@@ -84,7 +84,7 @@ class General:
         return orders, memory._replace(solver_ms=1e3 * (perf_counter() - began))
 
     def _decide_due(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
-        """The memory with new actions of the teams ``due`` (B,), everybody heard at once."""
+        """The memory with new actions of the teams ``due`` (B,), with ideal communication."""
         seen = observation if np.count_nonzero(due) == len(due) else Observation(*(field[due] for field in observation))
         features = sense_features(seen, memory.sight)
         sent = self.policy.messages(features)
@@ -111,7 +111,7 @@ class General:
         memory: GeneralMemory,
         due: np.ndarray,
     ) -> GeneralMemory:
-        """The memory with the decisions of the teams ``due`` (B,), of which the rest of the arguments are."""
+        """The memory with new actions of the teams ``due`` (B,); features, fresh and knowledge have one row per due team."""
         actions = memory.actions.copy()
         actions[due] = self.policy.decide(Sensed(features, actions[due], fresh), *knowledge)
         return memory._replace(actions=actions)

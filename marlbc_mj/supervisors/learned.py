@@ -1,4 +1,4 @@
-"""Learned supervisors: a checkpoint's greedy policy, evaluated without torch every few mission steps."""
+"""Learned supervisors: a checkpoint's greedy policy, evaluated every few mission steps without torch."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,19 +17,19 @@ from marlbc_mj.scenarios import Scenario
 
 
 class LearnedMemory(NamedTuple):
-    """B teams between two mission steps."""
+    """Memory of :class:`Learned` for B teams."""
 
     read: State
-    order_of: np.ndarray  # (A,) index into scenario.orders of every action
-    actions: np.ndarray  # (B, N) in force
-    solver_ms: float = 0.0  # what state and networks took in the last mission step [ms]
+    order_of: np.ndarray  # (A,) index into scenario.orders of each action
+    actions: np.ndarray  # (B, N) actions in force
+    solver_ms: float = 0.0  # computing time of state and networks in the last mission step [ms]
 
 
 @dataclass(frozen=True)
 class Learned:
     """A trained policy as a supervisor; build it with :meth:`load`.
 
-    A decision holds for ``interval`` mission steps, counted by each team's own; in between, nothing is computed.
+    A decision holds for ``interval`` of each team's own mission steps; nothing is computed in between.
     """
 
     policy: Policy
@@ -38,24 +38,24 @@ class Learned:
 
     @classmethod
     def load(cls, path: Path) -> "Learned":
-        """From a checkpoint.
+        """Load a policy from a checkpoint.
 
         Raises:
-            ConfigurationError: the file is missing, torn, changed, or not a checkpoint of a policy.
+            ConfigurationError: the file is missing, incomplete or altered, or not a checkpoint of a policy.
         """
         policy, description = read_policy(path)
         return cls(policy, description["signature"], path)
 
     @property
     def interval(self) -> int:
-        """Mission steps that a decision holds for."""
+        """Mission steps for which a decision holds."""
         return int(self.signature["interval"])
 
     def start(self, scenario: Scenario, teams: int) -> LearnedMemory:
-        """Check the scenario against what the policy was trained for.
+        """Initial memory; checks that the policy was trained for this scenario.
 
         Raises:
-            ConfigurationError: another team, other behaviors, slots, mission step or path, see
+            ConfigurationError: a different team, or different behaviors, slots, mission step or path, see
                 :func:`~marlbc_mj.policies.checkpoint.signature`; or networks that do not fit them.
         """
         path = called(self.path)
@@ -66,7 +66,7 @@ class Learned:
         return LearnedMemory(read, orders, np.zeros((teams, scenario.agents), dtype=np.int64))
 
     def decide(self, observation: Observation, memory: LearnedMemory) -> tuple[np.ndarray, LearnedMemory]:
-        """The greedy action of every agent; the one in force unless another is better by more than the margin."""
+        """The greedy action of every agent; the action in force unless another is better by more than the margin."""
         actions, began = memory.actions, perf_counter()
         due = observation.step % self.interval == 0
         if due.any():

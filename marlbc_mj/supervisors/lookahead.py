@@ -1,17 +1,18 @@
-"""Look ahead: the column while the formation's own lanes are blocked, else the formation (project).
+"""Look-ahead: the column while lanes of the formation are blocked, else the formation (project).
 
-A *lane* is the way of a slot along the path. It is blocked while the slot, moved along the path from ``behind`` ago until
-``ahead`` from now, comes within the safe distance of an obstacle; obstacles keep the velocity they have. The team forms the
-column while at least ``blocked`` lanes of the formation are blocked: one agent can go around an obstacle, several at once cannot.
+A *lane* is the track of a slot along the path. It is blocked if the slot comes within the safe distance of an obstacle on the
+stretch from ``behind`` before now to ``ahead`` after now; obstacles are assumed to keep their velocity. The team forms the column
+while at least ``blocked`` lanes of the formation are blocked: one agent can go around an obstacle, several at once cannot.
 
-That says nothing of the column, nor of the way back from it: beside the walls of a passage, and behind its end, lanes are free
-while agents are still between the walls. Under the set-based composition these wait there. Under (12) they cross, and violate
-(corridor: 0 of 40 layouts). So under (12) two conditions are added. No column is formed whose own lanes are blocked, since it
-helps nobody. And it stays while anybody is *shut in*: the straight way from an agent's place in the column to its slot comes
-within the safe distance of an obstacle, now or within ``change``.
+This rule considers neither the column's own lanes nor the way back from it. Beside the walls of a passage and behind its end, the
+formation's lanes are free while agents are still between the walls. Under the set-based composition these agents wait there.
+Under (12) they cross the walls, which is a violation (corridor: 0 of 40 layouts without one). So under (12) there are two more
+conditions. A column with a blocked lane is not formed, since it does not help. And the column is kept while any agent is *shut
+in*: the straight way from its place in the column to its slot comes within the safe distance of an obstacle, now or within
+``change``.
 
-The order in which an agent avoids comes from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published
-composition FM and FR alone would run into whatever is in the way. Under the set-based composition it is FM or FR alone.
+Orders with avoidance come from the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): under the published composition, FM
+and FR alone would run into obstacles. Under the set-based composition, the order is FM or FR alone.
 """
 
 from dataclasses import dataclass
@@ -35,19 +36,19 @@ from marlbc_mj.util.errors import ConfigurationError
 
 
 class Lanes(NamedTuple):
-    """Memory of :class:`LookAhead`; all but the motion is fixed for an episode."""
+    """Memory of :class:`LookAhead`; everything but the motion is fixed for an episode."""
 
-    motion: np.ndarray  # (B,) in force: IN_FORMATION or IN_COLUMN
-    slots: np.ndarray  # (N, 2) of FM around the desired centroid [m]
-    column: np.ndarray  # (N, 2) of FR [m]
+    motion: np.ndarray  # (B,) motion in force: IN_FORMATION or IN_COLUMN
+    slots: np.ndarray  # (N, 2) slots of FM around the desired centroid [m]
+    column: np.ndarray  # (N, 2) slots of FR [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
     safe_distance: float  # d_OA [m]
     rule: LocalRule
-    exposed: bool  # whether orders lead into obstacles: the composition does not avoid by itself
+    exposed: bool  # whether the composition does not avoid by itself, so that orders can lead into obstacles
 
     @property
     def sights(self) -> int:
-        """M, how many things :meth:`LookAhead.watch` looks for."""
+        """M, the number of conditions that :meth:`LookAhead.watch` checks."""
         return 3 if self.exposed else 1
 
 
@@ -60,10 +61,10 @@ class LookAhead:
     """
 
     blocked: int = 2  # lanes that must be blocked for a column
-    ahead: float = 8.0  # [s]
-    behind: float = 2.0  # [s]
-    change: float = 1.0  # what it takes to get from the column into the formation [s]
-    margin: float = 0.6  # of the local rule [m]
+    ahead: float = 8.0  # how far ahead lanes are checked [s]
+    behind: float = 2.0  # how far behind lanes are checked [s]
+    change: float = 1.0  # time to get from the column into the formation [s]
+    margin: float = 0.6  # margin of the local rule [m]
 
     def __post_init__(self) -> None:
         if not isinstance(self.blocked, int) or self.blocked < 1:
@@ -74,10 +75,10 @@ class LookAhead:
                 raise ConfigurationError(f"LookAhead {name} must be non-negative and finite, got {value}")
 
     def start(self, scenario: Scenario, teams: int) -> Lanes:
-        """The lanes and the rule of a scenario; all teams in formation.
+        """Initial memory: all teams in formation.
 
         Raises:
-            ConfigurationError: the scenario lacks an order, or the margin cannot be.
+            ConfigurationError: the scenario lacks an order, or the margin is invalid.
         """
         rule = make_local_rule(scenario, self.margin)
         slots, column = map(np.ascontiguousarray, scenario.formations)
@@ -85,15 +86,15 @@ class LookAhead:
         return Lanes(np.full(teams, IN_FORMATION), *fixed)
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:
-        """One motion per team, avoidance per agent."""
+        """Decide one motion per team, and avoidance per agent."""
         agents = self.watch(observation, memory).sum(axis=1)
         motion = self.motion(agents, self.blocked, memory.motion)
         return rule_orders(observation, motion, memory.rule), memory._replace(motion=motion)
 
     def watch(self, observation: Observation, lanes: Lanes) -> np.ndarray:
-        """(B, N, M) bool, what each agent sees by itself: whether its lane of the formation is blocked (M = 1).
+        """(B, N, M) bool, conditions that each agent checks by itself: whether its lane of the formation is blocked (M = 1).
 
-        Where orders lead into obstacles, also whether its lane of the column is, and whether it is shut in (M = 3).
+        If ``lanes.exposed``, also whether its lane of the column is blocked, and whether it is shut in (M = 3).
         """
         sights = [blocked_lanes(observation, lanes, (-self.behind, self.ahead))]
         if lanes.exposed:
@@ -102,10 +103,10 @@ class LookAhead:
         return np.stack(sights, axis=-1)
 
     def motion(self, agents: np.ndarray, enough: np.ndarray | int, last: np.ndarray) -> np.ndarray:
-        """IN_COLUMN or IN_FORMATION, from how many ``agents`` (..., M) see each thing that :meth:`watch` names.
+        """IN_COLUMN or IN_FORMATION, from the number of ``agents`` (..., M) for which each condition of :meth:`watch` holds.
 
-        ``enough`` (...,) blocked lanes make a column, and ``last`` (...,) is the motion in force. Numbers of agents may be
-        estimates: half an agent decides.
+        ``enough`` (...,) is the number of blocked lanes that makes a column, and ``last`` (...,) the motion in force. Numbers of
+        agents may be estimates, so thresholds lie half an agent below.
         """
         column = agents[..., 0] >= enough - 0.5
         if agents.shape[-1] > 1:
@@ -115,7 +116,7 @@ class LookAhead:
 
 
 def blocked_lanes(observation: Observation, lanes: Lanes, span: tuple[float, float]) -> np.ndarray:
-    """(B, N) bool: whose slot comes within the safe distance of an obstacle between ``span[0]`` and ``span[1]`` [s] from now."""
+    """(B, N) bool: whether an agent's slot comes within d_OA of an obstacle between ``span[0]`` and ``span[1]`` [s] from now."""
     blocked = np.zeros(observation.position.shape[:2], dtype=np.bool_)
     obstacles = np.ascontiguousarray(observation.obstacles)
     _fill_blocked(observation.time, lanes.slots, lanes.path, lanes.safe_distance, span, obstacles, blocked)
@@ -123,7 +124,7 @@ def blocked_lanes(observation: Observation, lanes: Lanes, span: tuple[float, flo
 
 
 def shut_in(observation: Observation, lanes: Lanes, change: float) -> np.ndarray:
-    """(B, N) bool: whose straight way from the column to its slot an obstacle is in, now, ``change`` [s] from now or between."""
+    """(B, N) bool: whether an agent's straight way from column to slot is blocked now, in ``change`` [s] or half-way between."""
     shut = np.zeros(observation.position.shape[:2], dtype=np.bool_)
     obstacles = np.ascontiguousarray(observation.obstacles)
     for ahead in (0.0, 0.5 * change, change):
@@ -133,9 +134,9 @@ def shut_in(observation: Observation, lanes: Lanes, change: float) -> np.ndarray
 
 @compiled
 def _fill_blocked(time, slots, path, safe_distance, span, obstacles, blocked):
-    """:func:`blocked_lanes` into ``blocked`` (B, N).
+    """Fill ``blocked`` (B, N) for :func:`blocked_lanes`.
 
-    Slot and obstacle both move in straight lines, so the time at which they are nearest is known, and nothing is sampled.
+    Slot and obstacle both move in straight lines, so the time of closest approach is computed exactly, without sampling.
     """
     for b in range(blocked.shape[0]):
         for i in range(blocked.shape[1]):
@@ -158,7 +159,7 @@ def _fill_blocked(time, slots, path, safe_distance, span, obstacles, blocked):
 def _add_shut(time, ahead, slots, column, path, safe_distance, obstacles, shut):
     """Set ``shut`` (B, N) where an obstacle is within d_OA of the segment from column to slot, ``ahead`` [s] from now.
 
-    Slots and column move along the path, obstacles as they do.
+    Slots and column move along the path, obstacles with their velocity.
     """
     for b in range(shut.shape[0]):
         t = time[b] + ahead

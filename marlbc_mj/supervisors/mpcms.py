@@ -1,28 +1,29 @@
 """MPCMS, the model predictive mission supervisor (Chen et al. 2020): the order sequence with the least cost over a horizon.
 
-At every mission step, over C candidate sequences of joint orders and H predicted mission steps k,
+At every mission step, it minimizes over C candidate sequences of joint orders, with H predicted mission steps k,
 
     J = sum_k sum_i (w_F E_FM,i + w_R E_FR,i + w_slack max(0, d_OA + margin - d_i)) + w_s (changes of the joint order),
 
-and the first orders of the best sequence are given. E = min(1, |p - slot| / tolerance): an error counts in units of the formation
-tolerance, up to one of it, since beyond it a formation is lost whatever the distance. Unbounded distances make w_F |p - FM slot|
-pull at agents in the column too, and then avoidance serves as a brake that keeps them from it (measured: switches 6/4/2/6).
-A step costs w_R per agent in formation, w_F in the column and w_F + w_R in neither, which is how G orders them.
+and returns the first orders of the best sequence. E = min(1, |p - slot| / tolerance): the error in units of the formation
+tolerance, at most 1, since beyond the tolerance a formation is lost at any distance. With unbounded errors, w_F |p - FM slot|
+pulls at agents in the column too, and avoidance then acts as a brake against that pull (measured: switches 6/4/2/6).
+A step costs w_R per agent in formation, w_F in the column and w_F + w_R in neither, the same ranking as that of G.
 
-The cost's terms, H and weights are the project's specification. The rest is reconstructed: E, the slots (those of the desired
-centroid), the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the candidates.
-These hold the joint order, or change it once, at one of the ``instants``: either the whole team to FM or to FR, or avoidance on
-top of (or off) the common motion behavior for up to ``together`` agents. Under the set-based composition only the former: there
-avoidance on top changes no motion. With one agent at a time the team forms a column at the
-gate, where two discs close in on two agents. With two at a time it dodges into the gate, and two agents violate (measured: 1.5
-and 1.1 s).
-The specified margin, 0.05 m, suits a reference; the agents lag behind it when it jumps. With that margin the case study sees
-0.035 s of violation at the entry of the gate, so 0.15 m is the default.
+The terms of the cost, H and the weights are the project's specification. The rest is reconstructed: E, the slots (those of the
+desired centroid), the slack (linear in the missing clearance), the count of changes (per team, as r2, erratum 11) and the
+candidates. A candidate holds the joint order, or changes it once, at one of the ``instants``. It changes the whole team to FM or
+to FR, or puts avoidance on top of (or takes it off) the common motion behavior for up to ``together`` agents. Under the set-based
+composition there are only the former, since avoidance on top has no effect there. With one agent at a time, the team forms a
+column at the gate, where two discs close in on two agents. With two at a time, it dodges into the gate, and two agents violate
+the safe distance (measured: 1.5 and 1.1 s).
 
-The MuJoCo prediction sees that lag, and needs a longer horizon for it: the way back from the column takes about 3 s, so
-that within the 2 s of H = 40 leaving it never pays, and the case study ends in the column; with H = 120 it is left, with 80 not.
-Under the set-based composition the kinematic way back takes longer than 2 s, too, since avoidance bounds it: with H = 40 the case
-study ends in the column, with 60 it does not, and on drawn layouts returns rise to H = 120 (STEPS_AHEAD).
+The specified margin, 0.05 m, suits the reference itself, but agents lag behind a reference that jumps. With that margin the case
+study has 0.035 s of violation at the entry of the gate, so the default is 0.15 m.
+
+The MuJoCo prediction includes this lag and therefore needs a longer horizon. The way back from the column takes about 3 s, so
+leaving it never pays off within the 2 s of H = 40, and the case study ends in the column; with H = 120 the team leaves it, with
+80 it does not. Under the set-based composition the kinematic way back also takes longer than 2 s, since avoidance slows it: with
+H = 40 the case study ends in the column, with 60 it does not, and on drawn layouts returns increase up to H = 120 (STEPS_AHEAD).
 """
 
 from dataclasses import dataclass, field
@@ -47,68 +48,67 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError, unknown
 
 STEPS_AHEAD = {"null-space": 40, "set-based": 120}
 """Default horizons by composition [mission steps]."""
-MOST_ORDERS = 3_000_000  # candidates x steps x agents in one decision of one team
+MOST_ORDERS = 3_000_000  # upper limit of candidates x steps x agents in one decision of one team
 PREDICTIONS = ("kinematic", "mujoco")
 PREDICTED_FROM = ("measured", "reference")
 AVOIDANCE = "OA"
 
 
 class Joint(NamedTuple):
-    """A joint order: the motion behavior that the whole team shares, and who has avoidance on top."""
+    """A joint order: the motion behavior of the whole team, and which agents have avoidance on top."""
 
     motion: int  # 0: FM, 1: FR
     avoiding: tuple[bool, ...]  # (N,)
 
 
 class Candidates(NamedTuple):
-    """Candidate sequences; the first one holds the present joint order."""
+    """Candidate sequences; the first one keeps the joint order in force."""
 
-    first: tuple[Joint, ...]  # (C,) joint order at the present mission step
+    first: tuple[Joint, ...]  # (C,) joint order of each candidate at the present mission step
     orders: np.ndarray  # (C, H, N) int64, indices into scenario.orders
     switches: np.ndarray  # (C,) changes of the joint order along the horizon
-    branch: np.ndarray  # (C,) int64, predicted step of the change; H for the first one
+    branch: np.ndarray  # (C,) int64, predicted step of the change; H for the first candidate
 
 
 class Forecast(NamedTuple):
-    """State of MPCMS for B teams between mission steps."""
+    """Memory of :class:`MPCMS` for B teams."""
 
     scenario: Scenario
     behaviors: Behaviors  # of the scenario
-    joints: tuple[Joint, ...]  # (B,) in force
+    joints: tuple[Joint, ...]  # (B,) joint orders in force
     reference: np.ndarray | None  # (B, N, 2) its own copy of p_r [m]; None before the first decision
-    twins: World | None  # MuJoCo prediction: a world per team that was given the same orders
-    worlds: World | None  # MuJoCo prediction: a world per candidate of one team
-    way: GiveWay  # to other agents
-    solver_ms: float = 0.0  # what the prediction took in the last decision [ms]
+    twins: World | None  # MuJoCo prediction: one world per team, stepped with the same orders
+    worlds: World | None  # MuJoCo prediction: one world per candidate of one team
+    way: GiveWay  # data for giving way to other agents
+    solver_ms: float = 0.0  # computing time of the prediction in the last decision [ms]
 
 
 @dataclass(frozen=True)
 class MPCMS:
     """Receding horizon over joint priority orders; see the module for the cost.
 
-    The kinematic prediction integrates the reference with the laws of the mission itself, from the ``measured`` positions or from
-    its own copy of the reference. The MuJoCo prediction simulates force law, limit and drag of every candidate; what a supervisor
-    cannot measure (reference, controller state) comes from a twin world that was given the same orders, the drag is the nominal
-    one. That twin is part of the memory and moves with every decision. All teams' candidates are judged in one call; only the
-    MuJoCo prediction simulates one team after the other. Where the scenario has agent avoidance, it goes on top of the orders
-    given while a neighbor is too close; no candidate knows of it. If no candidate keeps the clearance, the least violation is
-    chosen.
+    The kinematic prediction integrates the reference with the mission's own laws, from the ``measured`` positions or from its own
+    copy of the reference. The MuJoCo prediction simulates force law, limit and nominal drag for every candidate. It takes what a
+    supervisor cannot measure (reference, controller state) from a twin world, which is stepped with the same orders and is part
+    of the memory. The candidates of all teams are evaluated in one call; only the MuJoCo prediction runs one team after the
+    other. If the scenario has agent avoidance, AA goes on top of the returned orders while a neighbor is too close; candidates
+    ignore it. If no candidate keeps the clearance, the one with the least violation is chosen.
 
     Raises:
-        ConfigurationError: a negative horizon or weight, an empty candidate set, an unknown prediction.
+        ConfigurationError: an invalid horizon, weight or number of threads, an empty candidate set, or an unknown prediction.
     """
 
-    horizon: int | None = None  # H [mission steps]; None: that of the composition in STEPS_AHEAD
+    horizon: int | None = None  # H [mission steps]; None: the composition's entry in STEPS_AHEAD
     w_formation: float = 1.0  # w_F, per agent and step
     w_reconstruction: float = 0.3  # w_R, per agent and step
     w_switch: float = 20.0  # w_s, per change of the joint order
     margin: float = 0.15  # clearance wanted beyond d_OA [m]
     slack: float = 1e4  # weight of missing clearance [1/m]
-    instants: tuple[int, ...] = tuple(range(0, 40, 5))  # predicted steps at which a candidate may switch
+    instants: tuple[int, ...] = tuple(range(0, 40, 5))  # predicted steps at which a candidate may change the joint order
     together: int = 1  # agents whose avoidance a candidate may change at once
     prediction: Literal["kinematic", "mujoco"] = "kinematic"
     start_from: Literal["measured", "reference"] = "measured"  # kinematic prediction only
-    threads: int = 1
+    threads: int = 1  # threads for the prediction
     controller: Controller = field(default_factory=SORLC)  # MuJoCo prediction only
 
     def __post_init__(self) -> None:
@@ -136,10 +136,11 @@ class MPCMS:
             raise ConfigurationError(f"MPCMS threads must be between 1 and {most} on this machine, got {self.threads}")
 
     def start(self, scenario: Scenario, teams: int) -> Forecast:
-        """All teams in formation.
+        """Initial memory: all teams in formation.
 
         Raises:
-            ConfigurationError: the scenario lacks an order, or the MuJoCo prediction a compiled controller.
+            ConfigurationError: the scenario lacks an order, there are too many candidates, or the MuJoCo prediction has no
+                compiled controller and disturbance.
         """
         joint = Joint(0, (False,) * scenario.agents)
         most = 1 + len(set(self.instants)) * len(self._changes(scenario, Joint(0, (True,) * scenario.agents)))
@@ -154,7 +155,7 @@ class MPCMS:
         return Forecast(scenario, make_behaviors(scenario), (joint,) * teams, None, twins, worlds, give_way(scenario))
 
     def _simulators(self, scenario: Scenario, teams: int, candidates: int) -> tuple[World, World]:
-        """A twin per team, all in the state of the first, and worlds for the ``candidates`` of one team."""
+        """One twin per team, all in the same state, and worlds for the ``candidates`` of one team."""
         twins = World(scenario, self.controller, worlds=teams)
         if not twins.native:
             raise ConfigurationError("MPCMS prediction 'mujoco' needs a compiled controller and disturbance")
@@ -163,10 +164,10 @@ class MPCMS:
         return twins, World(scenario, self.controller, worlds=candidates, threads=self.threads)
 
     def decide(self, observation: Observation, memory: Forecast) -> tuple[np.ndarray, Forecast]:
-        """The first orders of each team's cheapest sequence; ties go to the earlier candidate, holding first.
+        """The first orders of each team's cheapest sequence; ties go to the earlier candidate, the first of which holds.
 
         Raises:
-            SimulationError: a team without any candidate of finite cost.
+            SimulationError: no candidate of a team has a finite cost.
         """
         firsts, pairs = self._pairs(memory)
         began = perf_counter()
@@ -182,7 +183,7 @@ class MPCMS:
         return orders, memory._replace(joints=joints, reference=reached[best], solver_ms=solver_ms)
 
     def _predict(self, observation: Observation, memory: Forecast, pairs: Pairs) -> tuple[np.ndarray, np.ndarray]:
-        """Costs (C,) of all pairs, without switches, and positions (C, N, 2) after the first predicted step."""
+        """Costs (C,) of all pairs, excluding switches, and positions (C, N, 2) after the first predicted step."""
         trails, start = None, observation.position
         if memory.twins is not None and memory.worlds is not None:
             follow(memory.twins, observation)
@@ -199,7 +200,7 @@ class MPCMS:
         return costs, trails[:, 0]
 
     def _pairs(self, memory: Forecast) -> tuple[tuple[Joint, ...], Pairs]:
-        """First joint orders of the candidates of every joint order in force, one after the other, and which are each team's."""
+        """The candidates of all joint orders in force: their first joint orders, and the pairs of team and candidate."""
         known = {joint: self._candidates(memory.scenario, joint) for joint in dict.fromkeys(memory.joints)}
         firsts, orders, switches, branch = zip(*known.values(), strict=True)
         counts = {joint: len(candidates.orders) for joint, candidates in known.items()}
@@ -210,7 +211,7 @@ class MPCMS:
         return tuple(chain(*firsts)), Pairs(team, sequence, np.concatenate(orders), np.concatenate(branch), extra)
 
     def _changes(self, scenario: Scenario, joint: Joint) -> list[Joint]:
-        """Joint orders that one change leads to."""
+        """Joint orders that are one change away from ``joint``."""
         agents = range(len(joint.avoiding))
         nobody = (False,) * len(agents)
         team = [Joint(motion, nobody) for motion in (0, 1)]
@@ -220,7 +221,7 @@ class MPCMS:
         return [j for j in dict.fromkeys((*team, *single)) if j != joint]
 
     def _candidates(self, scenario: Scenario, joint: Joint) -> Candidates:
-        """All sequences from the joint order in force."""
+        """All candidate sequences from the joint order ``joint``."""
         motions = scenario.formation_names
         orders = tuple((scenario.orders.index(m), scenario.orders.index(f"{AVOIDANCE}>{m}")) for m in motions)
         return _sequences(joint, tuple(self._changes(scenario, joint)), orders, self._horizon(scenario), self.instants)
@@ -230,13 +231,17 @@ class MPCMS:
 
 
 def avoids_anyway(scenario: Scenario) -> bool:
-    """Whether avoidance on top of an order changes no motion: it bounds every motion, and stands before other such bounds."""
+    """Whether avoidance on top has no effect: it already bounds every motion, and precedes all other inequality tasks."""
     keeps = np.flatnonzero(keeps_array(scenario.behaviors))
     return scenario.composition == "set-based" and len(keeps) > 0 and scenario.behaviors[keeps[0]].name == AVOIDANCE
 
 
 def _cheapest(costs: np.ndarray, team: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """(B,) the pair with the least of ``costs`` (C,) of every team, the first of equals; ``team`` (C,) is in order."""
+    """(B,) index of the pair with the least of ``costs`` (C,) per team, the first of equals; ``team`` (C,) is sorted.
+
+    Raises:
+        SimulationError: no pair of a team has a finite cost.
+    """
     first = np.searchsorted(team, np.arange(len(time)))
     rank = np.arange(len(team)) - first[team]
     table = np.full((len(time), rank.max() + 1), np.inf)
@@ -253,9 +258,9 @@ def _cheapest(costs: np.ndarray, team: np.ndarray, time: np.ndarray) -> np.ndarr
 def _sequences(
     joint: Joint, changes: tuple[Joint, ...], orders: tuple[tuple[int, int], ...], horizon: int, instants: tuple[int, ...]
 ) -> Candidates:
-    """Hold, then every change at every instant, later instants first: of two equal plans the one that waits is taken.
+    """Candidates: hold, then every change at every instant, later instants first; of two equal plans, the first is taken.
 
-    ``orders``: by motion behavior, the order without and with avoidance.
+    ``orders`` has the order without and with avoidance for each motion behavior.
     """
     plans = [(joint, horizon), *((change, k) for k in sorted(set(instants), reverse=True) for change in changes)]
     rows = {j: np.array([orders[j.motion][avoids] for avoids in j.avoiding], dtype=np.int64) for j in (joint, *changes)}

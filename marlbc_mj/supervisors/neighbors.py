@@ -1,7 +1,7 @@
-"""Giving way: how a supervisor uses agent avoidance (AA) where a scenario has it.
+"""Giving way: how a supervisor uses agent avoidance (AA) if a scenario has it.
 
-An agent whose nearest neighbor is within ``REACH`` d_AA, measured or between references, gets AA on top of the order it would
-have had anyway: AA>OA>FM for OA>FM. Everyone decides for itself; in a scenario without AA nothing changes.
+An agent with a neighbor within ``REACH`` d_AA, by measured positions or by references, gets AA on top of the order it would get
+otherwise: AA>OA>FM for OA>FM. Every agent decides for itself. In a scenario without AA nothing changes.
 """
 
 from typing import NamedTuple
@@ -14,23 +14,23 @@ from marlbc_mj.engine.observation import Observation
 from marlbc_mj.scenarios import Scenario
 
 REACH = 1.5
-"""In d_AA. Beyond 1, so that AA is on top before the distance is too small; there it does nothing yet."""
+"""Distance for giving way, in d_AA. Above 1, so that AA is on top before agents are too close; beyond d_AA it has no effect."""
 
 
 class GiveWay(NamedTuple):
     """Orders and distances for giving way in one scenario."""
 
     distance: float  # d_AA [m]; 0 without AA
-    lifted: np.ndarray  # (orders,) index of the same order with AA on top
+    lifted: np.ndarray  # (O,) for every order, the index of the same order with AA on top
 
 
 def no_way(scenario: Scenario) -> GiveWay:
-    """Nobody gives way: every order stays as it is."""
+    """Data with which nobody gives way: every order is unchanged."""
     return GiveWay(0.0, np.arange(len(scenario.orders)))
 
 
 def give_way(scenario: Scenario) -> GiveWay:
-    """From a scenario's behaviors."""
+    """The data for giving way from a scenario's behaviors; those of :func:`no_way` without AA."""
     orders = scenario.orders
     for j, behavior in enumerate(scenario.behaviors):
         if getattr(behavior, "sees", None) == NEAREST_NEIGHBOR:
@@ -41,7 +41,7 @@ def give_way(scenario: Scenario) -> GiveWay:
 
 
 def crowded(observation: Observation, way: GiveWay, reach: float = REACH) -> np.ndarray:
-    """(B, N) bool: whose nearest neighbor is within ``reach`` d_AA."""
+    """(B, N) bool: whether an agent's nearest neighbor is within ``reach`` d_AA."""
     if way.distance == 0.0:
         return np.zeros(observation.position.shape[:2], dtype=bool)
     gap = np.minimum(spacing(observation.position), spacing(observation.reference))
@@ -49,7 +49,7 @@ def crowded(observation: Observation, way: GiveWay, reach: float = REACH) -> np.
 
 
 def lift(orders: np.ndarray, observation: Observation, way: GiveWay) -> np.ndarray:
-    """Orders (B, N), with AA on top where a neighbor is too close."""
+    """``orders`` (B, N) with AA on top where a neighbor is too close."""
     if way.distance == 0.0:
         return orders
     return np.asarray(np.where(crowded(observation, way), way.lifted[orders], orders))

@@ -1,4 +1,4 @@
-"""Supervisors of one team, wrapped to decide for B teams: one memory per team, one call per team."""
+"""A wrapper with which a supervisor of one team decides for B teams: one memory and one call per team."""
 
 import inspect
 from dataclasses import dataclass
@@ -14,15 +14,15 @@ from marlbc_mj.util.modules import guarded
 
 
 class Memories(NamedTuple):
-    """B teams between two mission steps."""
+    """Memory of :class:`OneTeam`."""
 
-    teams: tuple[object, ...]  # (B,) memory of each
-    solver_ms: float | None = None  # what their solvers took in the last decision, all together [ms]; None: they do not tell
+    teams: tuple[object, ...]  # (B,) memory of each team
+    solver_ms: float | None = None  # total time of their solvers in the last decision [ms]; None if they do not report it
 
 
 @dataclass(frozen=True)
 class OneTeam:
-    """B teams under a supervisor that decides for one; they are asked one after the other."""
+    """B teams under a supervisor that decides for one; it is called for one team after the other."""
 
     supervisor: OneTeamSupervisor
 
@@ -35,7 +35,7 @@ class OneTeam:
         """The decisions of all teams, stacked.
 
         Raises:
-            ConfigurationError: a decision of wrong shape or type, or velocities for some teams only.
+            ConfigurationError: a decision of wrong shape or type, or velocities for only some of the teams.
         """
         answers = [ask_supervisor(self.supervisor, observation.team(b), own) for b, own in enumerate(memory.teams)]
         decisions, memories = zip(*answers, strict=True)
@@ -43,10 +43,10 @@ class OneTeam:
 
 
 def stack_decisions(decisions: tuple[Decision, ...], agents: int) -> Decision:
-    """One decision for B teams of B decisions for one team of N ``agents`` each.
+    """Stack the decisions for B single teams of N ``agents`` into one decision for all.
 
     Raises:
-        ConfigurationError: a decision of wrong shape or type, or velocities for some teams only.
+        ConfigurationError: a decision of wrong shape or type, or velocities for only some of the teams.
     """
     orders, velocities = zip(*(split_decision(decision, (agents,)) for decision in decisions), strict=True)
     given = [velocity for velocity in velocities if velocity is not None]
@@ -58,16 +58,16 @@ def stack_decisions(decisions: tuple[Decision, ...], agents: int) -> Decision:
 
 
 def _total(memories: tuple[object, ...]) -> float | None:
-    """Sum of what the memories tell as ``solver_ms`` [ms]; None where they do not."""
+    """Sum of ``solver_ms`` over the memories [ms]; None if no memory has it."""
     told = [ms for memory in memories if (ms := getattr(memory, "solver_ms", None)) is not None]
     return float(sum(told)) if told else None
 
 
 def batched(supervisor: Supervisor | OneTeamSupervisor) -> Supervisor:
-    """The supervisor itself, or :class:`OneTeam` around it where its ``start`` takes the scenario alone.
+    """The supervisor itself, or wrapped in :class:`OneTeam` if its ``start`` takes only the scenario.
 
     Raises:
-        ConfigurationError: an object without ``start`` and ``decide``.
+        ConfigurationError: a class, or an object without ``start`` and ``decide``.
     """
     if isinstance(supervisor, type):
         raise ConfigurationError(f"supervisor is the class {supervisor.__name__}; make one of it: {supervisor.__name__}()")

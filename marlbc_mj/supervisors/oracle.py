@@ -1,11 +1,12 @@
 """The oracle: switch times found by search on the simulator itself, for one scenario under one controller.
 
-It is the reference that every supervisor's regret is measured by: it knows the future, never violates the safe distance at any
-substep, and within that has the highest return (13) that the search found. Schedules are cached with seed and budget.
+Every supervisor's regret is measured against it. It knows the future, violates the safe distance at no substep, and has the
+highest return (13) that the search found under this condition. Schedules are cached with seed and budget.
 
 The search is an evolution strategy on the table of commands (mission steps, agents). Changes of command come in clusters, and the
-rewards between two clusters depend on the first of them only, nearly; so every candidate mutates all segments at once, and the
-next incumbent is put together from the best segment of each. What counts is its own simulation, never the sum.
+rewards between two clusters depend almost only on the earlier one. So every candidate mutates all segments at once, and one
+candidate of the next population combines the best version of each segment. It is scored by its own simulation, never by the sum
+of its segments' scores.
 """
 
 import json
@@ -31,12 +32,12 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.provenance import config_hash, plain_data, versions
 from marlbc_mj.util.stretches import stretches
 
-POPULATION = 64  # candidates simulated at a time
-APART = 4.0  # [s] changes of command further apart than this are in different segments
+POPULATION = 64  # candidates per generation, simulated together
+APART = 4.0  # [s] changes of command farther apart than this belong to different segments
 LEAD = 1.0  # [s] a segment begins this long before its first change
-MEAN_SHIFT = 4.0  # [mission steps] by which a mutation moves a change of command
-MEAN_RUN = 5.0  # [mission steps] for which a mutation holds a new command
-SPREAD = 1.5  # [s] standard deviation of a new command's start around a change
+MEAN_SHIFT = 4.0  # [mission steps] mean distance by which a mutation moves a change of command
+MEAN_RUN = 5.0  # [mission steps] mean duration of a command that a mutation inserts
+SPREAD = 1.5  # [s] standard deviation of an inserted command's start around a change
 
 
 class Found(NamedTuple):
@@ -44,15 +45,15 @@ class Found(NamedTuple):
 
     windows: tuple[Window, ...]
     total: float  # the return
-    scripted: float | None  # the return of the scenario's own schedule; None if that violates
+    scripted: float | None  # return of the scenario's own schedule (of ``start`` if it has none); None if it violates
     seed: int
     budget: int  # episodes allowed
     episodes: int  # episodes simulated
-    start: tuple[Window, ...] | None = None  # where the search started; None: at the scenario's own schedule
+    start: tuple[Window, ...] | None = None  # schedule from which the search started; None: the scenario's own
 
 
 class Evaluation(NamedTuple):
-    """Candidates' episodes."""
+    """Results of one episode per candidate."""
 
     reward: np.ndarray  # (B, M)
     violated: np.ndarray  # (B, M) bool: d <= d_OA for any agent after any substep of the mission step
@@ -64,7 +65,7 @@ def shipped_schedules() -> Path:
 
 
 def cache_key(scenario: Scenario, controller: Controller) -> str:
-    """Hash of all that decides a schedule's return; names, descriptions and the scripted schedule do not."""
+    """Hash of everything that affects a schedule's return, without names, descriptions and the scripted schedule."""
     bare = plain_data(replace(scenario, name="", description="", schedule=()))
     for field in fields(scenario):
         if field.metadata == YOUNG and getattr(scenario, field.name) == field.default:
@@ -73,10 +74,10 @@ def cache_key(scenario: Scenario, controller: Controller) -> str:
 
 
 def read_cache(path: Path) -> dict[str, Any]:
-    """Entries by key; empty where there is no file yet.
+    """Entries of the cache by key; empty if the file does not exist.
 
     Raises:
-        ConfigurationError: the file cannot be read.
+        ConfigurationError: the file cannot be read or is not a cache.
     """
     try:
         entries = json.loads(path.read_text()) if path.exists() else {}
@@ -88,7 +89,7 @@ def read_cache(path: Path) -> dict[str, Any]:
 
 
 def save_schedule(found: Found, scenario: Scenario, controller: str, path: Path | None = None) -> None:
-    """Add a schedule to the cache (the shipped one by default), in the place of a former one with the same key."""
+    """Add a schedule to the cache (the shipped one by default); it replaces an entry with the same key."""
     path = path or shipped_schedules()
     entry = {"scenario": scenario.name, "controller": controller, **found._asdict(), "versions": versions()}
     write_json(path, read_cache(path) | {cache_key(scenario, make_controller(controller)): entry})
@@ -99,14 +100,14 @@ class Oracle:
     """Plays the cached schedule of this scenario under this controller."""
 
     controller: str = "sorlc"  # name of the controller that the schedule was found with
-    cache: Path | None = None  # None: the one that comes with the package
-    unperturbed: bool = False  # play the schedule of the unperturbed scenario on its draws, for which it is no oracle
+    cache: Path | None = None  # None: the shipped one
+    unperturbed: bool = False  # play the schedule of the unperturbed scenario on perturbed draws, for which it is not an oracle
 
     def start(self, scenario: Scenario, teams: int) -> Schedule:
         """Memory: the cached schedule, which all teams share.
 
         Raises:
-            ConfigurationError: no schedule was found yet for this scenario and controller.
+            ConfigurationError: the cache has no schedule for this scenario and controller.
         """
         return self.schedule(scenario).start(scenario, teams)
 
@@ -120,7 +121,11 @@ class Oracle:
         return Scripted(tuple(Window(*w) for w in entry["windows"]), scenario.formation_names[0])
 
     def entry(self, scenario: Scenario) -> dict[str, Any]:
-        """The cache's entry: windows, total (return), seed, budget, episodes, versions."""
+        """The cache entry: a dict with the fields of :class:`Found`, scenario, controller and versions.
+
+        Raises:
+            ConfigurationError: there is none for this scenario and controller.
+        """
         entries = read_cache(self.cache or shipped_schedules())
         known = replace(scenario, perturbation=Perturbation()) if self.unperturbed else scenario
         key = cache_key(known, make_controller(self.controller))
@@ -149,14 +154,14 @@ def search(
 
     Args:
         controller: name of the controller.
-        budget: episodes that may be simulated; rounded down to whole populations, at least one.
+        budget: greatest number of episodes, rounded down to whole populations; at least one population.
         population: candidates simulated at a time.
-        start: schedule to start from; the scenario's by default.
-        progress: called with the episodes simulated so far and the best safe return (-inf before there is one).
+        start: initial schedule; the scenario's own by default.
+        progress: called with the number of episodes so far and the best safe return (-inf before there is one).
 
     Raises:
         ConfigurationError: a perturbed scenario, drawn or moving obstacles, no schedule to start from, a negative seed, too small
-            a budget, or no safe schedule found.
+            a budget or population, or no safe schedule found.
     """
     if scenario.layout is not None or scenario.moving:
         raise ConfigurationError(
@@ -207,14 +212,14 @@ def evaluate(world: World, tables: np.ndarray) -> Evaluation:
 
 
 def command_table(scenario: Scenario, windows: tuple[Window, ...]) -> np.ndarray:
-    """(M, N) index into ``scenario.orders.commands`` at every mission step, as the scripted supervisor gives them."""
+    """(M, N) index into ``scenario.orders.commands`` at every mission step when the scripted supervisor plays ``windows``."""
     schedule = Scripted(windows, scenario.formation_names[0]).start(scenario, 1)
     times = np.arange(scenario.mission_steps) * scenario.mission_step
     return np.asarray(scenario.orders.command_of[orders_at(times, schedule)])
 
 
 def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:
-    """The schedule that gives this table, default outside: bounds halfway between mission steps, -1 where all agents agree."""
+    """The schedule that plays ``table``: no windows for the default, bounds halfway between mission steps, agent -1 for all."""
     default = scenario.orders.commands.index(scenario.formation_names[0])
     runs: dict[tuple[int, int, int], list[int]] = {}
     for i in range(scenario.agents):
@@ -231,7 +236,7 @@ def windows_of(table: np.ndarray, scenario: Scenario) -> tuple[Window, ...]:
 
 
 def segments(table: np.ndarray, scenario: Scenario) -> list[slice]:
-    """Mission steps cut shortly before every cluster of changes, so that what a cluster leads to is in its own segment."""
+    """Split mission steps shortly before every cluster of changes, so that a segment contains the effects of its cluster."""
     changes = np.flatnonzero((np.diff(table, axis=0) != 0).any(axis=1)) + 1
     apart, lead = (round(t / scenario.mission_step) for t in (APART, LEAD))
     firsts = [c for k, c in enumerate(changes) if k == 0 or c - changes[k - 1] > apart]
@@ -240,12 +245,12 @@ def segments(table: np.ndarray, scenario: Scenario) -> list[slice]:
 
 
 def _score(result: Evaluation, b: int) -> tuple[float, float]:
-    """Safety first: minus the mission steps in violation, then the return."""
+    """Score of a candidate, compared in order: minus the number of mission steps in violation, then the return."""
     return -float(result.violated[b].sum()), float(result.reward[b].sum())
 
 
 def _assemble(tables: np.ndarray, result: Evaluation, cuts: list[slice], incumbent: int) -> np.ndarray:
-    """Every segment from the candidate that did best in it, the incumbent where none did better."""
+    """Combine the best candidate's version of each segment; the incumbent's where none is better."""
     table: np.ndarray = tables[incumbent].copy()
     for cut in cuts:
         score = result.reward[:, cut].sum(axis=1) - 1e6 * result.violated[:, cut].sum(axis=1)
@@ -267,7 +272,7 @@ def _mutate(table: np.ndarray, scenario: Scenario, rng: np.random.Generator) -> 
 
 
 def _shift(table: np.ndarray, cut: slice, rng: np.random.Generator) -> None:
-    """Move a change of command within ``cut`` to another time, for one agent or for all that change with it."""
+    """Move one change of command within ``cut`` to another time, for all agents that change then or for one of them."""
     changed = np.diff(table[cut], axis=0) != 0
     if not changed.any():
         return
@@ -284,7 +289,7 @@ def _shift(table: np.ndarray, cut: slice, rng: np.random.Generator) -> None:
 
 
 def _overwrite(table: np.ndarray, cut: slice, scenario: Scenario, rng: np.random.Generator) -> None:
-    """Hold some command for a few steps, near a change or anywhere in ``cut``, for some agents or all."""
+    """Insert a command for a few steps, near a change or anywhere in ``cut``, for some or all agents."""
     changes = np.flatnonzero((np.diff(table[cut], axis=0) != 0).any(axis=1)) + 1 + cut.start
     if len(changes) and rng.random() < 0.9:
         first = int(rng.normal(rng.choice(changes), SPREAD / scenario.mission_step))

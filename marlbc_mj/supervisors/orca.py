@@ -1,15 +1,17 @@
 """ORCA, optimal reciprocal collision avoidance (van den Berg, Guy, Lin & Manocha 2011), on the formation's velocity.
 
 Two bodies of combined radius r at relative position x collide within the horizon tau if their relative velocity lies in a
-truncated cone. The smallest change u that takes it out of there is shared: each agent takes half, half-plane
+truncated cone. Let u be the smallest change that takes it out of the cone. Each of two agents takes half of u, so its velocities
+are restricted to the half-plane
 
-    n^T (v - v_now - u/2) >= 0,   n outward from the cone at that place;
+    n^T (v - v_now - u/2) >= 0,   n the outward normal of the cone at that point.
 
-an obstacle takes none, so the agent takes all. The new velocity is the one nearest to v_c in all half-planes; where they exclude
-each other, the one with the least greatest violation. Nothing is composed and nobody switches: the label stays that of the
-behavior whose velocity v_c is. So ORCA avoids, and waits where its way is closed: it knows no column.
+With an obstacle, the agent takes all of u. The new velocity is the one nearest to v_c in all half-planes. If these contradict
+each other, the greatest violation is minimized, that of obstacles first. There is no composition and there are no switches: the
+label is always that of the behavior of v_c. So ORCA avoids, and waits where the way is closed; it never forms a column.
 
-Agents are discs of d_AA, obstacles discs of their radius plus d_OA, both plus a margin for the tracking error.
+The combined radius r is d_AA for two agents, and d_OA plus the obstacle's radius for an agent and an obstacle, each plus a margin
+for the tracking error.
 """
 
 from dataclasses import dataclass
@@ -34,9 +36,9 @@ class ORCA(Cruising):
 
     motion: str = "FM"
     horizon: float = 2.0  # tau [s]
-    margin: float = 0.1  # [m]
-    speed: float = 6.0  # bound of velocities [m/s]
-    sight: float = 15.0  # gap beyond which a body is ignored [m]
+    margin: float = 0.1  # added to both distances [m]
+    speed: float = 6.0  # upper bound of speeds [m/s]
+    sight: float = 15.0  # a body more than this beyond its wanted distance is ignored [m]
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.horizon) and self.horizon > 0):
@@ -52,21 +54,21 @@ class ORCA(Cruising):
 
 @allocation_free
 def orca_plane(between, radius, v, share, times, plane):
-    """The half-plane of velocities that one body permits: ``plane`` (3,) is n, c of n^T v >= c.
+    """The half-plane n^T v >= c of velocities that one body permits, written to ``plane`` as n, c.
 
     Args:
         between: (2, 2) position x [m] and velocity [m/s] of the body relative to the agent.
-        radius: r of both together [m].
-        v: (2,) velocity of the agent now [m/s].
-        share: of the change u that the agent takes, 1/2 or 1.
-        times: tau, and the time in which bodies that overlap are to part [s].
+        radius: combined radius r [m].
+        v: (2,) current velocity of the agent [m/s].
+        share: share of the change u that the agent takes, 1/2 or 1.
+        times: tau, and the time within which overlapping bodies should separate [s].
         plane: (3 or more,), written in place.
     """
     x, y = between[0, 0], between[0, 1]
     square = x * x + y * y
     inside = square <= radius * radius
     time = times[1] if inside else times[0]
-    w_x, w_y = -between[1, 0] - x / time, -between[1, 1] - y / time  # from the middle of the cut-off disc
+    w_x, w_y = -between[1, 0] - x / time, -between[1, 1] - y / time  # relative to the center of the truncating disc
     length = np.sqrt(w_x * w_x + w_y * w_y)
     back = w_x * x + w_y * y
     if inside or (back < 0.0 and back * back > radius * radius * length * length):
@@ -85,7 +87,7 @@ def orca_plane(between, radius, v, share, times, plane):
 
 @compiled
 def _avoid(wish, bodies, horizon, out):
-    """New velocities (B, N, 2) [m/s] of all agents of all teams into ``out``."""
+    """Write the new velocities (B, N, 2) [m/s] of all agents of all teams to ``out``."""
     agents, obstacles = wish.at.shape[1], wish.obstacles.shape[1]
     planes = np.empty((2 * (agents + obstacles), 4))  # rows: normal, offset, level
     between, still, times = np.empty((2, 2)), np.zeros(2), (horizon, bodies.step)

@@ -1,8 +1,9 @@
-"""Predictions of candidate order sequences: the kinematic reference or MuJoCo worlds over a horizon, and the cost of the outcome.
+"""Predictions of candidate order sequences over a horizon, by the kinematic reference or by MuJoCo worlds, and their cost.
 
-A *pair* is a team and one of its candidates; C counts the pairs of all B teams. Both predictions fill the same *trails*
-(C, H, N, 2): the position of every agent at the end of every predicted mission step, for each pair. One cost judges them. Pairs
-are shared out over threads; results do not depend on how many. Obstacles that move are predicted to keep the velocity they have.
+A *pair* is a team and one of its candidates; C is the number of pairs of all B teams. Both predictions produce *trails*
+(C, H, N, 2), the position of every agent at the end of every predicted mission step for each pair, which the same cost function
+evaluates. Pairs are distributed over threads; results do not depend on their number. Moving obstacles are predicted to keep
+their velocity.
 """
 
 from typing import NamedTuple
@@ -22,79 +23,79 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Scenario
 
 CERTAIN = 1.0 - 1e-9
-"""Factor of a lower bound, far beyond what rounding makes of it."""
+"""Factor that reduces a lower bound by far more than rounding errors."""
 
 
 class CostWeights(NamedTuple):
-    """The numbers of the cost."""
+    """The parameters of the cost."""
 
     formation: float  # w_F, per agent and step
     reconstruction: float  # w_R, per agent and step
-    slack: float  # of missing clearance [1/m]
-    clearance: float  # wanted [m]
-    scale: float  # of distances to slots [m]
+    slack: float  # w_slack, weight of missing clearance [1/m]
+    clearance: float  # d_min, clearance wanted [m]
+    scale: float  # distance from a slot that counts as an error of 1 [m]
 
 
 class Problem(NamedTuple):
-    """The mission's numbers for a prediction; flat, for compiled code."""
+    """The numbers of mission and cost for a prediction; flat, for compiled code."""
 
     mission_step: float  # [s]
     formations: np.ndarray  # (2, N, 2) slots of FM, then of FR [m]
-    w_formation: float  # the rest as in :class:`CostWeights`
+    w_formation: float  # this and the next four as in :class:`CostWeights`
     w_reconstruction: float
     w_slack: float
     least: float
     scale: float
-    floor: float  # least cost of a step of the team: nobody is at both of its slots
+    floor: float  # lower bound of the team's cost per step, since no agent can be at both of its slots
 
 
 class Teams(NamedTuple):
-    """Where predictions for B teams begin."""
+    """Initial states of predictions for B teams."""
 
-    first: np.ndarray  # (B,) int64, mission steps made
-    start: np.ndarray  # (B, N, 2) [m]
-    moving: np.ndarray  # (B, N, 2) velocity that references of limited acceleration go on from [m/s]
+    first: np.ndarray  # (B,) int64, number of mission steps so far
+    start: np.ndarray  # (B, N, 2) initial positions [m]
+    moving: np.ndarray  # (B, N, 2) initial velocity, for references of limited acceleration [m/s]
     obstacles: np.ndarray  # (B, K, 3), or (B, K, 5) where they move
 
 
 class Pairs(NamedTuple):
-    """The candidates of every team, one team after the other; many pairs may share a sequence of orders.
+    """The candidates of every team, one team after the other; several pairs may share a sequence of orders.
 
-    The other sequences of a team begin like its first one.
+    A team's other sequences begin with the same orders as its first one.
     """
 
     team: np.ndarray  # (C,) int64, below B
     sequence: np.ndarray  # (C,) int64, below S
     orders: np.ndarray  # (S, H, N) int64, indices into scenario.orders
     branch: np.ndarray  # (S,) int64, predicted step from which a sequence differs from the first of its team
-    extra: np.ndarray  # (S,) what a sequence costs beside its trail, more than the first of its team
+    extra: np.ndarray  # (S,) cost of a sequence besides its trail, relative to the first sequence of its team
 
 
 class Scratch(NamedTuple):
-    """Scratch arrays of C pairs of B teams."""
+    """Scratch arrays for C pairs of B teams."""
 
     lead: np.ndarray  # (C,) int64, the first pair of the same team
-    rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.plan.workspace_rows
-    velocity: np.ndarray  # (C, 2, N, 2) v_r now and before
+    rows: np.ndarray  # (C, W, 2), see marlbc_mj.engine.inequalities.workspace_rows
+    velocity: np.ndarray  # (C, 2, N, 2) v_r of this step and of the previous one
     obstacles: np.ndarray  # (C, K, 3 or 5)
-    grid: np.ndarray  # (C, room)
-    held: np.ndarray  # (B, H + 1) cost of the first pair before every step
-    held_velocity: np.ndarray  # (B, H + 1, N, 2) its v_r there
+    grid: np.ndarray  # (C, grid_room)
+    held: np.ndarray  # (B, H + 1) cost of the team's first pair before every step
+    held_velocity: np.ndarray  # (B, H + 1, N, 2) v_r of that pair before every step
 
 
 def problem(scenario: Scenario, weights: CostWeights) -> Problem:
     """The numbers of a scenario that a prediction needs, under the weights of a cost."""
-    apart = np.linalg.norm(scenario.formations[0] - scenario.formations[1], axis=-1)  # (N,) of an agent's two slots
+    apart = np.linalg.norm(scenario.formations[0] - scenario.formations[1], axis=-1)  # (N,) distance between an agent's two slots
     floor = min(weights.formation, weights.reconstruction) * np.minimum(1.0, apart / weights.scale).sum()
     return Problem(scenario.mission_step, scenario.formations, *weights, floor=float(floor))
 
 
 @allocation_free
 def predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs):
-    """Reference trail and cost of pair ``c``: p_r += dt v_r, with v_r of (12) evaluated at p_r as in the ``virtual`` reference.
+    """Reference trail and cost of pair ``c``: p_r += dt v_r, with v_r composed at p_r as in the ``virtual`` reference.
 
-    A pair goes on from the step at which it leaves its team's first pair, which is predicted before it. It is given up, with an
-    infinite cost, as soon as it cannot become cheaper than that one.
+    The prediction starts at the step where the pair's orders first differ from those of its team's first pair, which must have
+    been predicted before. It stops, with an infinite cost, as soon as the pair cannot become cheaper than the first one.
     """
     b, lead, orders = pairs.team[c], scratch.lead[c], pairs.orders[pairs.sequence[c]]
     begin, horizon = np.int64(0), orders.shape[0]
@@ -124,8 +125,8 @@ def predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs):
 
 @allocation_free
 def advance_reference(moment, before, orders, behaviors, problem, teams, pairs, scratch, after):
-    """Predicted step k of pair c, ``moment`` = (c, k), from p_r ``before`` to ``after`` (N, 2) [m] under ``orders`` (N,); moves
-    its v_r on.
+    """Predict step k of pair c, ``moment`` = (c, k), from p_r ``before`` to ``after`` (N, 2) [m] under ``orders`` (N,); update
+    the pair's v_r.
     """
     c, k = moment
     b, duration = pairs.team[c], problem.mission_step
@@ -141,13 +142,13 @@ def advance_reference(moment, before, orders, behaviors, problem, teams, pairs, 
 
 @allocation_free
 def cannot_win(cost, steps, problem, extra, best):
-    """Whether a candidate that cost ``cost`` so far and costs ``extra`` anyway ends above ``best``, with ``steps`` to go."""
+    """Whether a candidate with ``cost`` so far, a fixed ``extra`` cost and ``steps`` to go must end above ``best``."""
     return (cost + steps * problem.floor + extra) * CERTAIN > best
 
 
 @allocation_free
 def copy_points(points, into):
-    """``into`` = ``points``, both (N, 2)."""
+    """Copy ``points`` (N, 2) to ``into`` (N, 2)."""
     for i in range(points.shape[0]):
         for axis in range(2):
             into[i, axis] = points[i, axis]
@@ -155,7 +156,7 @@ def copy_points(points, into):
 
 @allocation_free
 def extrapolate(t, obstacles, drifted):
-    """Obstacles after ``t`` [s]: themselves where they are at rest."""
+    """Predicted obstacles after ``t`` [s], in ``drifted`` if they move; obstacles at rest are returned unchanged."""
     if obstacles.shape[1] == 3:
         return obstacles
     drift(t, obstacles, drifted)
@@ -164,7 +165,7 @@ def extrapolate(t, obstacles, drifted):
 
 @allocation_free
 def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
-    """Cost of the trail (H, N, 2) [m] of pair ``c``: the sum of :func:`add_step_cost` over all predicted steps."""
+    """Cost of the trail (H, N, 2) [m] of pair ``c``: :func:`add_step_cost` summed over all predicted steps."""
     cost = 0.0
     for k in range(trail.shape[0]):
         cost = add_step_cost(cost, k, trail[k], c, behaviors, problem, teams, pairs, scratch)
@@ -173,10 +174,10 @@ def trail_cost(c, behaviors, problem, teams, pairs, scratch, trail):
 
 @allocation_free
 def add_step_cost(cost, k, at, c, behaviors, problem, teams, pairs, scratch):
-    """``cost`` and what predicted step ``k`` of pair ``c`` adds to it, the team being ``at`` (N, 2) [m] at its end.
+    """``cost`` plus the cost of predicted step ``k`` of pair ``c``, at whose end the team is ``at`` (N, 2) [m].
 
-    The sum over agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale). Slots are those of the
-    desired centroid.
+    It is the sum over agents of w_F E_FM + w_R E_FR + w_slack max(0, d_min - d), E = min(1, |p - slot| / scale). Slots are placed
+    around the desired centroid.
     """
     b, duration, formations = pairs.team[c], problem.mission_step, problem.formations
     now, normal = scratch.rows[c, :2], scratch.rows[c, 2]
@@ -194,14 +195,14 @@ def add_step_cost(cost, k, at, c, behaviors, problem, teams, pairs, scratch):
 
 @compiled
 def _predict_serial(behaviors, problem, teams, pairs, scratch, trails, costs):
-    """:func:`predict_pair` of every pair, one after the other; the first of each team comes before its others."""
+    """Run :func:`predict_pair` for all pairs in order; the first pair of a team precedes its others."""
     for c in range(costs.shape[0]):
         predict_pair(c, behaviors, problem, teams, pairs, scratch, trails, costs)
 
 
 @threaded
 def _predict_parallel(behaviors, problem, teams, pairs, scratch, trails, costs):
-    """:func:`predict_pair` of every pair, shared out over numba's threads; the same numbers as in series."""
+    """Run :func:`predict_pair` for all pairs on numba's threads; results are identical to those in series."""
     for c in numba.prange(costs.shape[0]):
         if scratch.lead[c] == c:
             predict_pair(np.int64(c), behaviors, problem, teams, pairs, scratch, trails, costs)
@@ -212,7 +213,7 @@ def _predict_parallel(behaviors, problem, teams, pairs, scratch, trails, costs):
 
 @compiled
 def _judge(behaviors, problem, teams, pairs, scratch, trails, costs):
-    """:func:`trail_cost` of every pair, whose trails are filled."""
+    """Compute :func:`trail_cost` for all pairs from given trails."""
     for c in range(costs.shape[0]):
         costs[c] = trail_cost(c, behaviors, problem, teams, pairs, scratch, trails[c])
 
@@ -229,8 +230,8 @@ def judge_pairs(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Costs (C,) and trails (C, H, N, 2) of all pairs of teams and candidates.
 
-    ``trails`` given are judged as they are, else the kinematic reference is predicted. A pair that cannot become cheaper than the
-    first one of its team is given up: its cost is infinite, and the rest of its trail NaN.
+    Without ``trails``, the kinematic reference is predicted; the prediction of a pair that cannot become cheaper than the first
+    one of its team stops early, which leaves its cost infinite and the rest of its trail NaN. Costs exclude ``pairs.extra``.
     """
     kinematic, (count, teams_count, horizon) = trails is None, (len(pairs.team), len(teams.first), pairs.orders.shape[1])
     if trails is None:
@@ -256,10 +257,10 @@ def judge_pairs(
 
 
 def follow(twins: World, observation: Observation) -> None:
-    """Put twins (worlds of their own, one per team) where the measured teams are; references and controllers stay theirs."""
+    """Move twins, one world per team, to the teams' measured states; their references and controllers keep their own states."""
     state = twins.state
     state.position[:], state.velocity[:], state.obstacles[:] = observation.position, observation.velocity, observation.obstacles
-    if state.motions.shape[1]:  # a twin's obstacles go straight on from where they are seen
+    if state.motions.shape[1]:  # obstacles of a twin move in straight lines from their observed places
         place, velocity = observation.obstacles[..., :3], observation.obstacles[..., 3:]
         state.motions[..., :2], state.motions[..., 2:] = velocity, 0.0
         state.anchors[:] = place
@@ -269,9 +270,9 @@ def follow(twins: World, observation: Observation) -> None:
 
 
 def simulate(twins: World, team: int, worlds: World, orders: np.ndarray) -> np.ndarray:
-    """Trails (C, H, N, 2) of candidate ``orders`` (C, H, N) of one team through MuJoCo: positions, from its twin's state on.
+    """Trails (C, H, N, 2) of one team under candidate ``orders`` (C, H, N), simulated by MuJoCo from the state of its twin.
 
-    ``worlds`` holds at least C worlds; those left over repeat the first candidate. A world that diverges stays where it did.
+    ``worlds`` must have at least C worlds; the surplus ones repeat the first candidate. A world that diverges stops there.
     """
     candidates, horizon = orders.shape[:2]
     every = np.concatenate([orders, np.repeat(orders[:1], worlds.worlds - candidates, axis=0)])

@@ -1,15 +1,16 @@
-"""Rollout (Bertsekas 2021): a one-step improvement of the local rule by simulating it, over when the team changes its formation.
+"""Rollout (Bertsekas 2021): improves the local rule by simulating it, to find when the team should change its formation.
 
-The base policy is the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): each agent decides by itself when to avoid, under
-the set-based composition the composition does. What it cannot decide is when the team should form the column and when it should
-go back. So only that is searched: every ``interval`` each of 33 plans (hold the motion; change it after 0 to 8 s; change it back
-3, 6 or 10 s later, or never) is followed over 14 s with the base policy in the loop, and the first motion of the cheapest is
-given until the next decision. The cost is that of MPCMS (:mod:`marlbc_mj.supervisors.mpcms`), with its weights.
+The base policy is the local rule (:mod:`marlbc_mj.supervisors.set_based_rule`): each agent decides by itself when to avoid (under
+the set-based composition, the composition does). The base policy cannot decide when the team should form the column and when to
+return, so only this is searched. Every ``interval``, each of 33 plans (hold the motion; change it after 0 to 8 s; change it back
+3, 6 or 10 s later, or never) is simulated over 14 s with the base policy in the loop, and the first motion of the cheapest plan
+is used until the next decision. The cost is that of MPCMS (:mod:`marlbc_mj.supervisors.mpcms`), with the same weights.
 
-The prediction is that of the kinematic reference, and of the lag behind it: an agent follows its reference as a mass under
-proportional-derivative feedback within its force limit. Without the lag, jumps of the reference look free: at gain 8 a change of
-formation asks for up to 96 m/s, and the agents, 200 m/s^2 at most, cut corners that the reference does not. The model is the
-nominal one, whatever controller really runs; ``lag=False`` judges the reference itself. Obstacles keep the velocity they have.
+The prediction covers the kinematic reference and the lag behind it: each agent tracks its reference as a mass under
+proportional-derivative feedback within its force limit. Without the lag, jumps of the reference seem to cost nothing. But at gain
+8 a change of formation demands up to 96 m/s, and agents, with at most 200 m/s^2, cut corners that the reference does not. The
+feedback is nominal, whatever controller is used; ``lag=False`` evaluates the reference itself. Obstacles are assumed to keep
+their velocity.
 """
 
 from dataclasses import dataclass
@@ -30,33 +31,33 @@ from marlbc_mj.supervisors.set_based_rule import IN_FORMATION, LocalRule, follow
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 TRACKING_STIFFNESS, TRACKING_DAMPING = 100.0, 100.0
-"""Nominal feedback on errors of position [1/s^2] and velocity [1/s]: the gains of SORLC (40)."""
+"""Nominal feedback gains on position error [1/s^2] and velocity error [1/s]: those of SORLC (40)."""
 
 
 class Plans(NamedTuple):
     """P plans over H mission steps; the first one holds the motion.
 
-    They make a tree: what two plans have in common is predicted once.
+    They form a tree: the common beginning of two plans is predicted once.
     """
 
-    changed: np.ndarray  # (P, H) int64, 1 where the motion is not the one in force
-    switches: np.ndarray  # (P,) changes of the motion
-    level: np.ndarray  # (P,) int64, changes of the motion that the plan may make: 0 to 2
-    branch: np.ndarray  # (P,) int64, step at which it leaves the last plan before it of the level below; 0 for the first one
+    changed: np.ndarray  # (P, H) int64, 1 where the motion differs from the one in force
+    switches: np.ndarray  # (P,) number of changes of the motion
+    level: np.ndarray  # (P,) int64, depth in the tree: changes of the motion, 0 to 2, even if beyond the horizon
+    branch: np.ndarray  # (P,) int64, step at which it leaves its parent, the last plan before it with one level less
 
 
 class Lag(NamedTuple):
     """How an agent follows its reference."""
 
-    substeps: int  # per mission step; 0: the agent is where its reference is
+    substeps: int  # substeps per mission step; 0: agents are at their references
     substep: float  # [s]
-    limit: float  # of the acceleration per axis [m/s^2]
+    limit: float  # upper bound of the acceleration per axis [m/s^2]
 
 
 class Present(NamedTuple):
-    """Where predictions for B teams begin; named as :class:`~marlbc_mj.supervisors.prediction.Teams` where it means the same."""
+    """Initial states of predictions for B teams; field names as in :class:`~marlbc_mj.supervisors.prediction.Teams`."""
 
-    first: np.ndarray  # (B,) int64, mission steps made
+    first: np.ndarray  # (B,) int64, number of mission steps so far
     reference: np.ndarray  # (B, N, 2) p_r [m]
     position: np.ndarray  # (B, N, 2) measured [m]
     moving: np.ndarray  # (B, N, 2) measured velocity [m/s]
@@ -64,13 +65,13 @@ class Present(NamedTuple):
 
 
 class One(NamedTuple):
-    """Which team is predicted, as the cost asks for it."""
+    """The team that is predicted, in the form of ``Pairs`` that the cost function reads."""
 
     team: np.ndarray  # (1,) int64
 
 
 class Tracks(NamedTuple):
-    """Predictions before every step k = 0 to H, along the last plan of each level; (3, H + 1, N, 2) each."""
+    """Predicted states before every step k = 0 to H, along the last plan of each level; (3, H + 1, N, 2) each."""
 
     reference: np.ndarray  # p_r [m]
     position: np.ndarray  # p [m]
@@ -79,19 +80,19 @@ class Tracks(NamedTuple):
 
 
 class Room(NamedTuple):
-    """Scratch of one prediction."""
+    """Scratch arrays for the prediction of one team."""
 
     rows: np.ndarray  # (1, W, 2), see marlbc_mj.engine.inequalities.workspace_rows
     tracks: Tracks
-    costs: np.ndarray  # (3, H + 1) of the steps before each step
-    known: np.ndarray  # (3,) int64, last k of the tracks that is predicted
-    before: np.ndarray  # (N, 2) v_r of the step before [m/s]
+    costs: np.ndarray  # (3, H + 1) cost accumulated before each step
+    known: np.ndarray  # (3,) int64, last predicted k of the tracks of each level
+    before: np.ndarray  # (N, 2) v_r of the previous step [m/s]
     obstacles: np.ndarray  # (1, K, 3 or 5)
     orders: np.ndarray  # (N,) int64
 
 
 class Search(NamedTuple):
-    """Data that stay the same over an episode."""
+    """Data that are constant over an episode."""
 
     rule: LocalRule
     plans: Plans
@@ -103,7 +104,7 @@ class Search(NamedTuple):
 class Improved(NamedTuple):
     """Memory of :class:`Rollout`."""
 
-    motion: np.ndarray  # (B,) int64, in force
+    motion: np.ndarray  # (B,) int64, motion in force
     due: np.ndarray  # (B,) int64, mission step of the next decision
     search: Search
     room: Room
@@ -111,9 +112,9 @@ class Improved(NamedTuple):
 
 @allocation_free
 def follow_plan(one, plan, best, motion, search, present, room):
-    """Cost of a plan for one team, whose motion in force is ``motion``; infinite once it cannot be less than ``best``.
+    """Cost of a plan for one team with ``motion`` in force; infinite if it cannot be less than ``best``.
 
-    What is predicted goes into ``room``.
+    Predictions are stored in ``room``.
     """
     level, first = search.plans.level[plan], search.plans.branch[plan]
     tracks, costs, changed = room.tracks, room.costs[level], search.plans.changed[plan]
@@ -121,7 +122,7 @@ def follow_plan(one, plan, best, motion, search, present, room):
     if level == 0:
         _begin(one.team[0], present, tracks)
         costs[0] = 0.0
-    elif room.known[level - 1] < first:  # where the other was given up this one would have been, too
+    elif room.known[level - 1] < first:  # its parent was given up before the branch, and so is this plan
         return np.inf
     else:
         _copy(tracks, (level - 1, first), (level, first))
@@ -140,7 +141,7 @@ def follow_plan(one, plan, best, motion, search, present, room):
 
 @allocation_free
 def predict_step(moment, b, motion, search, present, room):
-    """Predicted mission step ``moment`` = (level, k) of team ``b``, the base policy in the loop; moves what is at k + 1."""
+    """Predict mission step ``moment`` = (level, k) of team ``b`` with the base policy; advances the state stored at k + 1."""
     level, k = moment
     rule, behaviors, dt, tracks = search.rule, search.rule.behaviors, search.problem.mission_step, room.tracks
     p_r, v_r = tracks.reference[level, k + 1], tracks.reference_velocity[level, k + 1]
@@ -157,7 +158,7 @@ def predict_step(moment, b, motion, search, present, room):
 
 @allocation_free
 def _begin(b, present, tracks):
-    """Team ``b`` as it is now, before the first step of the first level."""
+    """Store the present state of team ``b`` before the first step of level 0."""
     copy_points(present.reference[b], tracks.reference[0, 0])
     copy_points(present.position[b], tracks.position[0, 0])
     copy_points(present.moving[b], tracks.velocity[0, 0])
@@ -166,7 +167,7 @@ def _begin(b, present, tracks):
 
 @allocation_free
 def _copy(tracks, source, target):
-    """Copy what is predicted at one moment (level, k) to another."""
+    """Copy the predicted state at one (level, k) to another."""
     copy_points(tracks.reference[source], tracks.reference[target])
     copy_points(tracks.position[source], tracks.position[target])
     copy_points(tracks.velocity[source], tracks.velocity[target])
@@ -175,7 +176,7 @@ def _copy(tracks, source, target):
 
 @allocation_free
 def _give_way(at, way, orders, no_grid):
-    """Put agent avoidance on top of ``orders`` (N,) where a neighbor is too close at ``at`` (N, 2) [m]; how many."""
+    """Put AA on top of ``orders`` (N,) for agents ``at`` (N, 2) [m] with a neighbor too close; return their number."""
     count = 0
     if way.distance == 0.0:
         return count
@@ -189,9 +190,9 @@ def _give_way(at, way, orders, no_grid):
 
 @allocation_free
 def follow_reference(dt, lag, p_r, p, v, v_r):
-    """One mission step: p_r += dt v_r, and every agent after it, v' = clip(-k (p - p_r) - c (v - v_r)), all (N, 2).
+    """Advance references and agents by one mission step: p_r' = v_r, v' = clip(-k (p - p_r) - c (v - v_r)), all (N, 2).
 
-    Integrated as the plant is: v first, then p, then p_r.
+    Integration is that of the plant: v first, then p, then p_r.
     """
     for i in range(p.shape[0]):
         for axis in range(2):
@@ -207,7 +208,7 @@ def follow_reference(dt, lag, p_r, p, v, v_r):
 
 @compiled
 def _search(due, motion, search, present, room, costs):
-    """Costs (D, P) of all plans for the teams ``due`` (D,), whose motions in force are ``motion`` (B,)."""
+    """Compute ``costs`` (D, P) of all plans for the teams ``due`` (D,); ``motion`` (B,) holds the motions in force."""
     one = One(np.zeros(1, dtype=np.int64))
     for d in range(due.shape[0]):
         one.team[0] = due[d]
@@ -220,18 +221,18 @@ def _search(due, motion, search, present, room, costs):
 
 @dataclass(frozen=True)
 class Rollout:
-    """The local rule, and a search over when the team forms the column and goes back; see the module.
+    """The local rule, with a search for when the team forms the column and returns to the formation; see the module.
 
     Raises:
-        ConfigurationError: a time, weight or margin that cannot be, or times that are no mission steps.
+        ConfigurationError: an invalid time, weight or clearance.
     """
 
-    margin: float = 0.6  # of the local rule [m]
-    horizon: float = 14.0  # [s]
-    interval: float = 0.5  # between decisions [s]
-    change_after: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # [s]
-    back_after: tuple[float, ...] = (3.0, 6.0, 10.0)  # after the change [s]; a plan that never goes back is always there
-    w_formation: float = 1.0  # weights as those of MPCMS
+    margin: float = 0.6  # margin of the local rule [m]
+    horizon: float = 14.0  # predicted time [s]
+    interval: float = 0.5  # time between decisions [s]
+    change_after: tuple[float, ...] = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # times of the change [s]
+    back_after: tuple[float, ...] = (3.0, 6.0, 10.0)  # until the change back [s]; there are also plans without one
+    w_formation: float = 1.0  # weights as in MPCMS
     w_reconstruction: float = 0.3
     w_switch: float = 20.0
     slack: float = 1e4  # weight of missing clearance [1/m]
@@ -253,10 +254,10 @@ class Rollout:
                 raise ConfigurationError(f"Rollout {name} must lie between 0 and the horizon of {self.horizon:g} s, got {value}")
 
     def start(self, scenario: Scenario, teams: int) -> Improved:
-        """All teams in formation, each to decide at once.
+        """Initial memory: all teams in formation, with a decision due at once.
 
         Raises:
-            ConfigurationError: the scenario lacks an order, or the margin cannot be.
+            ConfigurationError: the scenario lacks an order, or the margin is invalid.
         """
         plans = self.plans(scenario.mission_step)
         weights = CostWeights(
@@ -286,16 +287,16 @@ class Rollout:
         return Improved(np.full(teams, IN_FORMATION), np.full(teams, -1), search, room)
 
     def plans(self, step: float) -> Plans:
-        """The plans over the horizon in mission steps of ``step`` [s]: hold, then later changes before earlier ones."""
+        """The plans in mission steps of ``step`` [s]: hold first, then later changes before earlier ones."""
         horizon, *rest = (round(time / step) for time in (self.horizon, *self.change_after, *self.back_after))
         count = len(self.change_after)
         return _make_plans(horizon, tuple(rest[:count]), tuple(rest[count:]))
 
     def decide(self, observation: Observation, memory: Improved) -> tuple[np.ndarray, Improved]:
-        """The rule's orders under the motion in force, which is searched for anew where a decision is due.
+        """The rule's orders under the motion in force; teams with a due decision search for a new motion first.
 
         Raises:
-            SimulationError: a team without any plan of finite cost.
+            SimulationError: no plan of a team has a finite cost.
         """
         due = np.flatnonzero(observation.step >= memory.due)
         if len(due):
@@ -303,7 +304,7 @@ class Rollout:
         return rule_orders(observation, memory.motion, memory.search.rule), memory
 
     def _decide_motion(self, observation: Observation, memory: Improved, due: np.ndarray) -> Improved:
-        """The memory with new motions for the teams ``due`` (D,); of equal plans the first."""
+        """The memory with new motions for the teams ``due`` (D,); of equally cheap plans the first is used."""
         search, seen = memory.search, observation
         fields = seen.step, seen.reference, seen.position, seen.velocity, seen.obstacles
         costs = np.empty((len(due), len(search.plans.switches)))
@@ -321,7 +322,7 @@ class Rollout:
 
 @lru_cache(maxsize=16)
 def _make_plans(horizon: int, changes: tuple[int, ...], backs: tuple[int, ...]) -> Plans:
-    """Hold, then every change, the later ones first, each for good and then back after each of ``backs``; in mission steps."""
+    """Hold, then every change, later ones first: each without change back, then with one after each of ``backs``; in steps."""
     spans = [(horizon, horizon)]
     spans += [(k, end) for k in sorted(set(changes), reverse=True) for end in (horizon, *(k + back for back in backs))]
     level = np.array([0] + [1, *(2 for _ in backs)] * len(set(changes)))

@@ -1,4 +1,4 @@
-"""The scripted supervisor: the scenario's own schedule of orders, the fewest switches its geometry allows."""
+"""The scripted supervisor: plays the scenario's schedule of orders, with the fewest switches its geometry allows."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,22 +11,22 @@ from marlbc_mj.scenarios import Scenario, Window
 from marlbc_mj.util.errors import ConfigurationError
 
 ON_BOUND = 1e-9
-"""A time within this of a bound is on it [s]: 3 * 0.05 > 0.15 in floating point, yet it is the bound."""
+"""Tolerance within which a time lies on a bound [s], since 3 * 0.05 > 0.15 in floating point."""
 
 
 class Schedule(NamedTuple):
-    """Windows of W orders, and what holds outside all of them."""
+    """W windows with their orders, and the default orders outside all of them."""
 
-    default: np.ndarray  # (N,) orders
+    default: np.ndarray  # (N,) orders outside all windows
     start: np.ndarray  # (W,) [s]
     end: np.ndarray  # (W,) [s]
-    agent: np.ndarray  # (W,) whose order it is; -1 for everybody
+    agent: np.ndarray  # (W,) agent that gets the order; -1 for all
     order: np.ndarray  # (W,)
 
 
 @dataclass(frozen=True)
 class Scripted:
-    """Orders by the clock. A time on the bound of a window is outside it."""
+    """Orders as a function of mission time. A time on a bound of a window is outside it."""
 
     windows: tuple[Window, ...] | None = None  # None: the scenario's schedule
     default: str = "FM"  # order outside all windows
@@ -35,7 +35,7 @@ class Scripted:
         """Memory: the schedule, which all teams share.
 
         Raises:
-            ConfigurationError: no schedule, or one that does not fit the scenario.
+            ConfigurationError: there is no schedule, or it does not fit the scenario.
         """
         windows = scenario.schedule if self.windows is None else self.windows
         if not windows:
@@ -50,7 +50,7 @@ class Scripted:
         )
 
     def decide(self, observation: Observation, memory: Schedule) -> tuple[np.ndarray, Schedule]:
-        """Later windows win over earlier ones."""
+        """Orders of the schedule at each team's time; of overlapping windows the last in the list applies."""
         return orders_at(observation.time, memory), memory
 
 
@@ -63,7 +63,7 @@ def orders_at(times: np.ndarray, schedule: Schedule) -> np.ndarray:
 
 @compiled
 def _play(time, schedule, orders):
-    """Put the orders of the windows that are open at ``time`` (B,) [s] into ``orders`` (B, N), which are the default."""
+    """Write the orders of the windows open at ``time`` (B,) [s] to ``orders`` (B, N), which contains the defaults."""
     for b in range(len(time)):
         for w in range(len(schedule.start)):
             if schedule.start[w] + ON_BOUND < time[b] < schedule.end[w] - ON_BOUND:

@@ -1,16 +1,16 @@
 """The set-based rule: avoidance goes on top only while the formation's velocity would break the safe distance (project).
 
-It is the idea of set-based tasks (Moe et al. 2016), an inequality that is active only where it is about to be broken, said in
-priority orders and so under the published composition (12). Each agent decides for itself, at its own reference p_r, without any
-prediction: with v the velocity of its formation behavior alone,
+It expresses the idea of set-based tasks (Moe et al. 2016), an inequality that is active only where it is about to be broken, by
+priority orders, and so works under the published composition (12). Each agent decides for itself, at its own reference p_r,
+without further prediction. With v the velocity of its formation behavior alone,
 
     OA on top   if   min(d(p_r), d(p_r + dt v)) < d_OA + margin   and   n^T (v - o') < 0,
 
-d and n the clearance from the nearest obstacle and its normal at p_r, o' the velocity of that obstacle, dt the mission step.
-Under (12) OA on top leaves the part of v along the obstacle, so the agent slides around it. Two obstacles can be told apart only
-while d_OA + margin is less than half the gap between them.
+where d is the clearance from the nearest obstacle, n its normal at p_r, o' the velocity of that obstacle and dt the mission step.
+Under (12), OA on top keeps the part of v along the obstacle, so the agent slides around it. The rule can separate two obstacles
+only if the gap between them is wider than 2 (d_OA + margin).
 
-Under the set-based composition avoidance is a constraint of every order, so the rule then gives the formation alone.
+Under the set-based composition avoidance is a constraint of every order, so the rule then returns the formation's order alone.
 """
 
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift, no_way
 from marlbc_mj.util.errors import ConfigurationError
 
 IN_FORMATION, IN_COLUMN = 0, 1
-"""The motion of a team: the first of ``scenario.formation_names``, or the second."""
+"""Motions of a team: the first of ``scenario.formation_names``, or the second."""
 
 
 class LocalRule(NamedTuple):
@@ -38,18 +38,18 @@ class LocalRule(NamedTuple):
 
     behaviors: Behaviors
     free: np.ndarray  # (2,) order of each motion without avoidance
-    avoiding: np.ndarray  # (2,) with avoidance on top; the same where the composition avoids by itself
-    least: float  # clearance from which the rule acts, d_OA + margin [m]; -inf where the composition avoids by itself
+    avoiding: np.ndarray  # (2,) order with avoidance on top; equal to ``free`` if the composition avoids by itself
+    least: float  # clearance below which the rule acts, d_OA + margin [m]; -inf if the composition avoids by itself
     step: float  # dt [s]
-    way: GiveWay  # to other agents
-    grid: np.ndarray  # scratch
+    way: GiveWay  # data for giving way to other agents
+    grid: np.ndarray  # scratch for grids of obstacles and team
 
 
 def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
-    """The rule for a scenario under its composition, as compiled code takes it fastest: by reference.
+    """The rule's data for a scenario and its composition, passed by reference for fast compiled code.
 
     Raises:
-        ConfigurationError: the scenario lacks an order, or a margin that is negative or not finite.
+        ConfigurationError: the scenario lacks an order, or the margin is negative or not finite.
     """
     if not (np.isfinite(margin) and margin >= 0):
         raise ConfigurationError(f"margin of the set-based rule must be non-negative and finite, got {margin}")
@@ -70,12 +70,12 @@ def avoids_by_itself(scenario: Scenario) -> bool:
 
 @allocation_free
 def follow_rule(t, motion, rule, at, obstacles, workspace, velocity, orders):
-    """Orders (N,) of one team by the rule, agent avoidance apart.
+    """Apply the rule to one team, without agent avoidance.
 
     Args:
         t: mission time [s].
-        motion: of the team, IN_FORMATION or IN_COLUMN.
-        rule: of the scenario.
+        motion: the team's motion, IN_FORMATION or IN_COLUMN.
+        rule: the scenario's data.
         at: (N, 2) positions at which behaviors are evaluated [m].
         obstacles: (K, 3) x, y, radius [m]; (K, 5) with their velocity [m/s] where they move.
         workspace: (WORKSPACE, 2) scratch.
@@ -83,7 +83,7 @@ def follow_rule(t, motion, rule, at, obstacles, workspace, velocity, orders):
         orders: (N,) int64, written in place.
 
     Returns:
-        How many agents have avoidance on top.
+        The number of agents with avoidance on top.
     """
     for i in range(at.shape[0]):
         orders[i] = rule.free[motion]
@@ -100,7 +100,7 @@ def follow_rule(t, motion, rule, at, obstacles, workspace, velocity, orders):
 def closes_in(p, v, rule, obstacles, rows):
     """Whether velocity ``v`` (2,) [m/s] takes an agent at ``p`` (2,) [m] closer to an obstacle than the rule allows.
 
-    The grid of the rule, if there is one, is that of these obstacles; ``rows`` (2 or more, 2) is scratch.
+    If ``rule.grid`` is not empty, it must be filled with these obstacles; ``rows`` (2 or more, 2) is scratch.
     """
     count = obstacles.shape[0]
     if count == 0 or rule.least == -np.inf:
@@ -128,7 +128,7 @@ def _fill_orders(time, motion, rule, at, obstacles, orders):
 
 
 def rule_orders(observation: Observation, motion: np.ndarray, rule: LocalRule) -> np.ndarray:
-    """(B, N) orders of B teams whose motions are ``motion`` (B,); agent avoidance on top where a neighbor is too close."""
+    """(B, N) orders of B teams with motions ``motion`` (B,); agent avoidance on top where a neighbor is too close."""
     at = observation.reference if rule.behaviors.virtual else observation.position
     orders = np.repeat(rule.free[motion][:, None], at.shape[1], axis=1)
     if rule.least == -np.inf:  # the composition avoids by itself, whatever the order
@@ -140,25 +140,25 @@ def rule_orders(observation: Observation, motion: np.ndarray, rule: LocalRule) -
 class Ruled(NamedTuple):
     """Memory of :class:`SetBasedRule`."""
 
-    motion: np.ndarray  # (B,) of every team
+    motion: np.ndarray  # (B,) motion of every team
     rule: LocalRule
 
 
 @dataclass(frozen=True)
 class SetBasedRule:
-    """The rule with one motion for the whole mission, FM unless said otherwise; see the module."""
+    """The rule with one motion for the whole mission, FM by default; see the module."""
 
-    margin: float = 0.6  # clearance beyond d_OA from which the rule acts [m]
-    column: bool = False  # FR in the place of FM
+    margin: float = 0.6  # clearance beyond d_OA below which the rule acts [m]
+    column: bool = False  # FR instead of FM
 
     def start(self, scenario: Scenario, teams: int) -> Ruled:
-        """The rule for this scenario; nothing is remembered.
+        """The rule's data for this scenario, constant over the episode.
 
         Raises:
-            ConfigurationError: the scenario lacks an order, or the margin cannot be.
+            ConfigurationError: the scenario lacks an order, or the margin is invalid.
         """
         return Ruled(np.full(teams, IN_COLUMN if self.column else IN_FORMATION), make_local_rule(scenario, self.margin))
 
     def decide(self, observation: Observation, memory: Ruled) -> tuple[np.ndarray, Ruled]:
-        """Every agent by itself."""
+        """Decide for every agent by itself."""
         return rule_orders(observation, memory.motion, memory.rule), memory

@@ -1,1 +1,1 @@
-"""Errors, files, provenance and colors: the helpers that every other package may use."""
+"""Helpers that every other package may use: errors, files, settings, provenance, colors and more."""

@@ -1,4 +1,4 @@
-"""Dataclasses with fields replaced by texts of a command line, ``name=value``."""
+"""Replacing the fields of a dataclass by ``name=value`` texts from the command line."""
 
 from dataclasses import is_dataclass, replace
 from typing import Any, ClassVar, Protocol, TypeVar
@@ -19,15 +19,15 @@ Settings = TypeVar("Settings", bound=_Dataclass)
 
 
 def with_settings(config: Settings, settings: tuple[str, ...], prefix: str = "") -> Settings:
-    """A frozen dataclass with fields replaced by ``name=value`` texts; ``outer.inner=value`` reaches a nested one.
+    """A copy of a dataclass with fields replaced by ``name=value`` texts; ``outer.inner=value`` sets a nested field.
 
     Args:
         config: the dataclass.
         settings: the texts; ``hidden=64,64`` gives a tuple.
-        prefix: text before the fields' names in messages.
+        prefix: text to put before field names in messages.
 
     Raises:
-        ConfigurationError: no such field, or a value of the wrong kind.
+        ConfigurationError: there is no such field, or a value has the wrong type.
     """
     changes: dict[str, Any] = {}
     for setting in settings:

@@ -1,4 +1,4 @@
-"""The errors that this package raises on purpose; every message names the value and the valid ones."""
+"""The errors that this package raises on purpose; each message names the wrong value and the valid ones."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -7,29 +7,29 @@ from marlbc_mj.util.text import nearest_word
 
 
 class MarlbcError(Exception):
-    """Root of all errors raised on purpose by marlbc_mj; the command line turns them into one line."""
+    """Base class of all errors that marlbc_mj raises on purpose; the command line reports them in one line."""
 
     exit_status = 2
 
 
 class ConfigurationError(MarlbcError, ValueError):
-    """A setting, a file or a combination of settings that cannot be run. Exit status 2."""
+    """An invalid setting, file or combination of settings. Exit status 2."""
 
 
 class SimulationError(MarlbcError, RuntimeError):
-    """A run that started and could not be finished, a diverged world for example. Exit status 3."""
+    """A run that started but could not finish, for example because a world diverged. Exit status 3."""
 
     exit_status = 3
 
 
 class NoSpaceError(ConfigurationError):
-    """An output that the disk has no room for; the command itself was right. Exit status 3."""
+    """An output that does not fit on the disk, although the command is valid. Exit status 3."""
 
     exit_status = 3
 
 
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
-    """The error for a name that is not in a list: says which one and which is spelled like it, and shows the list."""
+    """The error for a name that is not in a list; its message has the name, a similarly spelled one and the list."""
     names = list(valid)
     like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"
@@ -37,10 +37,10 @@ def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError
 
 
 def check_named_once(kind: str, names: Sequence[str]) -> None:
-    """Refuse names of which one is given twice; ``kind`` says what they name.
+    """Check that no name occurs twice; ``kind`` is the word for the named things in the message.
 
     Raises:
-        ConfigurationError: showing the names.
+        ConfigurationError: a name occurs twice; the message lists all names.
     """
     if len(set(names)) != len(names):
         raise ConfigurationError(f"a{'n' if kind[0] in 'aeiou' else ''} {kind} is named twice: {', '.join(names)}")
@@ -48,10 +48,10 @@ def check_named_once(kind: str, names: Sequence[str]) -> None:
 
 @contextmanager
 def enough_memory(what: str) -> Iterator[None]:
-    """Turn a lack of memory inside the block, Python's, NumPy's or torch's, into one line about ``what``.
+    """Turn an out-of-memory error of Python, NumPy or torch inside the block into a one-line error about ``what``.
 
     Raises:
-        ConfigurationError: memory was asked for that is not there.
+        ConfigurationError: there is not enough memory.
     """
     try:
         yield

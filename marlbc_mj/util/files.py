@@ -1,4 +1,4 @@
-"""Output folders and files, which appear whole or not at all, and never replace files of others."""
+"""Output folders and files, written completely or not at all, without replacing files of other programs."""
 
 import errno
 import json
@@ -15,30 +15,30 @@ from marlbc_mj.util.locks import held, held_alone, is_held
 from marlbc_mj.util.provenance import plain_data
 
 PARTIAL = ".partial-"
-"""Part of the name of an incomplete file or folder, before the number of the process that writes it and a random token."""
+"""Part of the name of an incomplete file or folder; the writing process's number and a random token follow."""
 REPLACED = ".old-"
-"""Part of the name of a folder that is being replaced, before the same."""
+"""Part of the name of a folder that is being replaced; the same number and token follow."""
 JOBS_FOLDER = ".jobs"
-"""Folder, in an output folder, of what a run that has not ended keeps; not counted as content, and replaced with the rest."""
+"""Subfolder of an output folder for files of an unfinished run; it does not count as content and is replaced with the rest."""
 MANIFEST = ".marlbc-files.json"
-"""Names of all files that :func:`staged_folder` wrote into a folder: the only ones that ``overwrite`` removes."""
+"""File that lists all files that :func:`staged_folder` wrote into a folder; ``overwrite`` removes only these."""
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""The system's errors for an output that is too large for the disk, a quota, or a limit of the process."""
+"""System errors for an output that exceeds the disk, a quota or the process's file size limit."""
 
 
 @contextmanager
 def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A folder to write into; it becomes ``out`` if the block ends without an error, and is removed otherwise.
+    """A temporary folder to write into; it becomes ``out`` if the block ends without an error, and is removed otherwise.
 
-    What a killed process left in the same place is removed. A link to a folder stays a link.
+    Leftovers of a killed process in the same place are removed. A link to a folder stays a link.
 
     Args:
-        out: the folder.
-        overwrite: whether ``out`` may hold something. What this function wrote there before is replaced, the rest stays.
+        out: output folder.
+        overwrite: whether ``out`` may contain files. Files that this function wrote there before are replaced, others stay.
 
     Raises:
-        ConfigurationError: ``out`` is not empty (and ``overwrite`` is off), also if another process filled it during the block;
-            it is a file, or cannot be written.
+        ConfigurationError: ``out`` is not empty although ``overwrite`` is off, even if another process filled it during the
+            block; or it is a file, or cannot be written.
         NoSpaceError: the disk is full.
     """
     check_folder(out, overwrite=overwrite)
@@ -56,7 +56,7 @@ def staged_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def check_folder(out: Path, *, overwrite: bool) -> None:
-    """Raise ConfigurationError if ``out`` holds something that may not be overwritten."""
+    """Raise ConfigurationError if ``out`` is a file, or contains files and ``overwrite`` is off."""
     with writing(out):
         if out.is_file():
             raise ConfigurationError(f"output folder {out} is a file")
@@ -66,29 +66,30 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
 
 @contextmanager
 def alone_in(out: Path, *, overwrite: bool) -> Iterator[None]:
-    """Write into ``out``, which is made, as the only process of this program that does.
+    """Create ``out`` and lock it during the block, so that no other process of this program writes there.
 
-    What was made is removed, with its parents, if no file is left there.
+    Folders that were created, parents included, are removed again if they are empty at the end.
 
     Raises:
-        ConfigurationError: another process is at it; ``out`` holds something (and ``overwrite`` is off), or cannot be written.
+        ConfigurationError: another process is writing there; ``out`` is not empty although ``overwrite`` is off; or it cannot be
+            written.
     """
     check_folder(out, overwrite=overwrite)
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     with held_alone(out, busy(out)):
-        check_folder(out, overwrite=overwrite)  # a process that has ended meanwhile may have filled it
+        check_folder(out, overwrite=overwrite)  # another process may have filled it in the meantime
         try:
             yield
         finally:
             for folder in made:
-                with suppress(OSError):  # there is something in it
+                with suppress(OSError):  # it is not empty
                     folder.rmdir()
 
 
 def busy(out: Path) -> str:
-    """What is said where another process writes into ``out``."""
+    """The message for an output folder that another process is writing."""
     return f"{out} is being written by another process; wait for it or choose another folder"
 
 
@@ -99,7 +100,7 @@ def _counts_not(name: str) -> bool:
 
 @contextmanager
 def _begun(out: Path, staging: Path, create: Callable[[Path], None]) -> Iterator[None]:
-    """Create ``staging`` and hold its lock during the block. Others never see it without the lock: they would remove it."""
+    """Create ``staging`` and hold its lock during the block. It never exists unlocked, as others would then remove it."""
     first = staging.with_name(f".new-{staging.name}")
     with writing(out):
         create(first)
@@ -110,11 +111,11 @@ def _begun(out: Path, staging: Path, create: Callable[[Path], None]) -> Iterator
 
 @contextmanager
 def writing(out: Path) -> Iterator[None]:
-    """Turn the system's errors inside the block into one line about ``out``.
+    """Turn system errors inside the block into one-line errors about ``out``.
 
     Raises:
-        NoSpaceError: no space left.
-        ConfigurationError: any other error of the system.
+        NoSpaceError: there is no space left.
+        ConfigurationError: any other system error.
     """
     try:
         yield
@@ -125,7 +126,7 @@ def writing(out: Path) -> Iterator[None]:
 
 @contextmanager
 def no_space_is_an_error(out: Path) -> Iterator[None]:
-    """Turn a full disk inside the block into a NoSpaceError about ``out``; other errors pass."""
+    """Turn the errors in ``NO_SPACE`` inside the block into a NoSpaceError about ``out``; others pass unchanged."""
     try:
         yield
     except OSError as error:
@@ -135,23 +136,23 @@ def no_space_is_an_error(out: Path) -> Iterator[None]:
 
 
 def _token() -> str:
-    """The number of this process, for people, and a random one: in containers all processes may have the same number."""
+    """This process's number, for people to read, and a random one, as processes in containers can share a number."""
     return f"{os.getpid()}-{secrets.token_hex(3)}"
 
 
 def _stays(folder: Path) -> bool:
-    """Whether a folder must be filled where it is: another file system is mounted there, or it is the current one."""
+    """Whether a folder must be filled in place, as it is a mount point or the current folder."""
     return folder.is_dir() and (folder.is_mount() or folder.samefile(Path.cwd()))
 
 
 def remove_orphans(out: Path) -> tuple[Path, Path]:
-    """Remove what killed processes left of ``out``, and bring back a folder that one was about to replace.
+    """Remove leftovers of killed processes for ``out``, and restore a folder that one of them was replacing.
 
     Returns:
-        ``out`` without links, and the folder in which it is made, which is there now.
+        ``out`` with links resolved, and the folder in which its staging folder goes, created if missing.
 
     Raises:
-        ConfigurationError: the system refuses.
+        ConfigurationError: a system error occurs.
     """
     target = out.resolve()
     place = target if _stays(target) else target.parent
@@ -173,7 +174,7 @@ def _remove_orphans(target: Path, place: Path) -> None:
 
 
 def _put_in_place(out: Path, target: Path, staging: Path, overwrite: bool) -> None:
-    """Make ``staging`` the folder ``target``, which the user calls ``out``."""
+    """Turn ``staging`` into the folder ``target``, which messages call ``out``."""
     files = _files(staging)
     (staging / MANIFEST).write_text(json.dumps(files, indent=1) + "\n", encoding="utf-8")
     check_folder(out, overwrite=overwrite)
@@ -191,13 +192,13 @@ def _put_in_place(out: Path, target: Path, staging: Path, overwrite: bool) -> No
 
 
 def _files(folder: Path) -> list[str]:
-    """Names of all files below ``folder``, relative to it, but those of an unfinished run."""
+    """Paths of all files below ``folder``, relative to it, except those of an unfinished run."""
     found = (path for path in folder.rglob("*") if not path.is_dir() or path.is_symlink())
     return sorted(path.relative_to(folder).as_posix() for path in found if not path.is_relative_to(folder / JOBS_FOLDER))
 
 
 def _written_before(folder: Path) -> set[str]:
-    """What :func:`staged_folder` says that it wrote into ``folder``; nothing where it cannot be read."""
+    """The files that :func:`staged_folder` wrote into ``folder``, from its manifest; empty if that cannot be read."""
     with suppress(OSError, ValueError, TypeError):
         names = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         return {MANIFEST, *(name for name in names if ".." not in PurePosixPath(name).parts and not Path(name).is_absolute())}
@@ -206,7 +207,7 @@ def _written_before(folder: Path) -> set[str]:
 
 @contextmanager
 def _refused_when_filled(out: Path) -> Iterator[None]:
-    """The error for a name that another process took first."""
+    """Raise ConfigurationError if another process takes the name or fills the folder inside the block."""
     try:
         yield
     except FileExistsError as error:
@@ -218,7 +219,7 @@ def _refused_when_filled(out: Path) -> Iterator[None]:
 
 
 def _swap(target: Path, staging: Path, ours: set[str]) -> None:
-    """Replace ``target`` by ``staging``, into which what others wrote there is taken along first."""
+    """Replace ``target`` by ``staging``, after carrying over files of others and empty folders from ``target``."""
     for name in _files(target):
         if name not in ours:
             (staging / name).parent.mkdir(parents=True, exist_ok=True)
@@ -235,7 +236,7 @@ def _swap(target: Path, staging: Path, ours: set[str]) -> None:
 
 
 def duplicate(source: Path, target: Path) -> None:
-    """A second name of the same file, a copy where the file system has no such thing."""
+    """Create a hard link to a file, or a copy if the file system does not support links."""
     try:
         os.link(source, target, follow_symlinks=False)
     except OSError:
@@ -243,7 +244,7 @@ def duplicate(source: Path, target: Path) -> None:
 
 
 def _move_into(out: Path, target: Path, staging: Path, ours: set[str]) -> None:
-    """Move every file of ``staging`` into ``target``, which stays the folder that it is."""
+    """Move every file of ``staging`` into ``target``, which remains the same folder."""
     for name in ours:
         (target / name).unlink(missing_ok=True)
     with _refused_when_filled(out), open(target / MANIFEST, "x", encoding="utf-8") as claim:
@@ -257,7 +258,7 @@ def _move_into(out: Path, target: Path, staging: Path, ours: set[str]) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Flush a file or a folder to the disk, so that it survives a loss of power."""
+    """Flush a file or folder to the disk, so that it survives a power loss."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -267,17 +268,17 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary path beside ``path``, with its suffix; it becomes ``path``, on the disk, if the block ends without an error.
+    """A temporary file beside ``path``, with its suffix; it is flushed and becomes ``path`` if the block ends without an error.
 
-    What a killed process left of the same file is removed.
+    Leftovers of a killed process for the same file are removed.
 
     Args:
-        path: the file.
+        path: output file.
         overwrite: whether an existing file may be replaced.
 
     Raises:
-        ConfigurationError: ``path`` exists (and ``overwrite`` is off), also if it appeared during the block, or the system
-            refuses to write it.
+        ConfigurationError: ``path`` exists although ``overwrite`` is off, even if it appeared during the block; or it cannot be
+            written.
         NoSpaceError: the disk is full.
     """
     check_target(path, overwrite=overwrite)
@@ -300,14 +301,14 @@ def staged_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _remove_orphan_files(path: Path, prefix: str) -> None:
-    """Remove what killed processes left of ``path``."""
+    """Remove leftovers of killed processes for the file ``path``."""
     for other in path.parent.iterdir():
         if other.name.startswith(prefix) and other.suffix == path.suffix and not is_held(other):
             other.unlink(missing_ok=True)
 
 
 def take_name(staging: Path, path: Path) -> None:
-    """Give a file the name ``path``, unless it is taken; it may keep its old name, too.
+    """Give a file the name ``path``, unless it is taken; the file may keep its old name as well.
 
     Raises:
         ConfigurationError: another process has taken the name.
@@ -317,16 +318,16 @@ def take_name(staging: Path, path: Path) -> None:
             os.link(staging, path)
         except FileExistsError:
             raise
-        except OSError:  # a file system without second names
+        except OSError:  # a file system without hard links
             check_target(path, overwrite=False)
             staging.replace(path)
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove what :func:`staged_file` left in ``folder`` and below when a process was killed while it wrote.
+    """Remove the temporary files of :func:`staged_file` that killed processes left in ``folder`` and below.
 
     Raises:
-        ConfigurationError: the system refuses to remove it.
+        ConfigurationError: a file cannot be removed.
     """
     for path in folder.rglob(f".*{PARTIAL}*"):
         with writing(path):
@@ -334,7 +335,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def check_target(path: Path, *, overwrite: bool) -> None:
-    """Raise ConfigurationError if ``path`` exists and must not be replaced, or is a folder."""
+    """Raise ConfigurationError if ``path`` is a folder, or exists and ``overwrite`` is off."""
     with writing(path):
         if path.is_dir():
             raise ConfigurationError(f"cannot write {path}: it is a folder")
@@ -343,7 +344,7 @@ def check_target(path: Path, *, overwrite: bool) -> None:
 
 
 def check_writable(path: Path, *, overwrite: bool) -> None:
-    """Raise ConfigurationError if a file cannot be written, before the work that it is to hold. Nothing is left of the trial."""
+    """Raise ConfigurationError if a file cannot be written; call it before long work. The check leaves no trace."""
     check_target(path, overwrite=overwrite)
     made = [folder for folder in path.parents if not folder.exists()]
     with writing(path):
@@ -355,6 +356,6 @@ def check_writable(path: Path, *, overwrite: bool) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write indented JSON through a temporary file; numbers that are not finite are texts in it, see :func:`plain_data`."""
+    """Write indented JSON through a temporary file; numbers that are not finite become texts, see :func:`plain_data`."""
     with staged_file(path, overwrite=True) as staging:
         staging.write_text(json.dumps(plain_data(value), indent=2, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
-"""Which files and folders a living process is writing: it holds the system's lock on them, which ends with the process."""
+"""Locks on files and folders that a running process is writing; the system releases them when the process ends."""
 
 import os
 import sys
@@ -13,15 +13,15 @@ if sys.platform != "win32":
 
 
 def lock(descriptor: int) -> None:
-    """Hold the lock of an open file or folder until it is closed; nothing where the system has none."""
+    """Lock an open file or folder until it is closed; does nothing on systems without locks."""
     if sys.platform != "win32":
         with suppress(OSError):  # a file system without locks
-            fcntl.flock(descriptor, fcntl.LOCK_EX)  # :func:`is_held` of another process takes it for a moment
+            fcntl.flock(descriptor, fcntl.LOCK_EX)  # waits, as :func:`is_held` of another process takes it briefly
 
 
 @contextmanager
 def held(path: Path) -> Iterator[None]:
-    """Hold the lock of a file or folder during the block, whatever its name becomes; nothing where the system has none."""
+    """Lock a file or folder during the block, even if it is renamed; does nothing on systems without locks."""
     if sys.platform == "win32":
         yield
         return
@@ -34,7 +34,7 @@ def held(path: Path) -> Iterator[None]:
 
 
 def is_held(path: Path) -> bool:
-    """Whether a process holds the lock of a file or folder; true also where that cannot be told."""
+    """Whether a process holds the lock of a file or folder; also true if that cannot be determined."""
     if sys.platform == "win32":
         return True
     try:
@@ -53,10 +53,10 @@ def is_held(path: Path) -> bool:
 
 @contextmanager
 def held_alone(path: Path, otherwise: str) -> Iterator[None]:
-    """Hold the lock of a folder, or of a file, which is made, during the block; nothing where the system has none.
+    """Lock a folder, or a file, which is created if missing, during the block; does nothing on systems without locks.
 
     Raises:
-        ConfigurationError: ``otherwise``; another process holds it, or has removed the file meanwhile.
+        ConfigurationError: another process holds the lock, or has removed the file or folder; the message is ``otherwise``.
     """
     if sys.platform == "win32":
         yield

@@ -1,4 +1,4 @@
-"""Names and sources of supervisors and controllers as people read them; the literature is listed in REFERENCES.md."""
+"""Display names and sources of supervisors and controllers; REFERENCES.md lists the literature."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -10,7 +10,7 @@ class Source(NamedTuple):
     """Display name of a method, and its citation."""
 
     display: str
-    citation: str = ""  # empty: a user's own
+    citation: str = ""  # empty for a user's own method
 
 
 NAMES = {
@@ -46,12 +46,12 @@ NAMES = {
     "terminal-sliding": Source("Terminal sliding mode", "Feng et al. 2002"),
     "predefined-time": Source("Predefined-time", "Sánchez-Torres et al. 2018"),
 }
-"""Sources by command-line name."""
+"""Source of each method, by its name on the command line."""
 LIMITED_SUFFIX = "-limited"
 
 
 def short_name(name: str) -> str:
-    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name as it is."""
+    """``mine.Careful`` of ``some/mine.py:Careful``, ``best`` of ``some/best.safetensors``; any other name unchanged."""
     file, _, attribute = name.rpartition(":")
     if file:
         return f"{Path(file).stem}.{attribute}"
@@ -59,7 +59,7 @@ def short_name(name: str) -> str:
 
 
 def source_of(name: str) -> Source:
-    """The source of a supervisor or controller; one that is not listed has its short name."""
+    """The source of a supervisor or controller; one that is not listed is displayed by its short name."""
     if name in NAMES:
         return NAMES[name]
     if name.endswith(LIMITED_SUFFIX) and name.removesuffix(LIMITED_SUFFIX) in NAMES:
@@ -74,7 +74,7 @@ def display_name(name: str) -> str:
 
 
 def display_key(key: str) -> str:
-    """Display name of a method by its key, ``mpcms+sorlc``; any other text as it is."""
+    """Display name of a method from its key, such as ``mpcms+sorlc``; any other text is returned unchanged."""
     supervisor, plus, controller = key.partition("+")
     return display_method(supervisor, controller) if plus and " " not in key else key
 

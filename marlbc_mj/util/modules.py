@@ -1,6 +1,4 @@
-"""A user's Python file as a module: the same one in every process, whatever the current folder is, and run again after an
-edit.
-"""
+"""Loading of a user's Python file as a module that is the same in every process and current folder; edits reload it."""
 
 import importlib.util
 import os
@@ -23,16 +21,16 @@ _SUFFIX = ".py"
 _PACKAGE = Path(__file__).parents[1]
 _Result = TypeVar("_Result")
 _PREFIX = "marlbc_user_"
-_LONGEST_PLACE = 160  # of a module's name: file names of the cache of compiled code hold it
+_LONGEST_PLACE = 160  # characters; part of a module's name, and so of file names in the cache of compiled code
 _MOST_BESIDE = 500
-"""More files beside a user's file than these are not looked at for changes."""
+"""Largest number of files beside a user's file to check for changes."""
 
 
 def split_name(name: str) -> tuple[str, str]:
-    """File and attribute of ``file.py:Name``; a name without an attribute has an empty one.
+    """Split ``file.py:Name`` into file and attribute; for any other name, the attribute is empty.
 
     Raises:
-        ConfigurationError: something else than a text.
+        ConfigurationError: the name is not a string.
     """
     if not isinstance(name, str):
         raise ConfigurationError(f"a name must be a text, got {type(name).__name__}")
@@ -41,16 +39,16 @@ def split_name(name: str) -> tuple[str, str]:
 
 
 def names_attribute(name: str) -> bool:
-    """Whether a name means something in a user's Python file."""
+    """Whether a name has the form ``file.py:Name``."""
     return bool(split_name(name)[1])
 
 
 def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
-    """Name, time of the last change and size of the files in a file's folder, itself included: another tuple after an edit.
+    """Name, modification time and size of the files in a file's folder, including itself; the tuple changes after an edit.
 
     Args:
         path: the file.
-        suffixes: endings of the files that count.
+        suffixes: suffixes of the files to include.
     """
     found = []
     for each in sorted(each for suffix in suffixes for each in path.resolve().parent.glob(f"*{suffix}"))[:_MOST_BESIDE]:
@@ -61,17 +59,17 @@ def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
 
 
 def load_module(path: Path) -> ModuleType:
-    """Run a user's Python file, whose folder it may import from; it is not run again unless a Python file there has changed.
+    """Run a user's Python file, which can import from its own folder; run it again only if a Python file there has changed.
 
     Raises:
-        ConfigurationError: the file is not there, or what it raised.
+        ConfigurationError: the file cannot be read, or it raises an error.
     """
     try:
         path = path.resolve()
         if path.exists() and not path.is_file():
             raise ConfigurationError(f"cannot read {path}: it is not a file")
         content = path.read_bytes()
-    except (OSError, RuntimeError) as error:  # a link that leads to itself is a RuntimeError
+    except (OSError, RuntimeError) as error:  # RuntimeError: a link to itself
         raise ConfigurationError(f"cannot read {path}: {getattr(error, 'strerror', None) or error}") from error
     name = _module_name(path)
     stamp = zlib.crc32(content), beside(path, _SUFFIX)
@@ -93,7 +91,7 @@ def load_module(path: Path) -> ModuleType:
 
 
 def _module_name(path: Path) -> str:
-    """A name that says where the file is, so that a pickle of what is in it can be read in another process."""
+    """A module name that encodes the file's path, so that another process can unpickle objects from the file."""
     place = b32encode(os.fsencode(path)).decode().rstrip("=").lower()
     if len(place) > _LONGEST_PLACE:
         place = f"{zlib.crc32(os.fsencode(path)):08x}"
@@ -101,7 +99,7 @@ def _module_name(path: Path) -> str:
 
 
 class _UserFiles(MetaPathFinder, Loader):
-    """Finds the module of a user's file by its name, where a pickle asks for it."""
+    """Imports a user's file from its module name, as unpickling requires."""
 
     def find_spec(self, fullname: str, path: object = None, target: object = None) -> ModuleSpec | None:
         file = _file_of(fullname)
@@ -111,11 +109,11 @@ class _UserFiles(MetaPathFinder, Loader):
         return load_module(Path(spec.origin)) if spec.origin else None
 
     def exec_module(self, module: ModuleType) -> None:
-        """The file has been run."""
+        """Do nothing: :meth:`create_module` has run the file."""
 
 
 def _file_of(name: str) -> Path | None:
-    """The file that a module's name means; None if it is none of a user's file, or the file is not there."""
+    """The file that a module name encodes; None if the name is not that of a user's file, or the file does not exist."""
     place = name.rpartition("_")[2].upper()
     try:
         path = Path(os.fsdecode(b32decode(place + "=" * (-len(place) % 8)))) if name.startswith(_PREFIX) else None
@@ -128,29 +126,29 @@ sys.meta_path.append(_UserFiles())
 
 
 def _execute(module: ModuleType, content: bytes, path: Path) -> None:
-    """Run the text that was stamped, with its folder in front of the search path for the time being."""
+    """Run ``content`` in the module, with the file's folder temporarily first on the search path."""
     before = set(sys.modules)
     sys.path.insert(0, str(path.parent))
     try:
         exec(compile(content, str(path), "exec"), vars(module))
     finally:
         sys.path.remove(str(path.parent))
-        for name in set(sys.modules) - before:  # another folder's helper of the same name is another module
+        for name in set(sys.modules) - before:  # a helper of the same name in another folder is another module
             file = getattr(sys.modules[name], "__file__", None)
             if file is not None and Path(file).parent == path.parent:
                 del sys.modules[name]
 
 
 def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:
-    """The return value of a user's code.
+    """Call a user's code and return its result; errors of this package pass unchanged.
 
     Args:
         call: the user's code.
-        what: its name, for the message.
-        kind: what is raised if it fails.
+        what: name of the code in the message.
+        kind: class of the error to raise.
 
     Raises:
-        MarlbcError: of this ``kind``: it raises anything else than an error of this package, or ends the process.
+        MarlbcError: an error of class ``kind``, if the code raises any other exception or calls ``sys.exit``.
     """
     try:
         return call()
@@ -161,7 +159,7 @@ def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = Co
 
 
 def blame(error: BaseException) -> str:
-    """An error of a user's code in one line: its kind, what it says, and the user's line that it comes from."""
+    """An error in a user's code in one line: its type, its message, and the user's line that raised it."""
     if isinstance(error, SystemExit):
         said = f"it calls sys.exit({error.code!r})"
     else:
@@ -171,20 +169,20 @@ def blame(error: BaseException) -> str:
 
 
 def _is_users(file: str) -> bool:
-    """Whether a file is neither Python's, nor of an installed package, nor of this one."""
+    """Whether a file belongs neither to Python nor to an installed package nor to this package."""
     inside = any(Path(file).is_relative_to(folder) for folder in (sys.prefix, sys.base_prefix, _PACKAGE))
     return not inside and not file.startswith("<")
 
 
 def made(name: str, kind: type) -> Any:
-    """The object that ``file.py:Name`` means; a class or function of that name is called without arguments.
+    """The object that ``file.py:Name`` names; a class or function is called without arguments to create it.
 
     Args:
         name: file and attribute.
-        kind: what the object must be; one that is an instance is taken as it is.
+        kind: class of the object; a callable that is already an instance is not called.
 
     Raises:
-        ConfigurationError: the file fails, or has nothing of that name.
+        ConfigurationError: the file or the call fails, or the file has no attribute of that name.
     """
     file, attribute = split_name(name)
     module = load_module(Path(file))

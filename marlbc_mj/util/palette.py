@@ -1,7 +1,7 @@
-"""Colors of agents, behaviors and methods: the same in the model, the figures, the video and the page (color-blind safe)."""
+"""Color-blind safe colors of agents, behaviors and methods, shared by models, figures, videos and pages."""
 
 AGENT_COLORS = ("#12645F", "#D05FA0", "#86B84F", "#A5714B", "#E8A9CB", "#5B3A1E", "#8FCFC0", "#4D4D4D")
-"""Colors of agents; none is near a behavior's, since a video shows both on one agent."""
+"""Colors of agents; none is close to a behavior's color, since a video shows both on one agent."""
 BEHAVIOR_COLORS = {"OA": "#C8102E", "FM": "#2F6DB5", "FR": "#E3A000", "AA": "#7A3E9D"}
 LINK_COLOR = "#1B1F26"
 SAFE_DISTANCE_COLOR = "#B4505E"
@@ -21,18 +21,18 @@ def rgba(color: str, alpha: float = 1.0) -> tuple[float, float, float, float]:
 
 
 def agent_color(agent: int) -> tuple[float, float, float, float]:
-    """RGBA of an agent, repeating after the palette's end."""
+    """RGBA color of an agent; colors repeat after the end of the palette."""
     return rgba(AGENT_COLORS[agent % len(AGENT_COLORS)])
 
 
 def command_color(command: str) -> str:
-    """Hex color of a command, that of its highest behavior."""
+    """Hex color of a command: the color of its behavior with the highest priority."""
     behavior = command.split(">")[0]
     return BEHAVIOR_COLORS.get(behavior, _OTHER_BEHAVIORS[sum(map(ord, behavior)) % len(_OTHER_BEHAVIORS)])
 
 
 def ink_on(color: str) -> str:
-    """Hex color of readable text on a ground ``#RRGGBB``: white, or near black where the ground's luminance (WCAG) is high."""
+    """Hex color of readable text on a background ``#RRGGBB``: white, or near black if its luminance (WCAG) is high."""
     linear = [v / 12.92 if v <= 0.04045 else ((v + 0.055) / 1.055) ** 2.4 for v in rgba(color)[:3]]
     luminance = 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
     return "#1B1F26" if luminance > 0.35 else "#FFFFFF"

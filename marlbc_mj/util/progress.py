@@ -1,11 +1,11 @@
-"""Progress of long work: one callback type for bars, lines and tests."""
+"""Progress of long computations: one callback type for progress bars, printed lines and tests."""
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 Progress = Callable[[str, float, float], None]
-"""Called with the stage, the amount done and the total."""
+"""Progress callback, called with the name of the stage, the amount done and the total."""
 
 
 def silent(what: str, done: float, total: float) -> None:
@@ -13,7 +13,7 @@ def silent(what: str, done: float, total: float) -> None:
 
 
 def note(line: str) -> None:
-    """Say something that the user should know and did not ask for, in one line on standard error; see :func:`hushed`."""
+    """Print one line of unrequested information for the user on standard error, unless :func:`hushed`."""
     if not _hushed:
         print(f"marlbc: {line}", file=sys.stderr, flush=True)
 
@@ -23,7 +23,7 @@ _hushed = False
 
 @contextmanager
 def hushed(quiet: bool) -> Iterator[None]:
-    """Within the block, if ``quiet``, :func:`note` says nothing."""
+    """If ``quiet``, suppress the output of :func:`note` within the block."""
     global _hushed
     before, _hushed = _hushed, quiet or _hushed
     try:

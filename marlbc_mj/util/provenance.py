@@ -1,4 +1,4 @@
-"""Where a result comes from (versions, machine, revision, configuration), and dataclasses as JSON data."""
+"""The origin of a result (versions, machine, revision, configuration), and conversion of dataclasses to JSON data."""
 
 import dataclasses
 import hashlib
@@ -16,13 +16,13 @@ PACKAGES = ("marlbc-mj", "mujoco", "dm-control", "numpy", "numba", "torch", "gym
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that results depend on, by the names of their distributions."""
+    """Versions of Python and of the packages that results depend on, by distribution name."""
     return dict(_versions())
 
 
 @cache
 def _versions() -> dict[str, str]:
-    from importlib.metadata import PackageNotFoundError, version  # which takes longer than the rest of a refusal
+    from importlib.metadata import PackageNotFoundError, version  # slow to import, so only on use
 
     found = {"python": platform.python_version()}
     for name in PACKAGES:
@@ -34,13 +34,13 @@ def _versions() -> dict[str, str]:
 
 
 UNKNOWN = "unknown"
-"""Revision of a package that was not installed from a repository."""
+"""Revision if the source tree is no git repository, or git fails."""
 
 
 def git_revision() -> str:
-    """Revision of the source tree; ``unknown`` if installed from a wheel.
+    """Git revision of the source tree; ``unknown`` if installed from a wheel, or if git fails.
 
-    A changed tree has ``-dirty`` and a digest of the changes at its end, so that equal revisions mean equal tracked files.
+    The revision of a changed tree ends with ``-dirty`` and a digest of the changes, so equal revisions mean equal tracked files.
     """
     root = Path(__file__).resolve().parents[2]
     if not (root / ".git").exists():
@@ -70,19 +70,19 @@ def cpu() -> str:
 
 
 def provenance() -> dict[str, Any]:
-    """Facts that every config.json and every log hold beside their configuration."""
+    """Versions, revision and machine, recorded in every config.json and every log with the configuration."""
     return {"versions": versions(), "git_revision": git_revision(), "cpu": cpu(), "platform": platform.platform()}
 
 
 def plain_data(value: Any, *, not_finite: Callable[[float], Any] = str) -> Any:
-    """JSON data of dataclasses, tuples and arrays. A dataclass keeps the name of its type.
+    """Convert dataclasses, tuples and arrays to JSON data. A dataclass keeps the name of its type.
 
-    It goes by the types of the values, not by annotations as :mod:`marlbc_mj.util.settings` does: fields hold any behavior,
-    disturbance or array, and :func:`config_hash` must not change.
+    The conversion depends on the types of the values, not on annotations as in :mod:`marlbc_mj.util.settings`, because fields can
+    hold any behavior, disturbance or array, and :func:`config_hash` must not change.
 
     Args:
-        value: what to convert, nested as deeply as it likes.
-        not_finite: what a number that is not finite becomes, for which JSON has no number; by default its name, ``"inf"``.
+        value: value to convert, with any nesting.
+        not_finite: converts numbers that are not finite, which JSON cannot represent; by default to a text such as ``"inf"``.
     """
     again = partial(plain_data, not_finite=not_finite)
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -90,7 +90,7 @@ def plain_data(value: Any, *, not_finite: Callable[[float], Any] = str) -> Any:
         return {"type": type(value).__name__, **fields}
     if isinstance(value, dict):
         return {str(key): again(entry) for key, entry in value.items()}
-    numpy: Any = sys.modules.get("numpy")  # not imported for this: without it there are no arrays
+    numpy: Any = sys.modules.get("numpy")  # not imported here: if nobody imported it, there are no arrays
     if numpy is not None and isinstance(value, numpy.ndarray):
         return again(value.tolist())
     if isinstance(value, (list, tuple)):

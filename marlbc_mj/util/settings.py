@@ -1,6 +1,6 @@
-"""Dataclasses of settings: rules in the annotations of their fields, and conversion from TOML tables, JSON data and texts.
+"""Dataclasses of settings: rules in the annotations of fields, and conversion from TOML tables, JSON data and texts.
 
-cattrs converts; this file adds the messages, which name the place, the value and the valid ones.
+cattrs does the conversion. This file adds error messages that name the setting, its value and the valid values.
 """
 
 import math
@@ -19,13 +19,13 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 
 T = TypeVar("T")
 Hook = Callable[[Any, Any], Any]
-"""Turns a value into what an annotation says."""
+"""Converts a value to the type of an annotation; called with both."""
 Unlimited = NewType("Unlimited", float)
-"""A number that may be infinite."""
+"""Type of a number that may be infinite."""
 
 
 class Rule(NamedTuple):
-    """A condition on the value of a field; it stands in the annotation, as in ``Annotated[int, AT_LEAST_ONE]``."""
+    """A condition on the value of a field, given in its annotation, for example ``Annotated[int, AT_LEAST_ONE]``."""
 
     words: str  # the condition, for messages: "must be at least 1"
     holds: Callable[[Any], bool]  # whether a value meets it
@@ -38,14 +38,14 @@ NOT_NEGATIVE = Rule("must not be negative", lambda value: value >= 0)
 
 
 def check(settings: Any, prefix: str = "") -> None:
-    """Check every field of a dataclass by the ``Literal`` or the rules in its annotation.
+    """Check every field of a dataclass against the ``Literal`` or the rules in its annotation.
 
     Args:
         settings: the dataclass.
-        prefix: text before the fields' names in messages.
+        prefix: text to put before field names in messages.
 
     Raises:
-        ConfigurationError: naming the first field that breaks a rule, and its value.
+        ConfigurationError: a field breaks a rule; the message names the first such field and its value.
     """
     kind: Any = type(settings)
     for name, hint in annotations(kind).items():
@@ -58,14 +58,14 @@ def check(settings: Any, prefix: str = "") -> None:
 
 
 def check_kinds(settings: Any, prefix: str = "") -> None:
-    """Check that fields of a dataclass that are annotated as numbers, texts or dataclasses hold such; others may hold anything.
+    """Check the type of every field annotated as a number, text, bool or dataclass; other fields may hold anything.
 
     Args:
         settings: the dataclass.
-        prefix: text before the fields' names in messages.
+        prefix: text to put before field names in messages.
 
     Raises:
-        ConfigurationError: naming the first field that holds something else.
+        ConfigurationError: a field has the wrong type; the message names the first such field.
     """
     owner: Any = type(settings)
     for name, hint in annotations(owner).items():
@@ -84,25 +84,25 @@ def check_kinds(settings: Any, prefix: str = "") -> None:
 
 _KINDS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
 _ABSTRACT: dict[Any, type] = {float: Real, int: Integral}
-"""What NumPy's numbers are, too."""
+"""Abstract types of numbers, which NumPy's numbers match too."""
 
 
 @cache
 def annotations(kind: type) -> dict[str, Any]:
-    """Annotations, by name, of the fields of a dataclass that are set when it is made."""
+    """Annotations of a dataclass's constructor fields, by name."""
     hints = get_type_hints(kind, include_extras=True)
     return {f.name: hints[f.name] for f in fields(kind) if f.init}
 
 
 @cache
 def field_types(kind: type) -> dict[str, Any]:
-    """What the fields of a dataclass are read as: their annotations, but :data:`Unlimited` where the default is infinite."""
+    """Types to convert the fields of a dataclass to: the annotations, or :data:`Unlimited` if the default is infinite."""
     unlimited = {f.name: Unlimited for f in fields(kind) if f.init and f.default == math.inf}
     return annotations(kind) | unlimited
 
 
 class _Misfit(ValueError):
-    """A value of the wrong kind. ``at`` makes the error for the place of the value, which a hook does not know."""
+    """Raised by a hook for a wrong value. ``at`` makes the final error from the value's place, which a hook does not know."""
 
     def __init__(self, at: Callable[[str], ConfigurationError]) -> None:
         super().__init__()
@@ -110,20 +110,20 @@ class _Misfit(ValueError):
 
 
 def misfit(wanted: str, value: object) -> _Misfit:
-    """The error of a hook: ``PLACE must be WANTED, got VALUE``."""
+    """The error that a hook raises, with the final message ``PLACE must be WANTED, got VALUE``."""
     return _Misfit(lambda place: ConfigurationError(f"{place} must be {wanted}, got {value!r}"))
 
 
 def choose(value: object, valid: Mapping[str, T], entry: str = "") -> T:
-    """The value of a name in a table.
+    """Look up a name in a table.
 
     Args:
         value: the name.
         valid: the table.
-        entry: end of the place in the message, ``.kind`` for a name that stood under that key.
+        entry: text to append to the place in the message, such as ``.kind`` for a name under that key.
 
     Raises:
-        ValueError: no such name; :func:`convert` makes a ConfigurationError of it.
+        ValueError: there is no such name; :func:`convert` turns this into a ConfigurationError.
     """
     if not isinstance(value, str) or value not in valid:
         raise _Misfit(lambda place: unknown(place + entry, value, valid))
@@ -131,17 +131,17 @@ def choose(value: object, valid: Mapping[str, T], entry: str = "") -> T:
 
 
 def convert(converter: Converter, value: Any, hint: Any, place: str = "") -> Any:
-    """A value as the type of an annotation.
+    """Convert a value to the type of an annotation.
 
     Args:
         converter: :func:`tables`, :func:`json_data` or :func:`texts`.
-        value: what was read.
-        hint: the annotation, a dataclass for example.
-        place: the value's name; empty for the whole of a file.
+        value: the value that was read.
+        hint: the annotation, for example a dataclass.
+        place: name of the value in messages; empty for a whole file.
 
     Raises:
-        ConfigurationError: an unknown key, missing ones, or a value of another type, with its place; or what a dataclass itself
-            refuses.
+        ConfigurationError: a key is unknown or missing, or a value has the wrong type, with its place in the message; or a
+            dataclass itself rejects a value.
     """
     try:
         return converter.structure(value, hint)
@@ -150,7 +150,7 @@ def convert(converter: Converter, value: Any, hint: Any, place: str = "") -> Any
 
 
 def _explain(error: Exception, place: str) -> ConfigurationError:
-    """The first fault of a conversion in words: unknown keys come before missing ones, and those before values."""
+    """The error for the first fault of a conversion: unknown keys come first, then missing keys, then values."""
     if isinstance(error, ClassValidationError):
         return _explain_fields(error, f"{place}." if place else "")
     if isinstance(error, IterableValidationError):
@@ -173,7 +173,7 @@ def _explain_fields(error: ClassValidationError, prefix: str) -> ConfigurationEr
 
 
 def _exactly(kind: type | tuple[type, ...], wanted: str) -> Hook:
-    """A hook that takes values of a type as they are; true and false are no numbers."""
+    """A hook that accepts values of a type unchanged; booleans do not count as numbers."""
 
     def take(value: Any, _: Any) -> Any:
         if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
@@ -214,7 +214,7 @@ def _limitless(value: Any, hint: Any) -> float:
 
 
 def _row_hook(kind: Any, converter: BaseConverter) -> Hook:
-    """For a list that becomes a named tuple, whose last fields may have defaults."""
+    """A hook that converts a list to a named tuple; entries for trailing fields with defaults may be missing."""
     names = kind._fields
     least = len(names) - len(kind._field_defaults)
     fill = namedtuple_dict_structure_factory(kind, converter)
@@ -228,7 +228,7 @@ def _row_hook(kind: Any, converter: BaseConverter) -> Hook:
 
 
 def _tuple_hook(hint: Any, converter: BaseConverter) -> Hook:
-    """For a list that becomes a tuple: of any length for ``tuple[T, ...]``, else as long as the annotation."""
+    """A hook that converts a list to a tuple, of any length for ``tuple[T, ...]``, else of the annotation's length."""
     entry, *others = get_args(hint)
     size = None if others == [Ellipsis] else 1 + len(others)
     fill = converter.get_structure_hook(GenericAlias(list, (entry,)))
@@ -244,7 +244,7 @@ def _tuple_hook(hint: Any, converter: BaseConverter) -> Hook:
 
 
 def _numbers_hook(hint: Any, converter: BaseConverter) -> Hook:
-    """For a text that becomes a tuple of whole numbers, or of texts."""
+    """A hook that converts a comma-separated text to a tuple of integers or texts."""
     if get_args(hint)[0] is str:
         return lambda text, _: tuple(filter(None, text.split(",")))
 
@@ -262,12 +262,12 @@ def _refuse_whole(text: str, _: Any) -> Any:
 
 
 def _made_of(origin: Any) -> Callable[[Any], bool]:
-    """Whether an annotation is ``origin[...]``."""
+    """A predicate: whether an annotation has the form ``origin[...]``."""
     return lambda hint: get_origin(hint) is origin
 
 
 def tables() -> Converter:
-    """A converter of TOML tables: numbers are finite, names are those of their ``Literal``, unknown keys are refused."""
+    """A converter for TOML tables: numbers must be finite, names must be in their ``Literal``, unknown keys are rejected."""
     converter = Converter()
     converter.register_structure_hook_factory(is_dataclass, _dataclass_hook)
     converter.register_structure_hook_factory(is_namedtuple, _row_hook)
@@ -285,9 +285,9 @@ def tables() -> Converter:
 
 
 def json_data() -> Converter:
-    """A converter of what :func:`marlbc_mj.util.provenance.plain_data` made of a dataclass.
+    """A converter from the output of :func:`marlbc_mj.util.provenance.plain_data` back to an equal dataclass.
 
-    It gives an equal dataclass. Numbers may be infinite, and any text stands for a ``Literal``: the dataclass checks its values.
+    Numbers may be infinite. Any text is accepted for a ``Literal``, as the dataclass checks its values itself.
     """
     converter = tables()
     for kind in (float, Unlimited):
@@ -297,7 +297,7 @@ def json_data() -> Converter:
 
 
 def texts() -> Converter:
-    """A converter of texts from a command line, which checks kinds only."""
+    """A converter for texts from a command line; it checks only types."""
 
     def parsed(kind: Callable[[str], Any], wanted: str) -> Hook:
         def parse(text: str, _: Any) -> Any:

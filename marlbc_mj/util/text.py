@@ -1,10 +1,10 @@
-"""Small helpers for text that people read."""
+"""Small helpers for human-readable text."""
 
 from collections.abc import Iterable
 
 LIKE = 0.6
-"""Likeness from which a word counts as a misspelling of another, from 0 to 1."""
-_LONGEST = 60  # characters; nobody misspells a name by more
+"""Least likeness, from 0 to 1, at which a word counts as a misspelling of another."""
+_LONGEST = 60  # characters; a longer word is no misspelled name
 
 
 def one_line(text: object) -> str:
@@ -13,7 +13,7 @@ def one_line(text: object) -> str:
 
 
 def nearest_word(word: str, words: Iterable[str]) -> str | None:
-    """The word that is spelled most like ``word``, whatever their case; None where none is like it."""
+    """The word spelled most like ``word``, ignoring case; None if none is similar enough."""
     if len(word) > _LONGEST:
         return None
     scored = [(_likeness(word.lower(), each.lower()), each) for each in words]
@@ -22,7 +22,7 @@ def nearest_word(word: str, words: Iterable[str]) -> str | None:
 
 
 def _likeness(one: str, other: str) -> float:
-    """From 0 to 1; what two dotted names have in common before their last dot does not count."""
+    """Likeness of two words, from 0 to 1; a prefix up to the last dot that both share does not count."""
     from difflib import SequenceMatcher
 
     (table, _, name), (same, _, like) = one.rpartition("."), other.rpartition(".")

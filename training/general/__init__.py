@@ -1,1 +1,1 @@
-"""Training of the general policy: one network for every agent, over families, teams and layouts."""
+"""Training of the general policy: one network for every agent, trained on families of missions, teams and layouts."""

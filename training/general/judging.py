@@ -1,4 +1,4 @@
-"""Evaluation of a policy on held-out layouts during training: success rate and median return of each family."""
+"""Evaluation of a policy during training: success rate and median return of each family and team on held-out layouts."""
 
 from typing import NamedTuple
 
@@ -14,16 +14,16 @@ from marlbc_mj.supervisors.base import Supervisor
 from marlbc_mj.supervisors.general import General
 
 VALIDATION_SEED = 50_000
-"""Seed of the held-out layouts that checkpoints are chosen by; results are reported on others, from 60000 on."""
+"""Seed of the held-out layouts for choosing checkpoints; results are reported on others, with seeds from 60000 on."""
 
 
 class Verdict(NamedTuple):
     """Outcomes of B missions, measured at mission steps."""
 
     total: np.ndarray  # (B,) return
-    reached: np.ndarray  # (B,) bool, everybody ended within the tolerance of its slot
+    reached: np.ndarray  # (B,) bool, every agent ended within the tolerance of its slot
     violated: np.ndarray  # (B,) bool, an agent came within the safe distance of an obstacle
-    switches: np.ndarray  # (B,) of all agents
+    switches: np.ndarray  # (B,) number of switches, summed over agents
 
     @property
     def success(self) -> np.ndarray:
@@ -32,23 +32,23 @@ class Verdict(NamedTuple):
 
 
 class JudgeScore(NamedTuple):
-    """Outcomes of one mission's layouts together."""
+    """Outcomes of one scenario, summarised over its layouts."""
 
     layouts: int
     succeeded: int
     violated: int
     total: float  # median return
-    switches: float  # median, of an agent
+    switches: float  # median of the switches per agent
 
 
 class Judge:
-    """Whole missions on the same held-out layouts of one scenario, again and again.
+    """Flies whole missions, on the same held-out layouts of one scenario at every call.
 
     Args:
-        scenario: that layouts are drawn of.
+        scenario: the scenario from which layouts are drawn.
         controller: name of the law that tracks the references.
-        layouts: how many.
-        threads: of the simulation.
+        layouts: number of layouts.
+        threads: number of threads of the simulation.
     """
 
     def __init__(self, scenario: Scenario, controller: str, layouts: int, threads: int = 1) -> None:
@@ -56,7 +56,7 @@ class Judge:
         self.world = World(scenario, make_controller(controller), worlds=layouts, threads=threads)
 
     def __call__(self, supervisor: Supervisor, seed: int = VALIDATION_SEED) -> Verdict:
-        """All missions from their beginning to their end."""
+        """Fly all missions from beginning to end."""
         world, scenario = self.world, self.scenario
         observation, memory = world.reset(seed), supervisor.start(scenario, world.worlds)
         total, switches = np.zeros(world.worlds), np.zeros(world.worlds)
@@ -73,7 +73,7 @@ class Judge:
         return Verdict(total, away <= scenario.formation_tolerance, violated, switches)
 
     def score(self, policy: GeneralPolicy, seed: int = VALIDATION_SEED) -> JudgeScore:
-        """All missions under a policy, as it is."""
+        """Fly all missions with a policy and summarise the outcomes."""
         verdict = self(General(policy), seed)
         counts = int(verdict.success.sum()), int(verdict.violated.sum())
         medians = float(np.median(verdict.total)), float(np.median(verdict.switches)) / self.scenario.agents
@@ -81,7 +81,7 @@ class Judge:
 
 
 def judge_policy(policy: GeneralPolicy, judges: dict[str, Judge]) -> dict[str, float]:
-    """Success rate, median return and median switches per agent of each family, by ``success_field`` and so on."""
+    """Success rate, median return and median switches per agent for each judge, under ``success_NAME`` and so on."""
     row: dict[str, float] = {}
     for name, judge in judges.items():
         score = judge.score(policy)

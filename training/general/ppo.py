@@ -1,4 +1,4 @@
-"""MAPPO for teams of any size: one actor for every agent, and one critic that sees the agent's inputs and its team's mean."""
+"""MAPPO for teams of any size: one actor for all agents, and one critic on an agent's inputs and their mean over the team."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,7 @@ from marlbc_mj.training.replay import Replay
 
 
 class Assessed(NamedTuple):
-    """M decisions of single agents under one policy."""
+    """M decisions of single agents under one policy, with advantages and returns."""
 
     state: Tensor  # (M, S) inputs of the actor
     view: Tensor  # (M, 2 S) inputs of the critic
@@ -25,20 +25,20 @@ class Assessed(NamedTuple):
     returns: Tensor  # (1, M) normalised
 
     def part(self, rows: Tensor) -> "Assessed":
-        """The decisions ``rows`` alone."""
+        """The subset ``rows`` of the decisions."""
         return Assessed(self.state[rows], self.view[rows], *(each[:, rows] for each in self[2:]))
 
 
 class TeamPPO(Learner):
     """Actor and critic of MAPPO (Yu et al., NeurIPS 2022) with parameter sharing; the network's values are the actor's logits.
 
-    An agent's return is that of its own rewards. The critic sees what the agent sees, and the mean of that over its team.
+    An agent's return is that of its own rewards. The critic's input is the agent's, together with its mean over the team.
     """
 
     joint = True
 
     def further(self, agents: int, scale: np.ndarray, generator: torch.Generator) -> list[nn.Parameter]:
-        """The critic, and the scale of its values; the actor begins with actions about equally likely."""
+        """Create the critic and the scale of its values, and start the actor with about equally likely actions."""
         self.network.weights[-1].data *= LAST_LAYER
         size = NetworkSize(agents, 2 * len(scale), 1, self.config.hidden)
         twice = torch.from_numpy(np.concatenate([scale, scale]))
@@ -52,7 +52,7 @@ class TeamPPO(Learner):
 
         Args:
             rows: arrays of a :class:`Replay`, first axis T.
-            sizes: (K,) agents of each team, in the order of their columns.
+            sizes: (K,) number of agents of each team, in the order of the columns.
             gamma: discount factor per decision.
         """
         view, after = (self.tensor(with_team(rows[name], sizes)) for name in ("state", "final"))
@@ -70,7 +70,7 @@ class TeamPPO(Learner):
         return Assessed(state, view.flatten(0, 1), action, old, self.tensor(gain.T), self.tensor(self.scaling(returns).T))
 
     def objective(self, part: Assessed) -> tuple[Tensor, Tensor]:
-        """The loss: clipped surrogate, entropy bonus and Huber loss of the values; and the errors of these (1, M)."""
+        """The loss (clipped surrogate, entropy bonus and Huber loss of the values), and the values' errors (1, M)."""
         ppo = self.config.ppo
         new, entropy = log_probability(self.network(part.state), part.action)
         value = self.critic(part.view)[..., 0]
@@ -83,13 +83,13 @@ class TeamPPO(Learner):
         return super().snapshot() | {"returns": self.scaling.sums.copy()}
 
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
-        """Go back to a :meth:`snapshot`."""
+        """Restore a :meth:`snapshot`."""
         super().restore(arrays)
         self.scaling.sums[:] = arrays["returns"]
 
 
 class PPOTrainer(GeneralTrainer):
-    """A run of MAPPO: actions are drawn from the policy, and every ``ppo.rollout`` decisions are learned from and forgotten."""
+    """A run of MAPPO: it draws actions from the policy, learns from ``ppo.rollout`` decisions at a time and discards them."""
 
     learner: TeamPPO
 
@@ -98,12 +98,12 @@ class PPOTrainer(GeneralTrainer):
         return TeamPPO
 
     def make_replay(self, rows: int) -> Replay:
-        """Room for one rollout."""
+        """A buffer with room for one rollout."""
         return Replay(self.config.ppo.rollout, rows, 1, INPUTS)
 
     @property
     def flown(self) -> TeamNetwork:
-        """The present actor: of so few updates a mean would still hold those that knew nothing."""
+        """The current actor: with so few updates, a running mean would still contain the untrained network."""
         return self.learner.network
 
     def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
@@ -112,7 +112,7 @@ class PPOTrainer(GeneralTrainer):
         return self.by_squad((logits + self.rng.gumbel(size=logits.shape)).argmax(axis=-1))
 
     def learn(self) -> None:
-        """At the end of a rollout, ``ppo.epochs`` passes over it."""
+        """At the end of a rollout, make ``ppo.epochs`` passes over it."""
         ppo = self.config.ppo
         if self.replay.count % ppo.rollout:
             return
@@ -125,7 +125,7 @@ class PPOTrainer(GeneralTrainer):
 
 
 def with_team(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """(T, M, 2 S) rows (T, M, S) of M agents, and beside each the mean over its team; ``sizes`` (K,) agents of the teams."""
+    """(T, M, 2 S) rows (T, M, S) of M agents, each joined with its team's mean; ``sizes`` (K,) are the team sizes."""
     begins = np.cumsum(sizes) - sizes
     means = np.add.reduceat(rows, begins, axis=1) / sizes[:, None].astype(rows.dtype)
     return np.concatenate([rows, np.repeat(means, sizes, axis=1)], axis=-1)

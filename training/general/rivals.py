@@ -1,4 +1,4 @@
-"""Learners of the general policy: VDN and QMIX for teams of any size, with one error for a team, imitation, and distillation."""
+"""Learners of the general policy: VDN and QMIX for teams of any size, with one error per team; imitation and distillation."""
 
 import numpy as np
 import torch
@@ -12,37 +12,38 @@ from marlbc_mj.training.rivals import QMIX, MixingLayers
 
 
 def team_means(rows: Tensor, team: Tensor) -> Tensor:
-    """(K, F) means over each of K teams of ``rows`` (M, F), whose teams are ``team`` (M,), 0 to K - 1."""
+    """(K, F) means of ``rows`` (M, F) over each of K teams; ``team`` (M,) is the team of each row, from 0 to K - 1."""
     count = torch.bincount(team).to(rows.dtype)
     return torch.zeros((len(count), rows.shape[1]), device=rows.device).index_add(0, team, rows) / count[:, None]
 
 
 class TeamVDN(Learner):
-    """VDN (Sunehag et al., AAMAS 2018) with one network for all agents of all teams, each of its own size.
+    """VDN (Sunehag et al., AAMAS 2018) with one network for all agents, for teams of any size.
 
-    The team's value is the mean of its agents', so that large teams do not outweigh small ones; so are reward and target.
+    A team's value, reward and target are the means over its agents, so that large teams do not outweigh small ones.
     """
 
     joint = True
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, K) values of the actions of K teams and their targets; ``batch`` has their agents one after the other."""
+        """(1, K) values of the actions of K teams, and their targets; ``batch`` lists the agents team by team."""
         chosen, target = super().estimates(batch, now, ahead)
         team = _teams_of(batch, chosen)
         return team_means(chosen.T, team).T, team_means(target.T, team).T
 
 
 class TeamMixer(MixingLayers):
-    """The mixture of QMIX for teams of any size: w2(x) . elu(mean_i |W1(x_i)| Q_i + b1(x)) + b2(x), x the mean of the inputs x_i.
+    """QMIX's mixing network for any team size: w2(x) . elu(mean_i |W1(x_i)| Q_i + b1(x)) + b2(x), x the mean of inputs x_i.
 
-    The layer that gives an agent's weights sees that agent's inputs, and is the same for all; the others see the team's mean.
+    W1, which weights an agent's value, has that agent's inputs as input and is shared by all agents. The other layers have the
+    team's mean as input.
     """
 
     def __init__(self, inputs: int, generator: torch.Generator) -> None:
         super().__init__(inputs, 1, generator)
 
     def forward(self, values: Tensor, inputs: Tensor, team: Tensor) -> Tensor:
-        """(1, K) values of the teams ``team`` (M,) from their agents' values (1, M) and inputs (M, S)."""
+        """(1, K) values of K teams from the agents' values (1, M), inputs (M, S) and teams ``team`` (M,)."""
         return self.mix(team_means(self.weight1(inputs).abs() * values.T, team), team_means(inputs, team))
 
 
@@ -54,7 +55,7 @@ class TeamQMIX(QMIX):
         return TeamMixer(len(scale), generator)
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
-        """(1, K) values of the actions of K teams and their targets."""
+        """(1, K) values of the actions of K teams, and their targets."""
         chosen = self.chosen(batch, now)
         team = _teams_of(batch, chosen)
         reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
@@ -63,10 +64,10 @@ class TeamQMIX(QMIX):
 
 
 class Imitation(Learner):
-    """Imitation alone: what the network gives are logits, and the actions of a batch are those of a guide, whatever was taken."""
+    """Pure imitation: the network's outputs are logits, and a batch's actions are the guide's, not those that were taken."""
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """The cross entropy of the guide's actions, and how improbable each was (1, M)."""
+        """The mean cross entropy of the guide's actions, and one minus the probability of each (1, M)."""
         logits = self.network(self.tensor(batch.state))[0]
         shown = torch.from_numpy(batch.action[:, 0]).to(logits.device)
         each = nn.functional.cross_entropy(logits, shown, reduction="none")
@@ -74,27 +75,27 @@ class Imitation(Learner):
 
 
 LEAD_LINEAR = 0.25
-"""Errors of a lead, see :class:`Distilled`, count squared up to this and linearly beyond: far from a change nobody needs it."""
+"""Errors of a lead larger than this count linearly, not squared: far from a switch it need not be exact; :class:`Distilled`."""
 MEAN_WEIGHT = 0.01
-"""Weight of the error of the values' mean, beside those of the leads."""
+"""Weight of the error of the values' mean relative to the errors of the leads."""
 
 
 class Distilled(Learner):
-    """Policy distillation (Rusu et al., ICLR 2016): one network learns the values of a teacher, a mean of several, in the states
-    that it comes to itself.
+    """Policy distillation (Rusu et al., ICLR 2016): one network learns the values of a teacher, the mean of several policies, in
+    the states that the network visits itself.
 
-    What decides is an action's lead over the mean of all, so leads are learned more exactly than the mean.
+    The choice of an action depends on the lead of its value over the mean of all values, so the loss puts most weight on leads.
     """
 
     def teach(self, teacher: GeneralPolicy) -> None:
-        """Learn from this policy; before the first update."""
+        """Set the teacher; call this before the first update."""
         network = teacher.network
         self.weights = [self.tensor(weight) for weight in network.weights]
         self.biases = [self.tensor(bias) for bias in network.biases]
         self.first_layer = side_by_side(self.weights[0], self.biases[0])
 
     def loss(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """The Huber loss of leads and values' means, and the largest error of a lead in each state (1, M)."""
+        """The Huber loss of the leads and of the values' mean, and each state's largest error of a lead (1, M)."""
         state = self.tensor(batch.state)
         with torch.no_grad():
             wanted = self.network.split(feed_forward(self.weights, self.biases, state, self.first_layer))[0].mean(dim=0)
@@ -112,31 +113,31 @@ GENERAL_RIVALS: dict[str, type[Learner]] = {
     "imitation": Imitation,
     "distilled": Distilled,
 }
-"""Learners by the setting ``learner``, where it names another than :class:`~marlbc_mj.training.learner.Learner`."""
+"""Learner class by the setting ``learner``; for others it is :class:`~marlbc_mj.training.learner.Learner`, or that of MAPPO."""
 
 
 def _teams_of(batch: Batch, like: Tensor) -> Tensor:
-    """(M,) the team of each transition, on the device of another tensor."""
+    """(M,) team of each transition, on the device of the tensor ``like``."""
     assert batch.team is not None
     return torch.from_numpy(batch.team).to(like.device)
 
 
 class TeamReplay(Replay):
-    """A ring of rows whose draws are whole teams: decisions of all agents of one team at one time.
+    """A ring buffer that draws whole teams: the decisions of all agents of a team at the same time.
 
     Args:
-        rows: decisions kept.
-        sizes: (T,) agents of each team, in the order of their columns.
-        state: S, size of an agent's inputs.
+        rows: number of decisions kept.
+        sizes: (T,) number of agents of each team, in the order of the columns.
+        state: S, the size of an agent's inputs.
     """
 
     def __init__(self, rows: int, sizes: np.ndarray, state: int) -> None:
         super().__init__(rows, int(sizes.sum()), 1, state)
         self.sizes = sizes
-        self.begins = np.cumsum(sizes) - sizes  # (T,) first column of each
+        self.begins = np.cumsum(sizes) - sizes  # (T,) first column of each team
 
     def sample(self, size: int, steps: int, gamma: float, rng: np.random.Generator, share: float = 0.0) -> Batch:
-        """Draw teams with ``size`` agents in the mean; see :meth:`Replay.sample`."""
+        """Draw as many teams as have ``size`` agents on average; see :meth:`Replay.sample`."""
         teams = max(1, round(size / self.sizes.mean()))
         drawn, first = rng.integers(len(self.sizes), size=teams), self.draw_rows(teams, steps, rng)
         sizes = self.sizes[drawn]

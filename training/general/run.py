@@ -1,4 +1,4 @@
-"""A training run of the general policy on disk: evaluations on held-out layouts, learning curve, best and last checkpoints."""
+"""Training runs of the general policy on disk: evaluations on held-out layouts, learning curve, best and last checkpoints."""
 
 import json
 from collections.abc import Callable
@@ -30,16 +30,16 @@ from marlbc_mj.util.provenance import plain_data, provenance
 
 CURVE = "eval.csv"
 _SAVED = {**{name: kind for name, kind in SAVED_KINDS.items() if name != "curve"}, "cpu_s": (int, float)}
-"""Types of the entries in the description of a saved run."""
+"""Required entries in the description of a saved run, with their types."""
 GeneralProgress = Callable[[GeneralTrainer, TrainingScores], None]
-"""Callback of a run after every decision, with its last evaluation."""
+"""Callback after every decision from the first evaluation on, with the trainer and its last evaluation."""
 
 
 def make_general_trainer(config: GeneralConfig) -> GeneralTrainer:
-    """The trainer of the configuration's learner.
+    """The trainer for the configuration's learner.
 
     Raises:
-        ConfigurationError: a scenario, controller or device that cannot be used.
+        ConfigurationError: the scenario, controller or device cannot be used.
     """
     return PPOTrainer(config) if config.learner == "mappo" else GeneralTrainer(config)
 
@@ -47,16 +47,16 @@ def make_general_trainer(config: GeneralConfig) -> GeneralTrainer:
 def train_general(
     config: GeneralConfig, out: Path, *, overwrite: bool = False, progress: GeneralProgress | None = None
 ) -> Interrupted | list[TrainingScores]:
-    """Train from scratch; returns the evaluations, or what interrupted the run.
+    """Train from scratch; returns the evaluations, or the interruption.
 
     Args:
         config: configuration of the run.
         out: folder of the run.
-        overwrite: whether ``out`` may hold something.
-        progress: called after every decision.
+        overwrite: whether ``out`` may contain files.
+        progress: called after every decision from the first evaluation on.
 
     Raises:
-        ConfigurationError: a setting that cannot be run, ``out`` is not empty, or another process trains there.
+        ConfigurationError: a setting is invalid, ``out`` is not empty, or another process is training there.
         SimulationError: a world diverged.
     """
     with training_in(out, overwrite=overwrite):
@@ -66,14 +66,14 @@ def train_general(
 
 
 def resume_general(out: Path, *, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
-    """Continue a run where it was last saved, bit for bit; returns the evaluations, or what interrupted the run.
+    """Continue a run from its last save, bit for bit; returns the evaluations, or the interruption.
 
     Args:
         out: folder of the run.
-        progress: called after every decision.
+        progress: called after every decision from the first evaluation on.
 
     Raises:
-        ConfigurationError: as :func:`marlbc_mj.training.run.resume`.
+        ConfigurationError: as for :func:`marlbc_mj.training.run.resume`.
         SimulationError: a world diverged.
     """
     path = saved_run(out)
@@ -82,7 +82,7 @@ def resume_general(out: Path, *, progress: GeneralProgress | None = None) -> Int
 
 
 def _restored(path: Path) -> "GeneralRun":
-    """The run that was saved in a file, in the file's folder, without what a killed process left there."""
+    """Load the run saved in a file, and remove from its folder the leftovers of a killed process."""
     arrays, description = read_arrays(path)
     check_origin(path, description, _SAVED)
     run = GeneralRun(saved_config(path, description["train"], GeneralConfig), path.parent)
@@ -96,7 +96,7 @@ def _restored(path: Path) -> "GeneralRun":
 
 
 def is_general_run(out: Path) -> bool:
-    """Whether a folder says that the general policy is trained in it."""
+    """Whether a folder's configuration file is that of a training of the general policy."""
     try:
         return bool(json.loads((out / CONFIG_FILE).read_text())["train"]["type"] == GeneralConfig.__name__)
     except (OSError, ValueError, KeyError, TypeError):
@@ -104,7 +104,7 @@ def is_general_run(out: Path) -> bool:
 
 
 class GeneralRun:
-    """A trainer with its folder.
+    """A trainer and its output folder; evaluates and saves at fixed intervals.
 
     Args:
         config: configuration of the run.
@@ -121,11 +121,11 @@ class GeneralRun:
         if self.trainer.teachers:
             self.origin["teachers"] = [run for _, header in self.trainer.teachers for run in trainings(header)]
         self.evaluations: list[TrainingScores] = []
-        self.wall = 0.0  # time of training so far, without evaluations [s]
-        self.cpu = 0.0  # of this process in that time, which a busy machine does not lengthen [s]
+        self.wall = 0.0  # training time so far, without evaluations [s]
+        self.cpu = 0.0  # processor time of that training, which a busy machine does not lengthen [s]
 
     def go(self, progress: GeneralProgress | None = None) -> Interrupted | list[TrainingScores]:
-        """Train to the end of the budget, or until a signal arrives; then the run saves itself."""
+        """Train until the budget is spent or a signal arrives; the run then saves itself."""
         trainer = self.trainer
 
         def decide() -> None:
@@ -147,7 +147,7 @@ class GeneralRun:
         write_arrays(self.out / RESUME, arrays, description)
 
     def evaluate(self) -> None:
-        """Fly the held-out layouts; write the learning curve, the last checkpoint and perhaps the best."""
+        """Fly the held-out layouts; write the learning curve, the last checkpoint, and perhaps the best."""
         policy = self.trainer.policy()
         row = {
             "wall_s": self.wall,

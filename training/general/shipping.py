@@ -1,4 +1,4 @@
-"""Copies a run of the general policy into the package, with its model card."""
+"""Copying checkpoints of the general policy into the package, with their model cards."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -20,7 +20,7 @@ _DECIDES = {
     "set-based": "between formation and column",
     "null-space": "between formation and column and whether avoidance is on top",
 }
-"""What an agent decides, by the composition that the policy needs."""
+"""Wording in the model card for an agent's decision, by the composition that the policy needs."""
 
 
 def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
@@ -33,7 +33,7 @@ def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool
         overwrite: whether a checkpoint of that name may be replaced.
 
     Raises:
-        ConfigurationError: no such run, a damaged checkpoint, or a file that may not be replaced.
+        ConfigurationError: there is no such run, its checkpoint is damaged, or a file may not be replaced.
     """
     return put_in_package(run, name, folder, overwrite=overwrite, read=read_general, write_card=general_card)
 
@@ -42,13 +42,13 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
     """Write the mean of several policies and its model card; returns the checkpoint's path.
 
     Args:
-        checkpoints: of general policies; one that is named twice counts twice.
+        checkpoints: checkpoints of general policies; one that is listed twice counts twice.
         name: name of the shipped checkpoint.
         folder: folder of the shipped checkpoints.
         overwrite: whether a checkpoint of that name may be replaced.
 
     Raises:
-        ConfigurationError: a damaged checkpoint, networks that have no mean, or a file that may not be replaced.
+        ConfigurationError: a checkpoint is damaged, the networks cannot be averaged, or a file may not be replaced.
     """
     parts = [read_general(path) for path in checkpoints]
     config = GeneralConfig()
@@ -63,8 +63,8 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
 
 
 def trainings(description: dict[str, Any]) -> list[dict[str, Any]]:
-    """Command, configuration, last evaluation and revision of each training of a checkpoint, from its header, one unless it is a
-    mean. Of the paths of files that a configuration names, the last three parts.
+    """Command, configuration, evaluation and revision of each training behind a checkpoint, from its header: one training
+    unless the checkpoint is a mean. File paths in a configuration are cut to their last three parts.
     """
     if "mean_of" in description:
         return list(description["mean_of"])
@@ -83,7 +83,7 @@ def _within(path: str) -> str:
 
 
 def _what(train: dict[str, Any]) -> str:
-    """What the policies of a training are."""
+    """The introduction of a model card: method, decisions, inputs and requirements of a training's policy."""
     composition = train.get("composition", "set-based")
     method = "Policy distillation into" if train.get("teachers") else "Dueling Q-learning of"
     return (
@@ -95,7 +95,7 @@ def _what(train: dict[str, Any]) -> str:
 
 
 def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> str:
-    """The model card of a mean, in Markdown: a line per network."""
+    """The model card of a mean policy in Markdown, with one table row per network."""
     lines = [
         f"# {name}",
         "",
@@ -109,7 +109,7 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
 
 
 def _introduced(runs: list[dict[str, Any]]) -> str:
-    """The sentences above a table of trainings."""
+    """The sentences that introduce a table of trainings."""
     return (
         f"{len(runs)} networks, each trained by a command of its own at the revision beside it"
         + ("; a file named in `start` is the checkpoint of another run" if any(run["train"]["start"] for run in runs) else "")
@@ -118,7 +118,7 @@ def _introduced(runs: list[dict[str, Any]]) -> str:
 
 
 def _rules(margin: float, dwell: int, deadline: float) -> str:
-    """When an agent leaves its order."""
+    """The sentences about when an agent leaves its order."""
     return (
         f"An agent leaves its order only for one whose value is higher by more than {margin:g}"
         + (f", and keeps a new one for at least {dwell} decisions." if dwell > 1 else ".")
@@ -132,7 +132,7 @@ def _rules(margin: float, dwell: int, deadline: float) -> str:
 
 
 def _table_of_runs(runs: list[dict[str, Any]]) -> str:
-    """A table with the command of each training."""
+    """A table with the command of each training, its length and its revision."""
     rows = [
         (
             f"`{_command(run)}`",
@@ -146,12 +146,12 @@ def _table_of_runs(runs: list[dict[str, Any]]) -> str:
 
 
 def general_card(name: str, description: dict[str, Any], rows: list[dict[str, str]]) -> str:
-    """The model card in Markdown: what the checkpoint is, how it was made, its learning curve on held-out layouts.
+    """The model card in Markdown: the checkpoint's purpose, its training, and its learning curve on held-out layouts.
 
     Args:
         name: name of the shipped checkpoint.
         description: description in the checkpoint's header.
-        rows: lines of the run's eval.csv.
+        rows: rows of the run's eval.csv.
     """
     train, evaluation, versions = description["train"], description["evaluation"], description["versions"]
     families = [key.removeprefix("success_") for key in rows[0] if key.startswith("success_")]
@@ -180,7 +180,7 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
 
 
 def _counted(names: list[str]) -> str:
-    """Names, with how often each is there where that is more than once."""
+    """The distinct names, with the number of occurrences if there are several."""
     return ", ".join(name if n == 1 else f"{name} ({n} times)" for name, n in Counter(names).items())
 
 
@@ -191,10 +191,10 @@ def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
 
 
 def training_command(train: dict[str, Any]) -> str:
-    """The command of a training with these settings: ``--set`` names those that differ from the defaults of this version."""
+    """The command for a training with these settings: ``--set`` lists those that differ from this version's defaults."""
     return " ".join([f"marlbc train {GENERAL} --seed {train['seed']}", *changed_settings(train, GeneralConfig(), said={"seed"})])
 
 
 def _command(run: dict[str, Any]) -> str:
-    """The command in a header; checkpoints of older versions have none there."""
+    """The command in a checkpoint's header; for older checkpoints, which have none, one made from the settings."""
     return str(run.get("command") or training_command(run["train"]))

@@ -1,4 +1,4 @@
-"""Squads: worlds of one family and team that learn together with others, each with the messages that its agents have heard."""
+"""Squads: each is a group of worlds of one family and team, with the messages that its agents have received."""
 
 from typing import Any, NamedTuple
 
@@ -30,34 +30,34 @@ from marlbc_mj.training.general.config import GeneralConfig
 from marlbc_mj.util.seeding import stream
 
 NEAREST_SIGHT = 6
-"""Bins of a lane that a guided episode looks at, at least: 9 settling times ahead."""
+"""Least number of lane bins that a guided episode looks at: up to 9 settling times ahead."""
 LOST_AFTER = 6
-"""Decisions for which an agent is shut out until it is lost."""
+"""Consecutive decisions with an agent shut out after which the agent counts as lost."""
 LOST_BEYOND = 8.0
-"""Distance from both slots beyond which an agent is far [d_OA]."""
+"""Distance from both slots beyond which an agent counts as far away [d_OA]."""
 AVOIDS_WITHIN = 0.5
-"""Clearance beyond d_OA within which a guide avoids [d_OA]."""
+"""Clearance beyond d_OA below which the guide can choose avoidance [d_OA]."""
 
 
 class SquadOutcome(NamedTuple):
     """Outcome of one decision of W teams."""
 
-    action: np.ndarray  # (W, N) taken, or where guides are imitated, what the guide would have taken
+    action: np.ndarray  # (W, N) actions to learn from: those taken, or for imitation the guide's
     reward: np.ndarray  # (W, N) float32
-    final: np.ndarray  # (W, N, S) inputs of the next decision, where an episode ended as if it went on
+    final: np.ndarray  # (W, N, S) inputs of the next decision, before any restart
     ended: np.ndarray  # (W,) bool, a new episode has begun
-    terminal: np.ndarray  # (W,) bool, nothing comes after: the mission is over, or the reward has the cost of the time after, too
+    terminal: np.ndarray  # (W,) bool, nothing to bootstrap: the mission is over, or the reward includes all later costs
     steps: int  # mission steps made, over all worlds
 
 
 class Squad:
-    """W worlds of one scenario. A mission's end is terminal; where an episode is cut short, so that phases differ, it is not.
+    """W worlds of one scenario. A mission's end is terminal; that of the first episodes, cut short to spread the phases, is not.
 
     Args:
-        scenario: that layouts are drawn of.
+        scenario: the scenario from which layouts are drawn.
         config: configuration of the run.
-        learning: the same for the exploration.
-        number: of the squad, for its own random stream.
+        learning: settings of the exploration.
+        number: index of the squad, which selects its random stream.
     """
 
     def __init__(self, scenario: Scenario, config: GeneralConfig, learning: TrainConfig, number: int) -> None:
@@ -71,28 +71,28 @@ class Squad:
         self.rng = stream(config.seed, number)
         self.last = np.full((config.worlds, scenario.agents), FORMATION, dtype=np.int64)
         self.heard = np.zeros((config.worlds, scenario.agents, scenario.agents, SENT), dtype=np.float32)
-        self.age = np.full(self.heard.shape[:3], np.inf)  # of what was heard [decisions]
-        self.loss = np.zeros(config.worlds)  # share of messages missed
-        self.mute = np.zeros((config.worlds, scenario.agents), dtype=bool)  # whom the others never hear
-        self.bins = np.zeros(config.worlds, dtype=np.int64)  # of lanes, that a guided episode looks at; 0: not guided
-        self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions that an agent has been shut out for
-        self.finish = scenario.mission_steps - self.interval + 1  # mission step from which no decision is left
+        self.age = np.full(self.heard.shape[:3], np.inf)  # age of the received messages [decisions]
+        self.loss = np.zeros(config.worlds)  # share of messages that are missed
+        self.mute = np.zeros((config.worlds, scenario.agents), dtype=bool)  # agents that the others never hear
+        self.bins = np.zeros(config.worlds, dtype=np.int64)  # lane bins that a guided episode looks at; 0: not guided
+        self.astray = np.zeros(config.worlds, dtype=np.int64)  # decisions for which an agent has been shut out
+        self.finish = scenario.mission_steps - self.interval + 1  # mission step after which no whole decision is left
         self.end = np.full(config.worlds, self.finish)  # mission step at which an episode ends
         self._restart(np.ones(config.worlds, dtype=bool))
-        phases = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # so that they differ
+        phases = self.rng.integers(self.interval, scenario.mission_steps, size=config.worlds)  # to spread the worlds
         self.end = np.minimum(phases, self.finish)
         self.inputs = self._exchange()  # (W, N, S) of the next decision
 
     @property
     def rows(self) -> int:
-        """Agents in all worlds."""
+        """Number of agents in all worlds."""
         return int(self.last.size)
 
     def _sense(self) -> np.ndarray:
         return sense_features(self.world.observe(), self.sight)
 
     def _exchange(self, only: np.ndarray | None = None) -> np.ndarray:
-        """(W, N, S) inputs after everybody sent once; of the teams ``only`` (W,) alone others' memories stay as they are."""
+        """(W, N, S) inputs after every agent sent one message; with ``only`` (W,) bool, only these teams exchange messages."""
         features = self._sense()
         arrives = self.rng.random(self.age.shape) >= self.loss[:, None, None]
         arrives &= ~self.mute[:, None]
@@ -104,21 +104,21 @@ class Squad:
         return join_inputs(features, self.heard, self.age * self.interval * self.scenario.mission_step / self.sight.time)
 
     def choose(self, greedy: np.ndarray, temperature: float) -> np.ndarray:
-        """(W, N) actions: ``greedy`` ones, a guide's, or what is explored at this temperature, see :class:`Exploration`."""
+        """(W, N) actions: ``greedy`` or the guide's, some replaced by :class:`Exploration` at this temperature."""
         greedy = np.where(self.bins[:, None] > 0, self._guide(), greedy)
         return self.explore(greedy, np.full(greedy.shape, temperature), self.rng)
 
     def _guide(self) -> np.ndarray:
-        """(W, N) what the look-ahead would do; where agents decide about avoidance, it is on top while :func:`obstructed`."""
+        """(W, N) actions of the look-ahead; if agents decide about avoidance, it is on top for :func:`obstructed` ones."""
         motion = look_ahead(self.inputs, self.last % len(MOTIONS), self.bins)[:, None]
         return np.asarray(motion + len(MOTIONS) * (obstructed(self.inputs, motion) & self.avoids))
 
     def step(self, actions: np.ndarray) -> SquadOutcome:
-        """One decision, with ``actions`` (W, N)."""
+        """Make one decision with ``actions`` (W, N)."""
         config = self.config
         learnt = self._guide() if config.learner == "imitation" else actions
         switched = (actions != self.last) & (self.world.state.steps > 0)[:, None]
-        self.last = actions.copy()  # a restart changes it; what was taken is learned from
+        self.last = actions.copy()  # a copy, as a restart overwrites it and the actions are learned from
         returns, violated = self._fly(self.orders[actions])
         team = (returns / self.interval - 2.0 * FORMATION_REWARD) / (2.0 * FORMATION_REWARD)
         final = self._exchange()
@@ -136,8 +136,8 @@ class Squad:
         return SquadOutcome(learnt, reward.astype(np.float32), final, ended, lost | over, self.interval * len(actions))
 
     def _fly(self, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(W,) returns of a decision's mission steps under ``orders`` (W, N); and (W, N) bool, who violated the safe distance
-        after one of them, nobody where the composition avoids.
+        """Returns (W,) of a decision's mission steps under ``orders`` (W, N), and (W, N) bool, agents that violated the safe
+        distance at the end of one of them; all False where the composition avoids obstacles by itself.
         """
         violated = np.zeros(orders.shape, dtype=bool)
         if not self.avoids:
@@ -149,35 +149,38 @@ class Squad:
         return returns, violated
 
     def _late(self, inputs: np.ndarray) -> np.ndarray:
-        """(W, N) bool: agents beyond the tolerance of their slots in the formation; ``inputs`` (W, N, S)."""
+        """(W, N) bool: agents outside the tolerance of their formation slots; ``inputs`` (W, N, S)."""
         return np.asarray(inputs[..., WAYS] > np.tanh(self.scenario.formation_tolerance / self.sight.length))
 
     def _lost(self, inputs: np.ndarray) -> np.ndarray:
-        """(W,) bool: an agent has been shut out for LOST_AFTER decisions, and neither its line nor moving obstacles let it in."""
+        """(W,) bool: teams in which an agent has been shut out for LOST_AFTER decisions.
+
+        None are lost where an approach along lines or moving obstacles can let such an agent in again.
+        """
         if self.scenario.motions or any(isinstance(behavior, LineFormation) for behavior in self.scenario.behaviors):
             return np.zeros(len(inputs), dtype=bool)
         self.astray = np.where(shut_out(inputs).any(axis=1), self.astray + 1, 0)
         return self.astray >= LOST_AFTER
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the squad needs to go on bit for bit: arrays, and the rest as JSON data."""
+        """The state that resumes the squad bit for bit: arrays, and the remaining values as JSON data."""
         arrays = {name: getattr(owner, name) for owner, name in self._plain_arrays()}
         return {**prefixed("world", self.world.snapshot()), **arrays}, {"rng": self.rng.bit_generator.state}
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a squad with the same configuration."""
+        """Restore a :meth:`snapshot` of a squad with the same configuration."""
         self.world.restore(unprefixed("world", arrays))
         for owner, name in self._plain_arrays():
             setattr(owner, name, arrays[name].copy())
         self.rng.bit_generator.state = scalars["rng"]
 
     def _plain_arrays(self) -> list[tuple[Any, str]]:
-        """Arrays that are attributes, as pairs of owner and name."""
+        """The arrays that a snapshot takes as they are: pairs of the owning object and the attribute's name."""
         own = ("last", "heard", "age", "loss", "mute", "bins", "astray", "end", "inputs")
         return [*((self, name) for name in own), *((self.explore, name) for name in ("left", "held"))]
 
     def _restart(self, ended: np.ndarray) -> None:
-        """New episodes on new layouts where ``ended`` (W,) is true."""
+        """Start new episodes on new layouts where ``ended`` (W,) is true."""
         config, count = self.config, int(ended.sum())
         self.world.reset(int(self.rng.integers(2**31)), ended)
         self.explore.forget(ended)
@@ -195,27 +198,27 @@ class Squad:
 
 
 def shut_out(inputs: np.ndarray) -> np.ndarray:
-    """(W, N) bool: agents far from both slots whose ways to both are blocked; ``inputs`` (W, N, S)."""
+    """(W, N) bool: agents far from both slots, with the straight ways to both blocked; ``inputs`` (W, N, S)."""
     far = np.tanh(LOST_BEYOND / COARSE)
     away = (inputs[..., WAYS + 1] > far) & (inputs[..., WAYS + 3] > far)
     return np.asarray((inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & away)
 
 
 def obstructed(inputs: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """(W, N) bool: agents close to an obstacle, whose straight way to the slot of ``motion`` (W, N or 1) comes closer than d_OA
-    to one; ``inputs`` (W, N, S).
+    """(W, N) bool: agents close to an obstacle with a blocked straight way to their slot, one that comes closer than d_OA to an
+    obstacle; ``motion`` (W, N or 1) selects the slot, ``inputs`` (W, N, S).
     """
     way = np.where(motion == COLUMN_ACTION, inputs[..., LANES + COLUMN_ACTION], inputs[..., LANES + FORMATION])
     return np.asarray((inputs[..., CLEARANCE_ENTRY] < AVOIDS_WITHIN) & (way < 0.0))
 
 
 def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.ndarray:
-    """(W,) one action per team: the column while two lanes of the formation are blocked, or the way back is for anybody.
+    """(W,) one action per team: the column while two formation lanes are blocked or, in it, any agent's way back is.
 
     Args:
         inputs: (W, N, S) of all agents.
         last: (W, N) motions in force, FORMATION or COLUMN_ACTION.
-        bins: (W,) first bins of the lanes that are looked at.
+        bins: (W,) number of bins to look at, from the first of each lane.
     """
     seen = np.arange(LANE_BINS) < bins[:, None, None]
     blocked = (np.where(seen, inputs[..., :LANE_BINS], np.inf) < 0.0).any(axis=-1)

@@ -1,4 +1,4 @@
-"""Learning of the general policy: one dueling network on the transitions of all agents of all squads."""
+"""Training of the general policy: one dueling network learns from the transitions of all agents of all squads."""
 
 import math
 from pathlib import Path
@@ -27,17 +27,17 @@ from marlbc_mj.training.replay import Replay
 from marlbc_mj.util.errors import ConfigurationError
 
 COLD = 0.05
-"""Temperature after the share ``cool_by`` of the budget."""
+"""Temperature once the share ``cool_by`` of the budget is spent."""
 
 
 class GeneralTrainer:
-    """One run. :meth:`advance` makes a decision in every world and learns from all agents' transitions alike.
+    """One training run; :meth:`advance` makes a decision in every world and learns from all agents' transitions alike.
 
     Args:
         config: configuration of the run.
 
     Raises:
-        ConfigurationError: a scenario, controller or device that cannot be used.
+        ConfigurationError: the scenario, controller or device cannot be used.
     """
 
     def __init__(self, config: GeneralConfig) -> None:
@@ -54,9 +54,9 @@ class GeneralTrainer:
         if isinstance(self.learner, Distilled):
             self.learner.teach(self._teacher())
         self.rng = np.random.default_rng(config.seed)
-        self.sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])  # (T,) of the teams
+        self.sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])  # (T,) team sizes
         self.replay = self.make_replay(int(self.sizes.sum()))
-        self.steps = 0  # mission steps made, over all worlds
+        self.steps = 0  # mission steps simulated so far, over all worlds
         self.error = 0.0  # mean absolute TD error of the last update
         single_thread()
 
@@ -81,16 +81,16 @@ class GeneralTrainer:
 
     @property
     def temperature(self) -> float:
-        """Wanted randomness of the actions; it falls from 1."""
+        """Temperature of the exploration, which falls from ``first_temperature``."""
         first = math.log(self.config.first_temperature)
         return math.exp(first + (math.log(COLD) - first) * self.share / self.config.cool_by)
 
     def _begin_with(self, policy: GeneralPolicy) -> None:
-        """Take over the network of a policy, also for targets and for the running mean.
+        """Copy a policy's network into the learner's network, its targets and its running mean.
 
         Raises:
-            ConfigurationError: its layers have other sizes than the configuration's, it is a mean of several networks, or it was
-                trained under another composition.
+            ConfigurationError: the policy's layer sizes differ from the configuration's, it is a mean of several networks, or it
+                was trained under another composition.
         """
         if len(policy.network.weights[0]) > 1:
             raise ConfigurationError(f"checkpoint {self.config.start} is a mean of several networks; a run begins with one")
@@ -110,14 +110,14 @@ class GeneralTrainer:
         """The mean of the configuration's teachers.
 
         Raises:
-            ConfigurationError: networks of different sizes, or of another composition.
+            ConfigurationError: the networks have different sizes or another composition.
         """
         teacher = mean_policy([policy for policy, _ in self.teachers], self.config.switching_margin)
         orders_for(teacher, self.squads[0].scenario)
         return teacher
 
     def advance(self) -> None:
-        """One decision in every world, stored, and the updates after it.
+        """Make one decision in every world, store it, and learn.
 
         Raises:
             ConfigurationError: the network diverged.
@@ -144,23 +144,23 @@ class GeneralTrainer:
         self.steps += sum(outcome.steps for outcome in outcomes)
 
     def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
-        """(W, N) actions of every squad, which has inputs among ``inputs`` (M, S); greedy, explored or a guide's."""
+        """(W, N) actions of every squad (greedy, explored or the guide's), from the inputs of all agents (M, S)."""
         greedy, temperature = self.learner.values(inputs)[:, 0].argmax(axis=-1), self.temperature
         return [squad.choose(best, temperature) for squad, best in zip(self.squads, self.by_squad(greedy), strict=True)]
 
     def by_squad(self, actions: np.ndarray) -> list[np.ndarray]:
-        """(W, N) actions of every squad, of those of all agents (M,)."""
+        """Split the actions of all agents (M,) into those of every squad (W, N)."""
         bounds = np.cumsum([squad.rows for squad in self.squads])[:-1]
         return [own.reshape(squad.last.shape) for squad, own in zip(self.squads, np.split(actions, bounds), strict=True)]
 
     @property
     def learning_rate(self) -> float:
-        """Step size of Adam at present."""
+        """Current step size of Adam."""
         first, last = self.config.learning_rate, self.config.final_learning_rate
         return last + (first - last) * (1.0 - self.share)
 
     def learn(self) -> None:
-        """The updates after a decision."""
+        """Make the updates that follow a decision."""
         config = self.config
         if self.replay.count <= config.n_step:
             return
@@ -171,16 +171,16 @@ class GeneralTrainer:
         self.refuse_nonsense()
 
     def refuse_nonsense(self) -> None:
-        """Stop if the network has diverged.
+        """Check that the last update's error is finite.
 
         Raises:
-            ConfigurationError: it has.
+            ConfigurationError: the network has diverged.
         """
         if not np.isfinite(self.error):
             raise ConfigurationError(f"the network diverged after {self.steps} mission steps; try a lower learning_rate")
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """Everything that the run needs to go on bit for bit: arrays, and the rest as JSON data."""
+        """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""
         squads = [squad.snapshot() for squad in self.squads]
         arrays, counts = snapshot_learning(self.learner, self.replay)
         for k, (own, _) in enumerate(squads):
@@ -189,7 +189,7 @@ class GeneralTrainer:
         return arrays, {"squads": [own for _, own in squads], **counts, **state}
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
-        """Return to a :meth:`snapshot` of a run with the same configuration."""
+        """Restore a :meth:`snapshot` of a run with the same configuration."""
         for k, (squad, own) in enumerate(zip(self.squads, scalars["squads"], strict=True)):
             squad.restore(unprefixed(f"squad{k}", arrays), own)
         restore_learning(self.learner, self.replay, arrays, scalars)
@@ -198,11 +198,11 @@ class GeneralTrainer:
 
     @property
     def flown(self) -> TeamNetwork:
-        """The network that the policy is made of: the running mean of the weights."""
+        """The network of the policy: the one with the running mean of the weights."""
         return self.learner.smooth
 
     def policy(self) -> GeneralPolicy:
-        """The greedy policy of :attr:`flown`."""
+        """The greedy policy of the network :attr:`flown`."""
         network = self.flown
         weights = tuple(w.detach().cpu().numpy().copy() for w in network.weights)
         biases = tuple(b.detach().cpu().numpy().copy() for b in network.biases)

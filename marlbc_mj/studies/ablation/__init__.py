@@ -1,4 +1,4 @@
-"""Ablations: what each choice of controller, reading and clock is worth, measured on whole episodes."""
+"""Ablations: the effect of each choice of controller, of reading of the paper, and of time step, measured on whole episodes."""
 
 from marlbc_mj.studies.ablation.cases import AblationRow, Case, Figures, Question
 from marlbc_mj.studies.ablation.jobs import AblationStudy, run_ablation

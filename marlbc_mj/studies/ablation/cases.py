@@ -1,4 +1,4 @@
-"""Questions and their rows: one episode per case, or the reason why there is none."""
+"""Ablation questions and their table rows: the figures of one episode per case, or the reason why there are none."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +15,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
 class Case(NamedTuple):
-    """A row of the table before it is measured: its settings, and how to run it."""
+    """One episode to run: the settings shown in its table row, its scenario and its controller."""
 
     settings: tuple[str, ...]  # one value for each of the question's parameters
     scenario: Scenario
@@ -23,23 +23,23 @@ class Case(NamedTuple):
 
 
 class Figures(NamedTuple):
-    """One episode in numbers."""
+    """The measured figures of one episode."""
 
     total: float  # return: sum of rewards over the episode
     switches: tuple[int, ...]  # per agent
     violation_time: float  # time with d <= d_OA, sum over agents [s]
-    clearance: float  # least of the team [m]
+    clearance: float  # least over agents and substeps [m]
     effort: float  # integral of |u| dt, sum over agents [N s]
     rms_velocity_error: float  # over all agents and substeps [m/s]
     rms_position_error: float  # over all agents and substeps [m]
 
 
 class AblationRow(NamedTuple):
-    """One case's figures, or why there are none."""
+    """A table row: the figures of one case, or the reason why there are none."""
 
     settings: tuple[str, ...]
     figures: Figures | None
-    first_over_this: float | None  # RMS velocity error of the block's first row over this one's
+    first_over_this: float | None  # RMS velocity error of the block's first row, divided by this row's
     failure: str = ""
 
 
@@ -47,15 +47,15 @@ class AblationRow(NamedTuple):
 class Question:
     """A question about one choice, and the cases that answer it, run under the scripted supervisor.
 
-    Rows with equal values of the first ``block`` parameters form a block, whose first row the others are compared with.
+    Rows with equal values of the first ``block`` parameters form a block. Each row is compared with the first row of its block.
     """
 
     name: str
     caption: str
-    about: str  # what varies and why; no number in it
+    about: str  # what varies and why, without measured numbers
     parameters: tuple[str, ...]
     cases: Callable[[], Sequence[Case]]
-    columns: tuple[str, ...]  # of the table, keys of page.ABLATION_COLUMNS; the CSV has all
+    columns: tuple[str, ...]  # of the table: ``ratio`` and keys of page.ABLATION_COLUMNS; the CSV has all
     block: int = 0
     remark: Callable[[Sequence[AblationRow]], str] | None = None  # a sentence computed from the rows
 
@@ -68,7 +68,7 @@ class Measured(NamedTuple):
 
 
 def measure_case(case: Case) -> Measured:
-    """One episode. A setting that is refused and a run that fails have their reason in place of figures."""
+    """Run the episode of a case. If its settings are refused or the run fails, the result has the reason instead of figures."""
     try:
         return Measured(figures_of(run_episode(World(case.scenario, case.controller, record=True), Scripted())))
     except SimulationError as error:
@@ -78,7 +78,7 @@ def measure_case(case: Case) -> Measured:
 
 
 def compare_rows(question: Question, measured: Sequence[Measured]) -> list[AblationRow]:
-    """The question's rows, in the order of its cases, each compared with the first of its block."""
+    """The question's rows, in the order of its cases, each compared with the first row of its block."""
     rows: list[AblationRow] = []
     first: AblationRow | None = None
     for case, (figures, failure) in zip(question.cases(), measured, strict=True):

@@ -1,4 +1,4 @@
-"""The ablation as a study: one job per case of every question, and their page."""
+"""The ablation study: one job per case of every question, and a page with all tables."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ class AblationJob(NamedTuple):
 
 @dataclass(frozen=True)
 class AblationStudy:
-    """Every case of some questions, and a table for each of them."""
+    """Study that runs all cases of the chosen questions and makes one table per question."""
 
     questions: tuple[Question, ...]
 
@@ -35,7 +35,7 @@ class AblationStudy:
         return measure_case(job.case)
 
     def rows(self, results: Sequence[Measured]) -> dict[str, tuple[Question, list[AblationRow]]]:
-        """Question and rows by the question's name, from the results of all jobs."""
+        """Each question with its rows, by the question's name, from the results of all jobs."""
         rows, begin = {}, 0
         for question in self.questions:
             end = begin + len(question.cases())
@@ -61,7 +61,7 @@ def run_ablation(
     engine: EngineName = "local",
     progress: Progress = silent,
 ) -> Conclusion[Measured]:
-    """Run the questions' cases; leaves ablation.md, ablation.csv and index.html in ``out``.
+    """Run all cases of the questions and write ablation.md, ablation.csv and index.html into ``out``.
 
     Raises:
         ConfigurationError: ``out`` cannot be written.

@@ -1,4 +1,4 @@
-"""The ablations' page: every question as a table with how to read it, in Markdown, CSV and HTML."""
+"""The page of the ablations: one table per question and how to read it, in Markdown, CSV and HTML."""
 
 import csv
 from collections.abc import Callable, Mapping, Sequence
@@ -19,7 +19,7 @@ ABLATION_COLUMNS: dict[str, tuple[str, Callable[[Figures], str]]] = {
     "velocity_error": (SCORES["rms_velocity_error_rms"].label, lambda f: f"{f.rms_velocity_error:.4f}"),
     "position_error": (SCORES["rms_position_error_rms"].label, lambda f: f"{f.rms_position_error:.4f}"),
 }
-"""Header and cell of a table's column by key; ``ratio``, which needs the whole row, is set in :func:`ablation_table`."""
+"""Header and cell text of a table column, by key. :func:`ablation_table` adds ``ratio``, which needs the whole row."""
 RATIO = "error, first / this"
 HOW_TO_READ = (
     "Every row is one whole deterministic episode under the scripted supervisor. Switches are per agent, violation time and "
@@ -30,7 +30,7 @@ HOW_TO_READ = (
 
 
 def ablation_table(question: Question, rows: Sequence[AblationRow]) -> Table:
-    """A question as a table; its notes are computed from the rows."""
+    """The table of a question, with notes that are computed from its rows."""
     failed = any(row.figures is None for row in rows)
     labels = [RATIO if key == "ratio" else ABLATION_COLUMNS[key][0] for key in question.columns]
     header = [*question.parameters, *labels, *(["result"] if failed else [])]
@@ -46,8 +46,8 @@ def write_ablation_page(
     """Write ablation.md, ablation.csv and index.html.
 
     Args:
-        results: question and rows by name.
-        facts: where the numbers come from, by name: revision and versions, for example.
+        results: each question with its rows, by the question's name.
+        facts: the origin of the numbers by name, for example revision and versions.
     """
     tables = [ablation_table(question, rows) for question, rows in results.values()]
     origin = "\n".join(f"- {name}: {value}" for name, value in facts.items())
@@ -60,7 +60,7 @@ def write_ablation_page(
 
 
 def csv_rows(results: Mapping[str, tuple[Question, Sequence[AblationRow]]]) -> list[list[object]]:
-    """Header and one line per row: question, all parameters of any question (empty where it has none), figures, failure."""
+    """Header and one line per row: question, parameters of all questions (empty if it lacks them), figures, ratio, failure."""
     parameters = list(dict.fromkeys(name for question, _ in results.values() for name in question.parameters))
     numbers = ["return", "switches", "violation_time_s", "clearance_min_m", "effort_integral_N_s"]
     numbers += ["rms_velocity_error_m_s", "rms_position_error_m"]
@@ -87,7 +87,7 @@ def _block(question: Question, row: AblationRow) -> tuple[str, ...]:
 
 
 def _notes(question: Question, rows: Sequence[AblationRow]) -> tuple[str, ...]:
-    """What varies, then what came out: the spread, the best row, and how many rows have no figures."""
+    """Notes of a table: what varies, best row and spread, the question's remark, and the number of rows without figures."""
     notes = [question.about]
     ran = [row for row in rows if row.figures is not None]
     if ran:
@@ -100,7 +100,7 @@ def _notes(question: Question, rows: Sequence[AblationRow]) -> tuple[str, ...]:
 
 
 def _spread(question: Question, ran: Sequence[AblationRow]) -> str:
-    """Best ratio, and the range of the return where the table has it."""
+    """Sentences on the best ratio and, if the table has a column for the return, on the range of the return."""
     best = max(ran, key=lambda row: row.first_over_this or 0.0)
     ratio = best.first_over_this or 1.0
     text = "No row tracks better than the first of its block."

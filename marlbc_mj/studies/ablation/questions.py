@@ -25,7 +25,7 @@ MISSION = ("total", "switches", "violation_time", "clearance", "effort", "veloci
 
 @laws.controller(gains=("position_gain", "velocity_gain", "limit"))
 def exact_model(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """PD plus perfect knowledge of f: u = clip(-k_p e_p - k_v e_v - f); the limit of what any identifier can reach."""
+    """PD plus perfect knowledge of f, the best that any identifier could achieve: u = clip(-k_p e_p - k_v e_v - f)."""
     for axis in range(2):
         e_p, e_v = p[axis] - p_r[axis], v[axis] - v_r[axis]
         wish = -gains.position_gain * e_p - gains.velocity_gain * e_v - drag[axis]
@@ -33,7 +33,7 @@ def exact_model(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 
 class ExactModel(PD):
-    """The gains of :class:`PD` with :func:`exact_model`."""
+    """Controller with the gains of :class:`PD` and the law :func:`exact_model`."""
 
     law = staticmethod(exact_model)
 
@@ -42,16 +42,17 @@ class ExactModel(PD):
 
 
 def half_mission(scale: float) -> Scenario:
-    """The case study's first 50 s from the slots, with ``scale`` times the drag.
+    """The case study's first 50 s with ``scale`` times the drag, starting in the slots of the formation.
 
-    Both points are passed, and the reference does not jump, which a large drag would turn into a fall.
+    The team passes both point obstacles. From the slots the reference has no large initial jump, which a large drag would turn
+    into divergence.
     """
     starts = tuple((x - 2.5, y) for x, y in SLOTS)
     return paper(starts=starts, duration=50.0, disturbance=PaperDrag(scale))
 
 
 def variants() -> dict[str, Controller]:
-    """The bases, and the limit that a perfectly known drag sets."""
+    """SORLC with each basis, and the exact model, which no identifier can beat, by name."""
     return {"off": SORLC(basis="off"), "published": SORLC(), "scaled": SORLC.scaled(), "exact model": ExactModel()}
 
 
@@ -111,7 +112,7 @@ def _best_of_sweep(rows: Sequence[AblationRow]) -> str:
 
 
 def _stability(rows: Sequence[AblationRow]) -> str:
-    """The limit, and what is left to gain below the default step."""
+    """Sentences on the stability limit of the substep, and on how much the error changes below the default substep."""
     limit, default = largest_stable_substep(*SORLC().linear_gains), f"{1e3 * paper().substep:g}"
     text = f"The linear loop is stable below {1e3 * limit:.1f} ms."
     errors = {row.settings[0]: row.figures.rms_velocity_error for row in rows if row.figures is not None}
@@ -123,7 +124,7 @@ def _stability(rows: Sequence[AblationRow]) -> str:
 
 
 def _worth_of_choices(rows: Sequence[AblationRow]) -> str:
-    """How far the sign alone, and the basis alone, move the error and the effort."""
+    """A sentence on how much the sign alone and the basis alone change the error and the effort."""
     sign, basis = (_largest_changes(rows, varied) for varied in (2, 1))
     return (
         f"With the rest equal, the sign changes the RMS velocity error by at most {sign[0]:.2%} and the effort by at most "
@@ -205,7 +206,7 @@ QUESTIONS: dict[str, Question] = {question.name: question for question in _QUEST
 
 
 def select_questions(names: Sequence[str]) -> tuple[Question, ...]:
-    """The named questions in the order given; all of them for no name.
+    """The named questions in the given order, or all questions if no name is given.
 
     Raises:
         ConfigurationError: unknown name, or one given twice.

@@ -1,4 +1,4 @@
-"""Engines, which run the jobs of a study: in processes of this machine, on a Ray cluster, or in an array of SLURM."""
+"""Engines, which run the jobs of a study in processes on this machine, on a Ray cluster, or in a SLURM job array."""
 
 from collections.abc import Callable
 from typing import Literal
@@ -30,7 +30,7 @@ def _slurm(workers: int) -> Engine:
 
 
 ENGINES: dict[str, Callable[[int], Engine]] = {"local": _local, "ray": _ray, "slurm": _slurm}
-"""How to make an engine, by name; called with the number of workers."""
+"""Factories of engines by name, called with the number of workers."""
 
 
 def make_engine(name: str, workers: int = 1) -> Engine:
@@ -38,10 +38,10 @@ def make_engine(name: str, workers: int = 1) -> Engine:
 
     Args:
         name: a key of :data:`ENGINES`.
-        workers: processes on this machine, CPUs of a Ray that is started for this study, or tasks of a SLURM array.
+        workers: processes on this machine, CPUs of the Ray instance started for this study, or tasks of a SLURM array.
 
     Raises:
-        ConfigurationError: unknown name, fewer than one worker, or the package that the engine needs is not installed.
+        ConfigurationError: unknown name, fewer than one worker, or something that the engine needs is not installed.
     """
     if name not in ENGINES:
         raise unknown("engine", name, ENGINES)

@@ -1,7 +1,7 @@
 """Engines and their tasks.
 
-An engine only moves work: :meth:`Work.do` is the same call in every process and on every machine, so results are the same bits
-whatever the engine. It owns no state that outlives it: the runner stores every result.
+An engine only decides where jobs run. Every process on every machine makes the same call, :meth:`Work.do`, so all engines give
+results that are identical to the last bit. Engines do not keep results: the runner stores them.
 """
 
 import traceback
@@ -18,39 +18,39 @@ from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.text import one_line
 
 MOST_TRIES = 4
-"""Tries of a job whose worker dies."""
+"""Most tries of a job whose worker dies."""
 
 
 class StopRequest(Protocol):
-    """Whether somebody asked the study to stop: the number of the signal, or 0."""
+    """A request to stop the study: the number of the signal that was received, or 0."""
 
     signal: int
 
 
 class JobError(SimulationError):
-    """A job raised something that is no error of this package's; the message says what and where."""
+    """A job raised an exception that is not one of this package's errors; the message says which one and where."""
 
 
 class Task(NamedTuple):
-    """A job on its way."""
+    """A job that is passed to an engine."""
 
-    place: int  # among the jobs of the study
-    key: str  # content address; empty where nothing is stored
+    place: int  # index among the jobs of the study
+    key: str  # content address; empty if nothing is stored
     job: Any
 
 
 @dataclass(frozen=True)
 class Work(Generic[JobT, ResultT]):
-    """The data that workers need besides their tasks; picklable."""
+    """Data that all workers need besides their tasks; picklable."""
 
     study: Study[JobT, ResultT]
     files: Path | None = None
-    """Folder for the large files of all jobs; None: there are none."""
+    """Folder for the large files of all jobs; None: jobs write no large files."""
     scratch: Path | None = None
-    """Folder for what an engine shares with its workers; None: nothing is stored."""
+    """Folder that an engine shares with its workers; None: the study stores nothing."""
 
     def visible(self) -> "Work[JobT, ResultT]":
-        """The same on a machine that may not see the study's folder: jobs leave large files where they are seen, or nowhere."""
+        """A copy for this machine, without the folder for large files if the machine cannot see it."""
         if self.files is None or self.files.is_dir():
             return self
         return replace(self, files=None)
@@ -62,18 +62,18 @@ class Work(Generic[JobT, ResultT]):
 
 
 class Outcome(NamedTuple):
-    """How one job ended, as data that an engine can move."""
+    """The result or the error of one job, as data that can be sent between processes."""
 
     result: Any
     error: str = ""
-    """Name of the error of this package that it raised; empty where it did not."""
+    """Name of the error class of this package that the job raised; empty if it raised none."""
     message: str = ""
 
     def unpack(self) -> Any:
-        """The result.
+        """Return the result, or raise the error of the job.
 
         Raises:
-            ConfigurationError, SimulationError: what the job raised.
+            ConfigurationError, SimulationError: the error that the job raised.
         """
         if self.error:
             raise getattr(errors, self.error, JobError)(self.message)
@@ -81,7 +81,7 @@ class Outcome(NamedTuple):
 
 
 def attempt(work: Work[Any, Any], task: Task) -> Outcome:
-    """Run one job where its errors cannot be raised through."""
+    """Run one job and return its error as data, for workers whose exceptions do not reach the study's process."""
     try:
         return Outcome(work.do(task))
     except errors.MarlbcError as error:
@@ -94,29 +94,29 @@ def attempt(work: Work[Any, Any], task: Task) -> Outcome:
 
 @dataclass
 class Ears:
-    """Callbacks of the study's process for an engine, besides results."""
+    """Callbacks by which an engine informs the study's process, besides the results that it yields."""
 
     progress: Progress = silent
     stop: StopRequest | None = None
-    """For jobs that save themselves; None: whatever stops the study interrupts them."""
+    """Stop request for jobs that save their own state; None: stopping the study interrupts its jobs."""
     retried: Callable[[str], None] = lambda reason: None
-    """Called with the reason why a job, or several, are tried again."""
+    """Called with the reason when one or more jobs are tried again."""
 
     def stopping(self) -> bool:
-        """Whether somebody asked the study to stop."""
+        """Whether the study was asked to stop."""
         return self.stop is not None and bool(self.stop.signal)
 
 
 class Engine(Protocol):
-    """A place where jobs run."""
+    """Interface of engines, which run the jobs of a study."""
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
-        """Places of jobs with their results, as they end; closing the generator ends everything that it started.
+        """Yield the index and the result of each job as it ends; closing the generator ends everything that it started.
 
-        A job whose worker dies is tried again, :data:`MOST_TRIES` times at most.
+        A job whose worker dies is tried again, up to :data:`MOST_TRIES` tries in total.
 
         Raises:
-            ConfigurationError: of a job, or the engine cannot be used here.
-            SimulationError: of a job, or a worker died once too often.
+            ConfigurationError: a job raised it, or the engine cannot be used here.
+            SimulationError: a job raised it, or a worker died too often.
         """
         ...

@@ -1,7 +1,8 @@
-"""Ends what a killed study leaves of a Ray that it has started: ``python -I -S guard.py TOKEN``, which imports nothing else.
+"""Guard process that kills the leftover Ray processes of a killed study: ``python -I -S guard.py TOKEN``.
 
-Ray's agents outlive a raylet that was killed. All processes of that Ray have the token in their environment. This one, in a
-session of its own, waits until its standard input ends, which the study's process holds, and ends them.
+Ray's agents survive when their raylet is killed. All processes of a Ray instance that a study starts have the token in their
+environment. The guard runs in its own session and waits until its standard input ends, which the study's process holds open.
+Then it kills the processes with the token. It imports only the standard library.
 """
 
 import os
@@ -12,14 +13,14 @@ from contextlib import suppress
 from pathlib import Path
 
 TOKEN = "MARLBC_RAY"
-"""Variable of the environment."""
-RAY_GRACE = 2.0  # that processes have to end by themselves [s]
-PAUSE = 0.1  # between two looks [s]
-CLEAN_LOOKS = 3  # in a row, after which nothing is left; one alone may miss a process in the middle of its exec
+"""Environment variable that holds the token."""
+RAY_GRACE = 2.0  # time for processes to end by themselves [s]
+PAUSE = 0.1  # time between two scans [s]
+CLEAN_LOOKS = 3  # empty scans in a row that mean that no process is left; a single one may miss a process during its exec
 
 
 def marked(token: str) -> list[int]:
-    """Numbers of the processes that have the token in their environment, on systems that show it; zombies show none."""
+    """IDs of the processes with the token in their environment, on systems with /proc; zombies are not found."""
     found = []
     for entry in Path("/proc").glob("[0-9]*/environ"):
         with suppress(OSError):
@@ -29,13 +30,13 @@ def marked(token: str) -> list[int]:
 
 
 def end_marked(token: str, within: float = 10.0) -> bool:
-    """End all of these processes but this one, and what they start meanwhile; whether none is left.
+    """Kill all processes with the token except this one, and those that they start meanwhile; returns whether none is left.
 
-    Who is alive after a look was started by somebody whom that look found. So looks that find nobody are the end.
+    A process that is alive after a scan was started by one that the scan found. So scans that find none mean that none is left.
 
     Args:
-        token: of the processes.
-        within: time after which it gives up [s].
+        token: the token of the processes.
+        within: time after which the function gives up [s].
     """
     until, clean = time.monotonic() + within, 0
     while clean < CLEAN_LOOKS and time.monotonic() < until:

@@ -18,13 +18,13 @@ from marlbc_mj.studies.protocol import JobT, ResultT, Stopped
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import Progress
 
-POLL = 0.2  # between two looks at the workers [s]
-GRACE = 5.0  # that a worker has to end by itself when its study was killed [s]
+POLL = 0.2  # time between two checks of the workers [s]
+GRACE = 5.0  # time for a worker to end by itself after its study was killed [s]
 DIED = "a worker process died (out of memory?)"
 
 
 class ThisProcess:
-    """Every job in turn. One that is stopped yields nothing; those behind it are asked as well, since some may be done."""
+    """Engine that runs one job after another. A stopped job yields no result; later ones are still tried, as some may be done."""
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         for task in tasks:
@@ -37,7 +37,7 @@ class ThisProcess:
 
 
 class Processes:
-    """Jobs in worker processes. After an error those that run are asked to save themselves, and awaited."""
+    """Engine that runs jobs in worker processes. After an error it asks running jobs to save their state and waits for them."""
 
     def __init__(self, workers: int) -> None:
         self.workers = workers
@@ -96,7 +96,7 @@ def _pooled(work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, worker
 
 @contextmanager
 def _quiet_when_broken() -> Iterator[None]:
-    """Say nothing of a job that was cancelled while its pool broke: Python's executor shows that as a traceback of its thread."""
+    """Hide the traceback that a thread of Python's executor prints for a job that is cancelled while its pool breaks."""
     say = threading.excepthook
     threading.excepthook = lambda event: None if event.exc_type is InvalidStateError else say(event)
     try:
@@ -107,7 +107,7 @@ def _quiet_when_broken() -> Iterator[None]:
 
 @contextmanager
 def _ctrl_c_later() -> Iterator[None]:
-    """Hold Ctrl-C back while workers are started, which inherit that: during their imports it would be a traceback each."""
+    """Block Ctrl-C while workers start. They inherit the block, so that Ctrl-C during their imports prints no tracebacks."""
     _mask("SIG_BLOCK")
     try:
         yield
@@ -117,7 +117,7 @@ def _ctrl_c_later() -> Iterator[None]:
 
 @contextmanager
 def _ctrl_c_now() -> Iterator[None]:
-    """Let Ctrl-C through, also one that came before; in a worker it is held back outside, where jobs are unpacked."""
+    """Unblock Ctrl-C, including a pending one. Outside this block it stays blocked in a worker, while jobs are unpickled."""
     _mask("SIG_UNBLOCK")
     try:
         yield
@@ -126,13 +126,13 @@ def _ctrl_c_now() -> Iterator[None]:
 
 
 def _mask(how: str) -> None:
-    """Change what this thread, and what it starts, takes of Ctrl-C, where there are masks."""
+    """Block or unblock Ctrl-C for this thread and for processes that it starts, on systems with signal masks."""
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(getattr(signal, how), {signal.SIGINT})
 
 
 def _drain(waiting: set[Future[Any]], told: "SimpleQueue[Any]", progress: Progress) -> None:
-    """Wait for jobs that have begun, and listen to them meanwhile: a worker whose pipe is full would never end."""
+    """Wait for running jobs and keep reading their messages: a worker blocked by a full pipe would never end."""
     waiting = {future for future in waiting if not future.cancel()}
     while waiting:
         _, waiting = wait(waiting, POLL)
@@ -140,7 +140,7 @@ def _drain(waiting: set[Future[Any]], told: "SimpleQueue[Any]", progress: Progre
 
 
 def _pass_on(told: "SimpleQueue[Any]", progress: Progress) -> None:
-    """Tell here what the workers have told since."""
+    """Pass the new progress messages of the workers to ``progress``."""
     while not told.empty():
         progress(*told.get())
 
@@ -150,17 +150,17 @@ class _Worker(NamedTuple):
 
     told: "SimpleQueue[Any]"
     stopping: Event  # shared by the study's process and all workers
-    saving: bool  # whether jobs save themselves
+    saving: bool  # whether jobs save their own state
 
 
 _worker: _Worker | None = None
 
 
 def _begin_worker(told: "SimpleQueue[Any]", stopping: Event, saving: bool) -> None:
-    """What a worker's jobs tell goes to the study's process.
+    """Set up a worker process, whose jobs report their progress to the study's process.
 
-    Ctrl-C reaches the whole group of processes: where jobs save themselves, a worker leaves it to the study, which asks it to
-    stop. Where they do not, a worker ends soon after its study was killed, whatever its job does.
+    Ctrl-C reaches the whole process group. If jobs save their own state, a worker ignores it, and the study asks the worker to
+    stop. Otherwise a worker ends soon after its study was killed, whatever its job is doing.
     """
     global _worker
     _worker = _Worker(told, stopping, saving)
@@ -179,9 +179,9 @@ def _end_with_parent() -> None:
 
 
 def _work(work: Work[JobT, ResultT], task: Task) -> ResultT:
-    """A job in a worker. Jobs that do not save themselves do not begin once the study ends, also those that are queued here.
+    """Run a job in a worker. Jobs that do not save their own state, also queued ones, do not begin once the study is ending.
 
-    Without its study, which was killed perhaps, the worker ends.
+    The worker exits if the study's process no longer exists, for example because it was killed.
     """
     assert _worker is not None
     told, stopping, saving = _worker

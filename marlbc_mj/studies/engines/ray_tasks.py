@@ -1,6 +1,6 @@
-"""Jobs as tasks of Ray: on the cluster that ``RAY_ADDRESS`` names, else in worker processes that are started here.
+"""Engine that runs jobs as Ray tasks, on the cluster that ``RAY_ADDRESS`` names or else in worker processes on this machine.
 
-Ray tries a task again whose worker or node died. Jobs whose study leaves large files need a folder that all nodes see.
+Ray repeats a task if its worker or node dies. If jobs write large files, all nodes must see the study's folder.
 """
 
 import os
@@ -22,17 +22,17 @@ from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.text import one_line
 
-TASKS_AHEAD = 2  # tasks that wait at Ray per CPU, beside those that run
+TASKS_AHEAD = 2  # tasks queued in Ray per CPU, besides the running ones
 ADDRESS = "RAY_ADDRESS"
 KEEPS_ENVIRONMENT = "SPT_NOENV"
-"""Variable that keeps Ray's processes from writing their titles over their environments, where the guard's token is."""
+"""Environment variable that keeps Ray's processes from overwriting their environment, and so the token, with their titles."""
 
 
 class RayTasks:
-    """Ray's tasks, one CPU each.
+    """Engine that runs every job as a Ray task with one CPU.
 
     Args:
-        workers: CPUs of a Ray that is started for the study; a cluster has its own number.
+        workers: CPUs of the Ray instance that is started for the study; not used on a cluster.
 
     Raises:
         ConfigurationError: Ray is not installed.
@@ -74,7 +74,7 @@ class RayTasks:
     def _outcome(self, reference: Any) -> Outcome:
         exceptions = self.ray.exceptions
         try:
-            found: Outcome = pickle.loads(self.ray.get(reference))  # so that arrays can be written to, as elsewhere
+            found: Outcome = pickle.loads(self.ray.get(reference))  # unpickled here, so that arrays are writable
         except (exceptions.RayTaskError, exceptions.RaySystemError) as error:
             raise SimulationError(f"a task of Ray failed: {one_line(str(error)[-300:])}") from error
         except exceptions.RayError as error:
@@ -84,7 +84,7 @@ class RayTasks:
 
     @contextmanager
     def _connected(self) -> Iterator[None]:
-        """Ray during the block; its handler of SIGTERM would replace ours.
+        """Connect to Ray during the block, and restore our handler of SIGTERM, which Ray replaces.
 
         Raises:
             ConfigurationError: the cluster cannot be reached.
@@ -109,21 +109,21 @@ class RayTasks:
 
 @contextmanager
 def _guarded() -> Iterator[None]:
-    """A process that ends the Ray that is started in the block, should this one be killed."""
+    """Run a guard process, which ends the Ray instance started in the block if this process is killed."""
     token = secrets.token_hex(8)
-    command = [sys.executable, "-I", "-S", guard.__file__, token]  # without this package: it is there at once
+    command = [sys.executable, "-I", "-S", guard.__file__, token]  # starts at once, since it does not import this package
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, start_new_session=True) as guarding:
         try:
             with _in_environment({guard.TOKEN: token, KEEPS_ENVIRONMENT: "1"}):
                 yield
         finally:
-            guard.end_marked(token)  # agents of a raylet that was killed
+            guard.end_marked(token)  # leftover agents of a killed raylet
             guarding.terminate()
 
 
 @contextmanager
 def _in_environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Variables of the environment during the block."""
+    """Set environment variables during the block."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -137,15 +137,15 @@ def _in_environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 
 class _Shared(NamedTuple):
-    """What all tasks have in common."""
+    """Data that all tasks share."""
 
-    work: bytes  # pickled: it can be read only where the search path is the study's
+    work: bytes  # pickled, since it can be read only with the study's search path
     folder: str
     path: tuple[str, ...]
 
 
 def _attempt(shared: _Shared, pickled: bytes) -> bytes:
-    """A job on a worker, in the folder and with the search path of the study's process where those are there, too."""
+    """Run a job on a worker, in the study's working folder if it exists there, and with the study's search path added."""
     if Path(shared.folder).is_dir():
         os.chdir(shared.folder)
     sys.path += [entry for entry in shared.path if entry not in sys.path]

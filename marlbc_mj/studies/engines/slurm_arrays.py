@@ -1,10 +1,11 @@
-"""Jobs in an array of SLURM, submitted by submitit; results come through the folder of the study, which all nodes must see.
+"""Engine that runs jobs in a SLURM job array; results come back through the study's folder, which all nodes must see.
 
-Every task of the array has a share of the jobs and appends their results to a pack of its own. SLURM requeues a task whose node
-died, and submitit one whose time is up; both go on behind the last result in their pack. A task that ended without all of its
-results is submitted again. What an array did whose study was killed is taken over by the next run.
+submitit submits the array. Each of its tasks runs a share of the jobs and appends their results to its own pack. SLURM requeues a
+task if its node dies, and submitit requeues one if its time is up. The task then resumes after the last result in its pack. If
+tasks end without all of their results, the missing jobs are submitted again. If a study is killed, its next run takes over the
+results of the array.
 
-Partition, account, memory and time limit are SLURM's own variables: ``SBATCH_PARTITION``, ``SBATCH_ACCOUNT``,
+Partition, account, memory and time limit are set by SLURM's own environment variables: ``SBATCH_PARTITION``, ``SBATCH_ACCOUNT``,
 ``SBATCH_MEM_PER_NODE``, ``SBATCH_TIMELIMIT``.
 """
 
@@ -25,23 +26,23 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.files import writing
 from marlbc_mj.util.text import one_line
 
-RESULTS_EVERY = 0.5  # between two looks for results [s]
-ALIVE_EVERY = 5.0  # between two looks whether tasks are alive [s]
-CANCELLED = 60.0  # until an array that was cancelled has gone [s]
-SLICE = 60  # after which a task of the array makes room for others, and goes on later [min]
+RESULTS_EVERY = 0.5  # time between two checks for results [s]
+ALIVE_EVERY = 5.0  # time between two checks whether tasks are alive [s]
+CANCELLED = 60.0  # longest wait for the end of a cancelled array [s]
+SLICE = 60  # time after which a task makes room for others and resumes later [min]
 MOST_SLICES = 10_000
 _ARRAYS, _LOGS = "arrays", "logs"
 
 
 class ArrayShare(NamedTuple):
-    """What one task of an array does; submitit pickles it, and calls it again after its time was up."""
+    """The share of jobs that one task of the array runs; submitit pickles it, and calls it again after a timeout."""
 
     work: Work[Any, Any]
     tasks: tuple[Task, ...]
     pack: Path
 
     def __call__(self) -> None:
-        """Run the jobs whose results are not in the pack."""
+        """Run the jobs whose results are not yet in the pack."""
         done = {entry.key for entry in entries(self.pack)} if self.pack.exists() else set()
         with PackWriter(self.pack) as results:
             for task in self.tasks:
@@ -49,19 +50,19 @@ class ArrayShare(NamedTuple):
                     results.add(task.key, codec.to_bytes(attempt(self.work, task)))
 
     def checkpoint(self) -> Any:
-        """What submitit submits when the time of a task is up: the same again."""
+        """The submission that submitit makes after a timeout: the same share again."""
         return import_module("submitit").helpers.DelayedSubmission(self)
 
 
 class SlurmArray:
-    """One array of tasks that share the jobs.
+    """Engine that shares the jobs among the tasks of a SLURM array.
 
     Args:
-        workers: tasks of the array.
-        cluster: ``slurm``, or ``local`` for submitit's processes on this machine, which stand for an array in tests.
+        workers: number of tasks in the array.
+        cluster: ``slurm``, or ``local`` for submitit's processes on this machine, which replace SLURM in tests.
 
     Raises:
-        ConfigurationError: submitit is not installed, or there is no SLURM.
+        ConfigurationError: submitit is not installed, or there is no command ``sbatch``.
     """
 
     def __init__(self, workers: int, cluster: str = "slurm") -> None:
@@ -72,7 +73,7 @@ class SlurmArray:
             raise ConfigurationError("the engine slurm needs submitit: pip install 'marlbc-mj[slurm]'") from error
         if cluster == "slurm" and shutil.which("sbatch") is None:
             raise ConfigurationError("no SLURM here: there is no command sbatch")
-        self._jobs: list[Any] = []  # of the last array
+        self._jobs: list[Any] = []  # submitit jobs of the last array
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None or work.scratch is None:
@@ -81,7 +82,7 @@ class SlurmArray:
             (work.scratch / _LOGS).mkdir(parents=True, exist_ok=True)
         self._cancel(work.scratch)
         array = _Array({task.key: task for task in tasks}, work.scratch)
-        yield from array.arrived(failed=False)  # of an array whose study was killed
+        yield from array.arrived(failed=False)  # results of an earlier array whose study was killed
         array.clear()
         try:
             yield from self._rounds(work, array, ears)
@@ -90,7 +91,7 @@ class SlurmArray:
         shutil.rmtree(work.scratch, ignore_errors=True)
 
     def _rounds(self, work: Work[JobT, ResultT], array: "_Array", ears: Ears) -> Generator[tuple[int, ResultT]]:
-        """An array, and others for what tasks that died have left."""
+        """Submit an array, and further ones if tasks end without all of their results."""
         for tries in range(MOST_TRIES):
             if not array.left:
                 return
@@ -103,7 +104,7 @@ class SlurmArray:
                 if monotonic() > looked + ALIVE_EVERY:
                     looked = monotonic()
                     if not self._alive(jobs):
-                        yield from array.arrived()  # what came between the two looks
+                        yield from array.arrived()  # results written between the two checks
                         break
                 sleep(RESULTS_EVERY)
         if array.left:
@@ -126,13 +127,13 @@ class SlurmArray:
         return jobs
 
     def _alive(self, jobs: list[Any]) -> bool:
-        """Whether any task of the array waits or runs."""
+        """Whether any task of the array is waiting or running."""
         if self.cluster != "slurm":
             return not all(job.done() for job in jobs)
         return bool(_queued({str(job.job_id).split("_")[0] for job in jobs}))
 
     def _cancel(self, scratch: Path) -> None:
-        """End all arrays that this study has submitted, also those of an earlier run."""
+        """Cancel all arrays that this study has submitted, including those of an earlier run."""
         if not (scratch / _ARRAYS).is_file():
             return
         names = set((scratch / _ARRAYS).read_text().split())
@@ -152,7 +153,7 @@ class SlurmArray:
 
 
 class _Array:
-    """Jobs whose results have not arrived, and how far each pack has been read."""
+    """The jobs without results, and the position up to which each pack has been read."""
 
     def __init__(self, left: dict[str, Task], scratch: Path) -> None:
         self.left = left
@@ -160,19 +161,19 @@ class _Array:
         self._read: dict[Path, int] = {}
 
     def clear(self) -> None:
-        """Remove all packs; new ones of the same names are read from their beginning."""
+        """Remove all packs and forget their positions, since new packs may have the same names."""
         for pack in self.scratch.glob(f"*{PACK_SUFFIX}"):
             pack.unlink()
         self._read.clear()
 
     def arrived(self, *, failed: bool = True) -> Generator[tuple[int, Any]]:
-        """Results since the last call.
+        """Yield the results that were written since the last call.
 
         Args:
-            failed: whether jobs that raised count; if not, they are left, and done again.
+            failed: whether to raise the error of a failed job; if not, the job is left to run again.
 
         Raises:
-            ConfigurationError, SimulationError: what a job raised.
+            ConfigurationError, SimulationError: the error that a job raised.
         """
         for pack in sorted(self.scratch.glob(f"*{PACK_SUFFIX}")):
             for entry in entries(pack, self._read.get(pack, 0)):
@@ -186,7 +187,7 @@ class _Array:
 
 
 def _queued(names: set[str]) -> list[str]:
-    """Which tasks of these arrays wait or run; when SLURM does not answer, all of them may."""
+    """IDs of the waiting or running tasks of these arrays; if SLURM does not answer, the names of all arrays."""
     for _ in range(MOST_TRIES):
         said = subprocess.run(["squeue", "--noheader", "--format=%i %F"], capture_output=True, text=True, check=False)
         if said.returncode == 0:
@@ -197,7 +198,7 @@ def _queued(names: set[str]) -> list[str]:
 
 
 def _last_words(scratch: Path | None) -> str:
-    """The last line of an error output, for a message."""
+    """The last line of the newest error log that is not empty, for an error message."""
     assert scratch is not None
     for path in sorted((scratch / _LOGS).glob("*.err"), key=lambda path: path.stat().st_mtime, reverse=True):
         lines = path.read_text(errors="replace").split("\n")

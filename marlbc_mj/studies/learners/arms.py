@@ -1,8 +1,8 @@
-"""Ablations of the general policy: one setting changed at a time, each trained on several seeds and flown on held-out layouts.
+"""Ablations of the general policy, one change at a time, each trained on several seeds and flown on held-out layouts.
 
-Values of different learners have different scales, so that one switching margin for all would favor some. Every training's policy
-flies with that of MARGINS with which it succeeds most on a few validation layouts, which no result is taken from. There is no
-dwell time and no deadline, so that what was learned shows.
+The values of different learners have different scales, so a common switching margin would favor some of them. Each policy is
+flown with the margin of MARGINS with which it succeeds most often on a few validation layouts, which are not part of the results.
+There is no dwell time and no deadline, so that the results show what was learned.
 """
 
 from collections.abc import Mapping, Sequence
@@ -50,7 +50,7 @@ ARMS: dict[str, Arm] = {
     "lenient": Arm("lenient", "every agent learns by itself, and overlooks some negative TD errors", {"learner": "lenient"}),
     "plain": Arm("plain", "every agent learns by itself, and all TD errors count", {"learner": "plain"}),
     "qmix": Arm("QMIX", "one TD error for a monotonic mixture of the team's values", {"learner": "qmix"}),
-    # while actions are random everybody switches: a cost for it teaches to keep any order for ever, and that stays
+    # random actions switch all the time, so a switch cost teaches agents never to switch, which they do not unlearn
     "mappo": Arm(
         "MAPPO",
         "one actor for all agents, a critic that sees the team, and no cost of a switch",
@@ -78,17 +78,17 @@ ARMS: dict[str, Arm] = {
         for left in DRAWN
     },
 }
-"""Changes of the defaults by name; the last five leave a family out each."""
+"""All arms by name; each of the last five leaves out one family."""
 MISSIONS = (*((family, "wedge-4", "straight") for family in DRAWN), ("corridor", "grid-9", "line"))
-"""Family, team and approach to the column of the missions that every policy is flown on."""
+"""The missions on which every policy is flown: family, team and approach to the column."""
 MARGINS = (0.0, 0.05, 0.3)
-"""Switching margins that a policy is tried with."""
+"""Switching margins that are tried for every policy."""
 TRIED = 8
-"""Validation layouts of every mission that it is tried on."""
+"""Number of validation layouts per mission on which the margins are tried."""
 
 
 class ArmJob(NamedTuple):
-    """One training, and the layouts after it."""
+    """One training run, and the layouts on which its policy is flown."""
 
     arm: str
     config: GeneralConfig
@@ -97,35 +97,36 @@ class ArmJob(NamedTuple):
 
 
 class ArmScore(NamedTuple):
-    """The layouts of one mission under one policy: how many, how many succeeded and violated, median return and switches."""
+    """Outcomes of one policy on one mission: numbers of layouts, successes and violations, medians of return and switches."""
 
     mission: str
     layouts: int
     succeeded: int
     violated: int
-    total: float
-    switches: float  # of an agent
-    margin: float  # of the policy
+    total: float  # median return
+    switches: float  # median, per agent
+    margin: float  # switching margin of the policy
 
 
 @dataclass(frozen=True)
 class ArmStudy:
-    """Every arm on training seeds 1 to ``seeds``, on the same held-out layouts. The policy is the last one of its training, with
-    the switching margin of MARGINS that suits it best on validation layouts.
+    """Study that trains every arm on seeds 1 to ``seeds`` and flies all policies on the same held-out layouts.
+
+    Each policy is the last one of its training run, with the switching margin of MARGINS that is best on validation layouts.
 
     Raises:
-        ConfigurationError: an unknown arm or one named twice, or a number below 1.
+        ConfigurationError: an unknown or repeated arm, or a number below 1.
     """
 
     arms: tuple[str, ...] = ()
-    """Names in ARMS; none stands for all."""
+    """Names in ARMS; empty: all arms."""
     seeds: int = 5
     budget: int = 400_000
-    """Mission steps of a training."""
+    """Mission steps per training run."""
     layouts: int = 40
-    """Held-out layouts of every mission."""
+    """Number of held-out layouts per mission."""
     first: int = 70_000
-    """Seed of the first of them."""
+    """Seed of the first held-out layout."""
 
     def __post_init__(self) -> None:
         for name in self.arms:
@@ -134,10 +135,10 @@ class ArmStudy:
         check_named_once("arm", self.arms)
         if self.layouts < 1:
             raise ConfigurationError(f"layouts must be at least 1, got {self.layouts}")
-        self.jobs()  # a number that cannot be run is refused here
+        self.jobs()  # raises if a number is invalid
 
     def jobs(self) -> list[ArmJob]:
-        """Seed by seed, so that a study that is stopped compares all arms."""
+        """All training runs, seed by seed, so that a stopped study has results of all arms."""
         return [
             ArmJob(name, GeneralConfig(**ARMS[name].changes, seed=seed, budget=self.budget), self.first, self.layouts)
             for seed in seed_range(self.seeds, 1)
@@ -158,7 +159,7 @@ class ArmStudy:
         return _fly(policy, best, _judges(job.layouts, composition), job.first)
 
     def report(self, results: Sequence[list[ArmScore]], out: Path | None, progress: Progress = silent) -> Report:
-        """Write arms.csv, arms.md, arms.pdf and arms.png, and the configuration."""
+        """Write arms.csv, arms.md, arms.pdf, arms.png and config.json."""
         rows = [
             {"arm": job.arm, "seed": job.config.seed, "mission_steps": job.config.budget, **flown._asdict()}
             for job, flights in zip(self.jobs(), results, strict=True)
@@ -174,7 +175,7 @@ class ArmStudy:
 
 
 def _judges(layouts: int, composition: str) -> dict[str, Judge]:
-    """A judge of every mission under a composition, by family and team."""
+    """One judge per mission under the given composition, by family and team."""
     return {
         f"{family}, {team}": Judge(
             team_mission(family, *read_team(team), composition=composition, split="test", column_approach=approach),
@@ -186,24 +187,24 @@ def _judges(layouts: int, composition: str) -> dict[str, Judge]:
 
 
 def _fly(policy: GeneralPolicy, margin: float, judges: Mapping[str, Judge], first: int) -> list[ArmScore]:
-    """All missions from the layout ``first`` on, with a switching margin in the place of the policy's own, and no dwell time."""
+    """Fly all missions from seed ``first`` on with the given switching margin, without the policy's dwell time and deadline."""
     flown = mean_policy([policy], margin)
     return [ArmScore(mission, *judge.score(flown, first), margin) for mission, judge in judges.items()]
 
 
 def _standing(scores: Sequence[ArmScore]) -> tuple[int, float]:
-    """Sort key, best last: successes first, then returns."""
+    """Sort key with the best last: by successes, then by returns."""
     return sum(score.succeeded for score in scores), sum(score.total for score in scores)
 
 
 def _missions(rows: Sequence[Mapping[str, Any]]) -> tuple[list[str], list[str]]:
-    """Names of all missions, and of the families, which come first."""
+    """Names of all missions, and of the first of them, one per family."""
     missions = list(dict.fromkeys(row["mission"] for row in rows))
     return missions, missions[: len(DRAWN)]
 
 
 def success_of_seeds(lines: Sequence[Mapping[str, Any]], missions: Sequence[str]) -> list[float]:
-    """Share of successes over some missions together, of every training [%]."""
+    """Success rate of every training run over the given missions together [%]."""
     shares = []
     for seed in dict.fromkeys(row["seed"] for row in lines):
         own = [row for row in lines if row["seed"] == seed and row["mission"] in missions]
@@ -212,7 +213,7 @@ def success_of_seeds(lines: Sequence[Mapping[str, Any]], missions: Sequence[str]
 
 
 def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
-    """A row per arm: success in % over its seeds, on all families and on each mission; violations of all flights."""
+    """A table with a row per arm: mean success [%] over its seeds, for all families and per mission, and all violations."""
     missions, families = _missions(rows)
     arms, cells = lines_by("arm", ARMS, rows), []
     for name, lines in arms.items():
@@ -231,7 +232,7 @@ def arms_table(rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def draw_arms(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Failures over the five families: a dot per training, a bar at the mean, an arm per line."""
+    """Figure of the failures over the five families: one line per arm, a dot per training run, a bar at the mean."""
     arms, (_, families) = lines_by("arm", ARMS, rows), _missions(rows)
     figure = Figure(figsize=(pl.SINGLE, 0.55 + 0.17 * len(arms)), layout="constrained")
     axes = figure.add_subplot(xlabel="layouts that failed [%]")

@@ -1,4 +1,4 @@
-"""Table and figure of a study of learners, from the lines of its CSV files."""
+"""Table and figure of a learner study, made from the lines of its CSV files."""
 
 from collections.abc import Sequence
 from math import inf
@@ -22,16 +22,16 @@ from marlbc_mj.util.files import staged_file
 from marlbc_mj.util.palette import METHOD_COLORS
 
 WIDE = 6
-"""Variants of a group at most, and panels side by side in the figure."""
+"""Most variants in a group, and number of panels side by side in the figure."""
 REFERENCE_VARIANT = "marlms"
-"""The variant that every panel shows beside its own."""
+"""The variant that every panel shows for comparison."""
 COLOR, REFERENCE_COLOR, FAILED_COLOR = METHOD_COLORS[0], "#9A9A9A", "#C8102E"
 _GOAL: dict[str, Any] = {"color": METHOD_COLORS[1], "marker": "v", "markersize": 3, "linestyle": "none"}
 _END: dict[str, Any] = {"color": FAILED_COLOR, "marker": "x", "markersize": 4, "linestyle": "none"}
 
 
 def write_comparison(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
-    """study.md, study.tex, curves.pdf and curves.png, from the lines of the CSV files alone."""
+    """Write study.md, study.tex, curves.pdf and curves.png, made from the lines of the CSV files alone."""
     table = learners_table(rows)
     figure_note = (
         "`curves.pdf`: median and range over the runs that got that far; violation is the worst agent's, linear below 0.1 s.\n"
@@ -53,7 +53,7 @@ def by_variant(lines: Sequence[CsvLine]) -> dict[str, list[CsvLine]]:
 
 
 def learners_table(rows: Sequence[CsvLine]) -> Table:
-    """A row per variant: how many runs met the goal and when, their best evaluation and their last."""
+    """A table with a row per variant: how many runs met the goal and when, and their best and last evaluations."""
     labels: tuple[tuple[str, str], ...] = (
         ("", "runs"),
         ("goal", "met"),
@@ -108,7 +108,7 @@ def _cells(rows: Sequence[CsvLine]) -> tuple[str, ...]:
 
 
 def _until(estimate: Estimate, digits: int) -> str:
-    """``value [low, high]`` where any of them may be infinite."""
+    """An estimate as ``value [low, high]``; each number may be infinite."""
     if np.isnan(estimate.value):
         return DASH
     value, low, high = ("∞" if number == inf else fixed(number, digits) for number in estimate)
@@ -116,7 +116,7 @@ def _until(estimate: Estimate, digits: int) -> str:
 
 
 def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
-    """Return and violation time against mission steps, a pair of panels per variant, placed by :func:`rows_of_panels`."""
+    """Figure of return and violation time over mission steps, two panels per variant, placed by :func:`rows_of_panels`."""
     runs, evaluations = by_variant(rows), by_variant(curves)
     blocks = rows_of_panels(list(runs))
     columns = max(map(len, blocks))
@@ -161,7 +161,7 @@ def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
 
 
 def rows_of_panels(names: Sequence[str]) -> list[list[str]]:
-    """Variants row by row: a group is never split, and takes the rest of a row where all of it has room there."""
+    """Variants row by row. A group is never split; it joins the row before it if the whole group fits there."""
     blocks: list[list[str]] = [[]]
     for group in dict.fromkeys(VARIANTS[name].group for name in names):
         members = [name for name in names if VARIANTS[name].group == group]
@@ -200,7 +200,7 @@ def _draw_panel(axes: Axes, key: str, rows: Sequence[CsvLine], curves: Sequence[
 
 
 def _handles(*, compared: bool) -> list[Line2D | Patch]:
-    """The legend; where variants are ``compared`` each panel has the reference's median, too."""
+    """Entries of the legend, with the median of the reference variant if variants are ``compared``."""
     reference = Line2D([], [], color=REFERENCE_COLOR, label=f"median of {VARIANTS[REFERENCE_VARIANT].title}")
     return [
         Line2D([], [], color=COLOR, label="median"),

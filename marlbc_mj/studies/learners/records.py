@@ -1,4 +1,4 @@
-"""Results of the runs of a study of learners, as lines of its two CSV files."""
+"""Results of a learner study as lines of its two CSV files, study.csv and curves.csv."""
 
 import csv
 import json
@@ -21,14 +21,15 @@ from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import staged_file
 
 DONE_MARK, FAILED_MARK = "DONE", "FAILED"
-"""Files that mark the folder of a run that finished, and of one that failed."""
+"""Names of the files that mark the folder of a finished run and of a failed run."""
 GOAL_SWITCHES = (4, 2, 2, 4)
-"""Switches per agent that meet the goal on the case study; with no violation and at least the scripted supervisor's return."""
+"""Most switches per agent that meet the goal on the case study, which also requires no violation and at least the scripted
+supervisor's return."""
 UNFINISHED = "unfinished"
-"""The failure of a run that was interrupted and can go on."""
+"""Entry in the column ``failure`` for an interrupted run that can be resumed."""
 
 CsvLine = dict[str, str]
-"""A line of a CSV file: what is shown of a run is exactly what its file says."""
+"""A line of a CSV file as text, so that tables and figures show exactly what the file contains."""
 Line = TypeVar("Line", bound=Mapping[str, Any])
 """A line of any table."""
 RUN_COLUMNS = (
@@ -50,13 +51,13 @@ CURVE_COLUMNS = ("variant", "seed", "mission_steps", "return", "violation_time",
 
 
 def lines_by(column: str, names: Iterable[str], lines: Sequence[Line]) -> dict[str, list[Line]]:
-    """Lines by what a column says, in the order of ``names``; a name without lines is left out."""
+    """Lines grouped by the value of a column, in the order of ``names``; names without lines are left out."""
     found = {name: [line for line in lines if line[column] == name] for name in names}
     return {name: own for name, own in found.items() if own}
 
 
 def read_json(path: Path, key: str) -> Any:
-    """An entry of a JSON object; ConfigurationError where the file holds none."""
+    """An entry of the JSON object in a file; raises ConfigurationError if there is none."""
     try:
         return json.loads(path.read_text())[key]
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -65,16 +66,16 @@ def read_json(path: Path, key: str) -> Any:
 
 @cache
 def scripted_return(scenario: str, controller: str) -> float:
-    """Return of the scripted supervisor on the scenario, to the six digits of eval.csv; the goal for learned ones."""
+    """Return of the scripted supervisor on the scenario, rounded to six digits as in eval.csv: the goal for learners."""
     world = World(make_scenario(scenario), make_controller(controller), record=True)
     return float(f"{measure(run_episode(world, make_supervisor('scripted', controller)))['team']['return']:.6g}")
 
 
 def collect(out: Path) -> tuple[list[CsvLine], list[CsvLine]]:
-    """Lines of study.csv and curves.csv from all runs in the study's folder, also those of earlier calls.
+    """Lines of study.csv and curves.csv from all runs in the study's folder, including runs of earlier calls.
 
     Raises:
-        ConfigurationError: a file of a run that cannot be read.
+        ConfigurationError: a file of a run cannot be read.
     """
     rows: list[CsvLine] = []
     curves: list[CsvLine] = []
@@ -111,7 +112,7 @@ def _row(name: str, config: TrainConfig, evaluations: Sequence[CsvLine], failure
 
 
 def meets_goal(evaluation: CsvLine, least_return: float) -> bool:
-    """Whether no agent violates, none switches more than GOAL_SWITCHES says, and the return is not below the goal's."""
+    """Whether no agent violates, none exceeds its number of GOAL_SWITCHES, and the return is at least ``least_return``."""
     few = [float(s) <= limit for s, limit in zip(_switches(evaluation), GOAL_SWITCHES, strict=False)]
     return all(few) and float(evaluation["violation_time"]) == 0.0 and float(evaluation["return"]) >= least_return
 
@@ -121,7 +122,7 @@ def _switches(evaluation: CsvLine) -> list[str]:
 
 
 def read_csv(path: Path, columns: Sequence[str]) -> list[CsvLine]:
-    """Lines of a CSV file that has at least these columns; ConfigurationError where it does not."""
+    """Lines of a CSV file with at least these columns; raises ConfigurationError if a column or all lines are missing."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             lines = [dict(line) for line in csv.DictReader(file)]
@@ -133,10 +134,10 @@ def read_csv(path: Path, columns: Sequence[str]) -> list[CsvLine]:
 
 
 def read_study(folder: Path) -> tuple[list[CsvLine], list[CsvLine]]:
-    """What :func:`write_csvs` wrote.
+    """Read study.csv and curves.csv as :func:`write_csvs` wrote them.
 
     Raises:
-        ConfigurationError: study.csv or curves.csv is missing, torn, or names an unknown variant.
+        ConfigurationError: a file is missing or incomplete, names an unknown variant, or has text instead of numbers.
     """
     rows = read_csv(folder / "study.csv", RUN_COLUMNS)
     curves = read_csv(folder / "curves.csv", CURVE_COLUMNS) if any(row["wall_s"] for row in rows) else []
@@ -157,7 +158,7 @@ def _is_number(text: str) -> bool:
 
 
 def write_csvs(folder: Path, rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> None:
-    """study.csv, a line per run, and curves.csv, a line per evaluation."""
+    """Write study.csv with one line per run and curves.csv with one line per evaluation."""
     for name, columns, lines in (("study.csv", RUN_COLUMNS, rows), ("curves.csv", CURVE_COLUMNS, curves)):
         with staged_file(folder / name, overwrite=True) as staging, staging.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, lineterminator="\n")

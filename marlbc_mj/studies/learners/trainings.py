@@ -1,6 +1,6 @@
-"""The study of learners: one training per variant and seed, in a folder of its own, in which it resumes after a stop.
+"""The learner study: one training run per variant and seed, each in its own folder, from which it resumes after a stop.
 
-A run that finished leaves ``DONE`` with the hash of its configuration, one that failed ``FAILED`` with its reason.
+A finished run leaves ``DONE`` with the hash of its configuration. A failed run leaves ``FAILED`` with the reason.
 """
 
 import shutil
@@ -29,7 +29,7 @@ from marlbc_mj.util.text import one_line
 
 
 class TrainingJob(NamedTuple):
-    """One run: what is trained, and in which folder."""
+    """One training run: its variant, its configuration and its folder."""
 
     variant: str
     config: TrainConfig
@@ -37,48 +37,48 @@ class TrainingJob(NamedTuple):
 
     @property
     def key(self) -> str:
-        """The run's name in every message."""
+        """Name of the run in messages."""
         return f"{self.variant} seed {self.config.seed}"
 
     @property
     def hash(self) -> str:
-        """Hash of the configuration, by which a folder tells whether it holds this run."""
+        """Hash of the configuration, which shows whether a folder holds this run."""
         return config_hash({"train": self.config})
 
 
 class TrainingEnd(NamedTuple):
-    """How a run ended: ``finished``, ``found`` (finished before) or ``failed``, and why it failed."""
+    """How a run ended: ``finished``, ``found`` (finished in an earlier call) or ``failed``, and the reason for a failure."""
 
     how: str
     reason: str = ""
 
 
 def unchanged(config: TrainConfig) -> TrainConfig:
-    """The configuration as it is."""
+    """The configuration without changes."""
     return config
 
 
 @dataclass(frozen=True)
 class LearnerStudy:
-    """Every variant on seeds 0 to ``seeds - 1``, and their comparison."""
+    """Study that trains every variant on seeds 0 to ``seeds - 1`` and compares the variants."""
 
     out: Path
-    """Folder of the study; a run's is ``out/VARIANT/SEED``."""
+    """Folder of the study; each run has the folder ``out/VARIANT/SEED``."""
     variants: tuple[str, ...] = ()
-    """Names in VARIANTS; none stands for all."""
+    """Names in VARIANTS; empty: all variants."""
     seeds: int = 5
     """Runs per variant."""
     budget: int | None = None
-    """Mission steps per run; None: those of the preset ``fast``."""
+    """Mission steps per run; None: the budget of the preset ``fast``."""
     adjust: Callable[[TrainConfig], TrainConfig] = unchanged
-    """Changes every configuration."""
+    """Function that changes the configuration of every run."""
 
     def jobs(self) -> list[TrainingJob]:
-        """Seed by seed, so that a study that is stopped compares all variants.
+        """All runs, seed by seed, so that a stopped study still compares all variants.
 
         Raises:
-            ConfigurationError: an unknown variant or one named twice, a number below 1, a setting that cannot be run, or a folder
-                with a run of another configuration.
+            ConfigurationError: an unknown or repeated variant, a number below 1, an invalid setting, or a folder that holds a run
+                with another configuration.
         """
         for name in self.variants:
             if name not in VARIANTS:
@@ -102,7 +102,7 @@ class LearnerStudy:
         return train_job(job, watch)
 
     def report(self, results: Sequence[TrainingEnd], out: Path | None, progress: Progress = silent) -> Report:
-        """CSV files, table and figure of all runs in the folder of the study, also those of earlier calls."""
+        """Write CSV files, table and figure of all runs in the study's folder, including runs of earlier calls."""
         rows, curves = records.collect(self.out)
         if not rows or out is None:
             return Report(to_markdown(learners_table(rows)) if rows else "", list(rows))
@@ -111,23 +111,23 @@ class LearnerStudy:
 
 
 def compare_learners(rows: Sequence[CsvLine], curves: Sequence[CsvLine], folder: Path) -> Report:
-    """Table and figure from the lines of the CSV files alone."""
+    """Write the table and the figure, which are made from the lines of the CSV files alone."""
     write_comparison(folder, rows, curves)
     table = to_markdown(learners_table(rows))
     return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show it all", list(rows))
 
 
 def train_learners(study: LearnerStudy, workers: int, progress: Progress = silent) -> int:
-    """Train what is missing; returns the signal that stopped the study, or 0.
+    """Train all runs that have not finished; returns the signal that stopped the study, or 0.
 
     Args:
-        study: what is trained.
+        study: the study whose runs are trained.
         workers: processes that share the runs.
-        progress: called with a line per event, how many runs have ended, and how many there are.
+        progress: called with one line per event, the amount done and the total, in runs when a run ends, else in mission steps.
 
     Raises:
-        ConfigurationError: fewer than one worker, a setting, or a folder that cannot be written or that another process is at.
-        SimulationError: a worker died; what was saved goes on with the next call.
+        ConfigurationError: fewer than one worker, an invalid setting, or a folder that cannot be written or is in use.
+        SimulationError: a worker died; the next call resumes the runs from their saved states.
     """
     total, count = len(study.jobs()), 0
 
@@ -146,15 +146,15 @@ def train_learners(study: LearnerStudy, workers: int, progress: Progress = silen
 
 
 def train_job(job: TrainingJob, watch: Watch) -> TrainingEnd:
-    """Train, or go on training; a run that fails is kept with its reason, and tried again by the next call.
+    """Train a run from the start or resume it. A failed run is recorded with the reason, and the next call tries it again.
 
     Args:
-        job: what to run; finished before, it is left as it is.
-        watch: told a line at the start and after every tenth of the budget; asked after every decision whether to stop.
+        job: the run; it is not trained again if it has finished.
+        watch: receives a line at the start and after every tenth of the budget; a stop request is checked after every decision.
 
     Raises:
-        ConfigurationError: the outcome cannot be written.
-        Stopped: the run has saved itself, or has not begun.
+        ConfigurationError: ``DONE`` or ``FAILED`` cannot be written.
+        Stopped: the run was stopped, and its state is saved or it has not begun.
     """
     if (job.folder / DONE_MARK).is_file():
         _prune(job.folder)
@@ -170,7 +170,7 @@ def train_job(job: TrainingJob, watch: Watch) -> TrainingEnd:
             ended = training.resume(job.folder, progress=observe)
         else:
             ended = training.train(job.config, job.folder, overwrite=True, progress=observe)
-    except Exception as error:  # whatever stops one learner must not stop the others
+    except Exception as error:  # an error in one run must not stop the others
         reason = one_line(str(error) if isinstance(error, MarlbcError) else f"{type(error).__name__}: {error}")
         write_json(job.folder / FAILED_MARK, {"failure": reason, "train": job.config})
         return TrainingEnd("failed", reason)
@@ -182,13 +182,13 @@ def train_job(job: TrainingJob, watch: Watch) -> TrainingEnd:
 
 
 def _observer(job: TrainingJob, watch: Watch) -> Callable[[Any, Mapping[str, float]], None]:
-    """What is done after every decision of a training: a line after every tenth, and a stop where one is asked for."""
+    """Callback after every decision: reports a line after every tenth of the budget, and stops the run on request."""
     tenth = 0
 
     def observe(trainer: Any, row: Mapping[str, float]) -> None:
         nonlocal tenth
         if watch.stopping():
-            signal.raise_signal(signal.SIGTERM)  # noted by the run, which saves itself
+            signal.raise_signal(signal.SIGTERM)  # the run's signal handler notes it, and the run saves its state
         share = min(1.0, trainer.steps / job.config.budget)
         if int(10 * share) > tenth:
             tenth = int(10 * share)
@@ -200,12 +200,12 @@ def _observer(job: TrainingJob, watch: Watch) -> Callable[[Any, Mapping[str, flo
 
 
 def failed_runs(study: LearnerStudy) -> list[str]:
-    """Names of the runs of a study that failed the last time they were tried."""
+    """Names of the runs of a study whose last try failed."""
     return [job.key for job in study.jobs() if (job.folder / FAILED_MARK).is_file()]
 
 
 def _trained(folder: Path) -> str | None:
-    """Hash of the configuration that the folder's run finished with, or goes on with."""
+    """Configuration hash of the finished or resumable run in a folder; None if there is no such run."""
     if (folder / DONE_MARK).is_file():
         return str(read_json(folder / DONE_MARK, "config_hash"))
     if (folder / RESUME).is_file():
@@ -214,7 +214,7 @@ def _trained(folder: Path) -> str | None:
 
 
 def _prune(folder: Path) -> None:
-    """Leave evaluations, progress, configuration and the best checkpoint of a finished run."""
+    """Remove all files of a finished run but evaluations, progress, configuration and best checkpoint."""
     for path in (folder / RESUME, folder / FAILED_MARK, *(folder / "checkpoint").glob("last.*")):
         path.unlink(missing_ok=True)
     shutil.rmtree(folder / "tensorboard", ignore_errors=True)

@@ -1,4 +1,4 @@
-"""The variants that a study of learners compares: MARLMS, its ablations, its presets and its rivals."""
+"""The variants that the learner study compares: MARLMS, its ablations, its presets and its baselines."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -10,19 +10,19 @@ from marlbc_mj.training.methods import CARE, METHODS
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to learn: a method and a preset with changes. A group has at most ``WIDE`` variants, a row of the figure."""
+    """A learner: a method and a preset with changes. A group has at most ``comparison.WIDE`` variants, one row of the figure."""
 
     title: str
     """Name in figures."""
     line: str
     group: str
-    """Group of the comparison: learner, preset or rival."""
+    """Group in the comparison: ``learner``, ``preset`` or ``rival`` (a baseline)."""
     method: str = "marlms"
     preset: str = "fast"
     changes: Mapping[str, Any] = field(default_factory=dict)
 
     def config(self, seed: int, budget: int) -> TrainConfig:
-        """The run's configuration, on one thread, so that runs do not compete for cores."""
+        """The configuration of a run. It uses one thread, so that runs do not compete for cores."""
         changes = {**METHODS[self.method][0], **self.changes, "method": self.method, "seed": seed, "budget": budget}
         return make_config(self.preset, **changes, threads=1)
 
@@ -62,4 +62,4 @@ VARIANTS: dict[str, Variant] = {
     "rlms": Variant("RLMS", "agents that learn alone", "rival", "rlms"),
     "mappo": Variant("MAPPO", "multi-agent PPO", "rival", "mappo"),
 }
-"""Method, preset and changes by name."""
+"""All variants by name."""

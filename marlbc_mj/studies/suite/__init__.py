@@ -1,1 +1,1 @@
-"""The suite: a fixed set of missions in tracks, named by a hash, on which supervisors and controllers are compared."""
+"""The suite: a fixed set of missions in tracks, identified by a hash, on which supervisors and controllers are compared."""

@@ -1,4 +1,4 @@
-"""Videos of the layouts to look at: for every method of a track its worst one and its median one."""
+"""Videos of selected layouts: the worst and the median layout of every method in a track."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,13 +24,13 @@ CLIP_STYLE = VideoStyle(speed=8.0, size=(640, 360))
 def render_clips(
     groups: Sequence[MissionRuns], flown: Mapping[Method, Entrant], folder: Path, progress: Progress = silent
 ) -> list[str]:
-    """Fly the worst and the median layout of every method again and render them; what could not be rendered, a line each.
+    """Fly the worst and the median layout of every method again and render them; returns a line per clip that failed.
 
     Args:
-        groups: all rows.
-        flown: how methods are made that a user's files define.
-        folder: of the page; clips go into ``clips`` below it.
-        progress: told how many clips are done.
+        groups: all results.
+        flown: entrants of the methods that this study flies; the only way to make those from a user's files.
+        folder: folder of the page; clips are written into its subfolder ``clips``.
+        progress: called with the number of clips done and the total.
     """
     problems, chosen = [], notable_layouts(groups)
     for done, one in enumerate(chosen):
@@ -44,13 +44,13 @@ def render_clips(
 
 
 def _registered(method: Method) -> Entrant | None:
-    """How a method is made by its names; None where they are no names of this package."""
+    """The entrant of a method with names of this package; None for other methods."""
     known = method.supervisor in SUPERVISORS and method.controller in CONTROLLERS
     return Entrant(method.supervisor, method.controller, method) if known else None
 
 
 def _render(one: Notable, entrant: Entrant | None, folder: Path) -> None:
-    """Write one clip; a method whose file is not known has none."""
+    """Render one clip; nothing is done if the entrant is unknown."""
     if entrant is None:
         return
     law = make_controller(entrant.controller)

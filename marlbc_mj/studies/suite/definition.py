@@ -1,7 +1,8 @@
-"""Suite v1: its missions, their layouts, and the hash that names it.
+"""Suite v1: its missions, their layouts, and the hash that identifies it.
 
-No number of any supervisor, controller or law was chosen on these layouts: seeds begin at 90000, and layouts are of the split
-that no training draws. A change of any mission, by a default of a scenario for example, changes the hash and is another suite.
+No parameter of any supervisor, controller or law was tuned on these layouts: their seeds begin at 90000, and they belong to the
+split that training never draws. Any change of a mission, for example of a scenario's default, changes the hash and so makes it
+another suite.
 """
 
 import hashlib
@@ -33,11 +34,11 @@ FROZEN = {
 """Hash of every track of this version."""
 SUITE_SEED = 90_000
 QUICK = 50
-"""Layouts of each mission in a quick run: the first of the whole suite's."""
+"""Layouts per mission in a quick run: the first ones of the whole suite."""
 QUICK_TRACKS = ("paper", "families", "control")
-"""Tracks of a quick run where none are named: large teams and robots with wheels and rotors take most of the time."""
+"""Default tracks of a quick run. The others, with large teams and robots with wheels and rotors, take most of the time."""
 HASH_DIGITS = 9
-"""Significant digits of numbers in the definition: the last bits of a sine differ between machines."""
+"""Significant digits of the numbers that are hashed, since the last bits of a sine differ between machines."""
 SUITE_FAMILIES = ("field", "forest", "gates", "corridor", "traffic", "exchange")
 SUITE_TEAMS = (("circle", 8), ("line", 6), ("grid", 9), ("wedge", 16), ("grid", 32))
 TEAM_FAMILIES = ("field", "forest", "gates")
@@ -54,13 +55,13 @@ class SuiteMission(NamedTuple):
 
 
 class Track(NamedTuple):
-    """Missions that belong together, and the law that flies them."""
+    """Missions that belong together, and the controller or the supervisor that is the same for all methods."""
 
     name: str
     summary: str
     missions: Callable[[], list[SuiteMission]]
-    controller: str | None  # the one that supervisors are compared under; None: controllers are compared
-    supervisor: str | None = None  # the one that controllers are compared under
+    controller: str | None  # with which supervisors are compared; None: controllers are compared
+    supervisor: str | None = None  # with which controllers are compared
 
 
 def _paper() -> list[SuiteMission]:
@@ -106,13 +107,13 @@ def _robots() -> list[SuiteMission]:
 
 
 def gate_for(robot: str) -> Scenario:
-    """The case study's gate at the robot's scale, with starts within 1 and obstacles within 0.5 of its length units."""
+    """The case study's gate at the robot's scale; start coordinates vary by 1 and obstacles by 0.5 of its length units."""
     unit = make_robot(robot).length
     return make_scenario("robot_gate", robot=robot, perturbation=Perturbation(unit, 0.5 * unit))
 
 
 def field_for(robot: str) -> Scenario:
-    """The field of discs at the robot's scale: lengths in its length units, speeds and gains that its limits allow.
+    """The field of discs at the robot's scale: lengths in its length units, speed and gains within its limits.
 
     Speed, gains and the distance at which avoidance begins are chosen as in :mod:`marlbc_mj.scenarios.robot_gate`.
     """
@@ -131,8 +132,8 @@ def field_for(robot: str) -> Scenario:
         formation_tolerance=0.5 * unit,
         formation_gain=gain,
         avoidance_gain=2.5 * gain,
-        obstacles=8,  # avoidance begins farther out than for a point mass, so fewer fit
-        radius=(unit, unit),  # solid bodies have one
+        obstacles=8,  # avoidance begins farther out than for a point mass, so fewer obstacles fit
+        radius=(unit, unit),  # no seed can change the radius of a solid obstacle
         margin=3.0 * unit,
         gap=max(4.0 * unit, 2.2 * avoid),
         disturbance=LinearDrag(coefficient=AIR_DRAG if body.height > 0 else 0.0),
@@ -151,7 +152,7 @@ def field_for(robot: str) -> Scenario:
 
 
 def _unseen(scenario: Scenario) -> Scenario:
-    """The held-out layouts of a scenario that draws layouts; one that draws starts only is as new by its seeds."""
+    """The scenario with held-out layouts; one that draws no layouts is unchanged, and its seeds alone make its draws new."""
     return scenario if scenario.layout is None else held_out(scenario)
 
 
@@ -181,12 +182,12 @@ def missions_of(track: str) -> tuple[SuiteMission, ...]:
 
 
 def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layouts: int | None = None) -> list[SuiteMission]:
-    """Missions of the named tracks, all of them without names.
+    """The chosen missions of the chosen tracks.
 
     Args:
-        tracks: names; none: all.
-        names: of missions, to leave out others.
-        layouts: of each mission, the first so many.
+        tracks: names of tracks; empty: all.
+        names: names of missions; empty: all missions of the tracks.
+        layouts: number of layouts per mission, the first ones; None: all.
 
     Raises:
         ConfigurationError: an unknown or repeated name, or fewer than one layout.
@@ -203,13 +204,13 @@ def choose_missions(tracks: Sequence[str] = (), names: Sequence[str] = (), layou
 
 
 def suite_hash() -> str:
-    """The hash that names this version: of the hashes of its tracks."""
+    """The hash that identifies this version of the suite, made from the hashes of its tracks."""
     return _digest({"version": VERSION, "tracks": FROZEN})
 
 
 @cache
 def track_hash(name: str) -> str:
-    """Hash of a track, as it is in this code.
+    """Hash of a track as this code defines it.
 
     Raises:
         ConfigurationError: an unknown track, or one that needs a package that is not installed.
@@ -226,7 +227,7 @@ def _digest(content: Any) -> str:
 
 
 def _canonical(scenario: Scenario) -> Any:
-    """A scenario as data, rounded, without fields that came later and do nothing at their defaults, and without prose."""
+    """A scenario as rounded data, without its description and without later fields that have their defaults."""
     young = {f.name: f.default for f in scenario.__dataclass_fields__.values() if f.metadata == YOUNG}
     left_out = {name for name, default in young.items() if getattr(scenario, name) == default} | {"description"}
     data = {name: getattr(scenario, name) for name in scenario.__dataclass_fields__ if name not in left_out}
@@ -242,7 +243,7 @@ def _round(value: Any) -> Any:
 
 
 def check_frozen(tracks: Sequence[str]) -> None:
-    """Raise ConfigurationError where a track of this code is not the frozen one."""
+    """Raise ConfigurationError if a track of this code differs from the frozen one."""
     for name in tracks:
         if track_hash(name) != FROZEN[name]:
             raise ConfigurationError(

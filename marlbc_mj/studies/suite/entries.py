@@ -1,4 +1,4 @@
-"""Methods that fly the suite: every supervisor under the composition that it is meant for, and every controller."""
+"""Methods that fly the suite: every supervisor under the compositions that it is meant for, and every controller."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,27 +12,27 @@ from marlbc_mj.util.errors import ConfigurationError, check_named_once, unknown
 from marlbc_mj.util.method_names import short_name
 
 SUITE_SEARCHES = ("mpcms", "mpcms-mujoco", "rollout")
-"""Supervisors that try out futures at every decision. A quick run leaves them out unless they are named."""
+"""Supervisors that search over predicted futures. A quick run leaves them out unless they are named."""
 SLOW = ("mpcms-mujoco",)
-"""Supervisors that take minutes an episode and fly only where they are named."""
+"""Supervisors that take minutes per episode and fly only if they are named."""
 OWN_VELOCITIES = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
-"""Supervisors whose velocities replace those of a composition, which makes no difference to them."""
+"""Supervisors that give velocities instead of orders, so that the composition does not matter."""
 FOR_SET_BASED = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "marlms-general")
 """Supervisors that leave avoidance to the set-based composition."""
 
 
 class Choice(NamedTuple):
-    """The selection of methods by the command line."""
+    """The methods that the command line selects."""
 
-    supervisors: tuple[str, ...] | None = None  # None: all that are not too slow
+    supervisors: tuple[str, ...] | None = None  # None: all but slow ones
     controllers: tuple[str, ...] | None = None  # of the control track; None: all
     compositions: tuple[str, ...] | None = None  # for every supervisor; None: those that it is meant for
-    shield: bool = False  # every row twice, without a shield and with one
-    quick: bool = False  # leave searches out
+    shield: bool = False  # fly every method without a shield and with one
+    quick: bool = False  # leave out supervisors that search
 
 
 class Entrant(NamedTuple):
-    """A method of one track, and the names under which its parts are made."""
+    """A method of one track, and the names from which its supervisor and controller are made."""
 
     supervisor: str  # a name, FILE.py:NAME, or the path of a checkpoint
     controller: str
@@ -43,7 +43,7 @@ def entrants(track: str, choice: Choice) -> list[Entrant]:
     """All methods of a track.
 
     Raises:
-        ConfigurationError: an unknown or repeated name, or a file that gives no supervisor or controller.
+        ConfigurationError: an unknown or repeated name, or a file without a supervisor or controller.
     """
     own = TRACKS[track]
     if own.controller is None:
@@ -70,7 +70,7 @@ def entrants(track: str, choice: Choice) -> list[Entrant]:
 
 
 def meant_for(supervisor: str) -> tuple[str, ...]:
-    """Compositions under which a supervisor has rows: the published ones and a stranger's have one under each."""
+    """Compositions under which a supervisor flies: both, unless it depends on one or does not use any."""
     if supervisor in FOR_SET_BASED:
         return ("set-based",)
     return ("null-space",) if supervisor in OWN_VELOCITIES else COMPOSITIONS
@@ -86,7 +86,7 @@ def _named(kind: str, names: Sequence[str] | None, default: tuple[str, ...]) -> 
 
 
 def _entrant(supervisor: str, controller: str, composition: str, shield: bool) -> Entrant:
-    """Checks both names, so that nothing is flown where one is wrong."""
+    """Make an entrant after checking both names, so that nothing is flown if one is wrong."""
     make_controller(controller)
     make_supervisor(supervisor, controller)
     method = Method(short_name(supervisor), short_name(controller), composition, shield)

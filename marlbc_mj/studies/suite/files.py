@@ -1,4 +1,4 @@
-"""Files of a run of the suite, written and read: suite.json, and a CSV file per track with a row per layout."""
+"""Writes and reads the files of a suite run: suite.json, and a CSV file per track with a row per layout."""
 
 import json
 import sys
@@ -18,21 +18,21 @@ from marlbc_mj.util.files import write_json
 from marlbc_mj.util.provenance import provenance
 
 FORM = 1
-"""Version of the form of suite.json."""
+"""Version of the format of suite.json."""
 SUITE_FILE = "suite.json"
 _OF_OTHERS = ("command", "date", "code", "git_revision", "cpu")
-"""Facts that are kept of results shown beside others."""
+"""Facts that are kept of earlier results that are shown next to new ones."""
 
 
 class SuiteResults(NamedTuple):
-    """Rows of the suite, and where they come from."""
+    """Rows of the suite, and facts about their origin."""
 
     facts: Mapping[str, Any]  # ``suite``, ``versions``, ``git_revision``, ``cpu``, ``platform``, ``code``, ``command``, ``date``
     groups: tuple[MissionRuns, ...]
 
 
 def describe_suite() -> dict[str, Any]:
-    """What suite.json says besides results: the suite's version and hash, and how, when and where it is flown."""
+    """The facts in suite.json besides results: version and hash of the suite, and how, when and where it is flown."""
     return {
         "suite": {"version": VERSION, "hash": suite_hash()},
         "command": " ".join(["marlbc", *sys.argv[1:]]),
@@ -52,7 +52,7 @@ def write_suite(results: SuiteResults, folder: Path) -> None:
 
 
 def _track_entry(track: str, groups: Sequence[MissionRuns]) -> dict[str, Any]:
-    """Missions of a track, each with its seeds and its methods."""
+    """The entry of a track in suite.json: its missions, each with its seeds and its methods."""
     own = [each for each in groups if each.track == track]
     entry: dict[str, Any] = {}
     for mission in dict.fromkeys(each.mission for each in own):
@@ -70,15 +70,15 @@ def _numbers(summary: MissionSummary) -> dict[str, Any]:
 
 
 def _with_interval(estimate: Estimate) -> list[float]:
-    """Value, low and high end of the interval."""
+    """The value, and the lower and upper ends of its interval."""
     return list(estimate)
 
 
 def read_suite(folder: Path) -> SuiteResults:
-    """What :func:`write_suite` wrote.
+    """Read the results that :func:`write_suite` wrote.
 
     Raises:
-        ConfigurationError: no such folder, another form or suite, or a file that is torn.
+        ConfigurationError: no such folder, another format or suite, or an incomplete file.
     """
     path = folder / SUITE_FILE
     try:
@@ -103,7 +103,7 @@ def read_suite(folder: Path) -> SuiteResults:
 
 
 def merge(own: SuiteResults, other: SuiteResults) -> SuiteResults:
-    """The rows of both; where both have a method on a mission, the first's."""
+    """The rows of both results; if both have a method on a mission, only those of ``own``."""
     there = {(each.track, each.mission, each.method) for each in own.groups}
     kept = [each for each in other.groups if (each.track, each.mission, each.method) not in there]
     beside = [{name: other.facts[name] for name in _OF_OTHERS}, *other.facts.get("beside", ())]

@@ -1,4 +1,4 @@
-"""Jobs of the suite: one method on a block of layouts, and how it is flown."""
+"""Jobs of the suite, each of which flies one method on a block of layouts."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,7 +13,7 @@ from marlbc_mj.studies.suite.entries import Choice, Entrant, entrants
 from marlbc_mj.util.progress import Progress, silent
 
 BLOCK = QUICK
-"""Layouts of one job, so that the whole suite goes on from a quick run."""
+"""Layouts per job; as many as in a quick run, so that the whole suite can reuse its results."""
 
 
 class SuiteJob(NamedTuple):
@@ -21,13 +21,13 @@ class SuiteJob(NamedTuple):
 
     track: str
     mission: str
-    scenario: Scenario  # under the method's composition
+    scenario: Scenario  # with the method's composition
     entrant: Entrant
     seeds: tuple[int, ...]
 
     @property
     def method(self) -> Method:
-        """What flies."""
+        """The method that is flown."""
         return self.entrant.method
 
 
@@ -35,7 +35,7 @@ def suite_jobs(missions: Sequence[SuiteMission], choice: Choice) -> list[SuiteJo
     """All jobs, mission by mission.
 
     Raises:
-        ConfigurationError: a name that is wrong, see :func:`~marlbc_mj.studies.suite.entries.entrants`.
+        ConfigurationError: an invalid name, see :func:`~marlbc_mj.studies.suite.entries.entrants`.
     """
     flown = {track: entrants(track, choice) for track in dict.fromkeys(mission.track for mission in missions)}
     return [
@@ -48,10 +48,10 @@ def suite_jobs(missions: Sequence[SuiteMission], choice: Choice) -> list[SuiteJo
 
 
 def under(scenario: Scenario, composition: str) -> Scenario:
-    """The scenario under a composition of that name.
+    """The scenario with the named composition.
 
     Raises:
-        ConfigurationError: there is none.
+        ConfigurationError: an unknown composition.
     """
     changes: dict[str, Any] = {"composition": composition}
     return replace(scenario, **changes)
@@ -62,7 +62,7 @@ def _blocks(seeds: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
 
 
 def fly_layouts(job: SuiteJob, progress: Progress = silent) -> tuple[LayoutRun, ...]:
-    """The method on every layout of the block; a run that fails, or a method that cannot start, is a row with its reason."""
+    """Fly the method on every layout of the block; a run that fails or cannot start gives a row with the reason."""
     entrant, scenario = job.entrant, job.scenario
     draws = DrawsJob(scenario, entrant.supervisor, entrant.controller, job.seeds, entrant.method.shield)
     runs = fly_draws(draws, progress).runs

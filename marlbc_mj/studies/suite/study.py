@@ -1,4 +1,4 @@
-"""The suite as a study: jobs, one method on a block of layouts each, and the files and the page made from all of them."""
+"""The suite as a study: each job flies one method on a block of layouts; the report makes files and a page of all results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,12 +20,12 @@ from marlbc_mj.util.progress import Progress, silent
 
 @dataclass(frozen=True)
 class SuiteStudy:
-    """Every chosen method on every layout of the chosen missions."""
+    """Study that flies every chosen method on every layout of the chosen missions."""
 
     missions: tuple[SuiteMission, ...]
     choice: Choice
     beside: Path | None = None
-    """Folder of results whose rows stand beside those that are flown."""
+    """Folder of earlier suite results that are shown next to the new ones; None: none."""
     clips: bool = False
     """Whether the worst and the median layout of every method are rendered."""
 
@@ -36,10 +36,10 @@ class SuiteStudy:
         return fly_layouts(job)
 
     def gather(self, results: Sequence[tuple[LayoutRun, ...]]) -> SuiteResults:
-        """All rows of all jobs, and those beside them; without jobs these alone.
+        """The rows of all jobs and the earlier results; without missions, the earlier results alone.
 
         Raises:
-            ConfigurationError: results that cannot stand beside others, see :func:`~marlbc_mj.studies.suite.files.read_suite`.
+            ConfigurationError: earlier results that cannot be compared, see :func:`~marlbc_mj.studies.suite.files.read_suite`.
         """
         others = None if self.beside is None else read_suite(self.beside)
         if others is not None and not self.missions:
@@ -66,7 +66,7 @@ class SuiteStudy:
 
 
 def _strangeness(results: SuiteResults) -> list[str]:
-    """One line for every part of the results that is of other code than this."""
+    """One line for every other version of the code that made some of the results."""
     codes = dict.fromkeys(str(facts["code"]) for facts in (results.facts, *results.facts.get("beside", ())))
     return [f"rows are of other code ({code}) than this ({code_version()})" for code in codes if code != code_version()]
 
