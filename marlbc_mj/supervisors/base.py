@@ -14,7 +14,7 @@ from marlbc_mj.util.modules import guarded
 
 
 class Blend(NamedTuple):
-    """A decision with its own reference velocities, which replace those composed from the orders (12).
+    """A decision with its own reference velocities, which replace the output of the composition.
 
     A one-team supervisor returns both arrays without the leading axis.
     """
