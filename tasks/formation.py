@@ -32,7 +32,7 @@ class FormationArena(composer.Arena):
 
 NO_COPY = (
     "a dm_control environment holds MuJoCo's physics by address and cannot be copied or sent to another process; make another "
-    "one with the same random_state there, or copy the Gymnasium view, which goes on from the same state"
+    "one with the same random_state there, or copy the Gymnasium view, which continues from the same state"
 )
 
 

@@ -16,7 +16,7 @@ JOBS = 40
 
 @dataclass(frozen=True)
 class Digests:
-    """Digests of numbers, each with a file; ``pause`` is how long each takes [s]."""
+    """A study that hashes numbers and writes a file for each; ``pause`` is the time that each job takes [s]."""
 
     count: int = JOBS
     pause: float = 0.0
@@ -39,7 +39,7 @@ class Digests:
 
 def main(out: str, engine: str, workers: int, pause: float) -> None:
     """Run the study on an engine and compare its results with those of this process."""
-    from digests import Digests as Same  # not of __main__, which workers cannot import
+    from digests import Digests as Same  # workers cannot import the class from __main__
 
     def show(what: str, done: float, total: float) -> None:
         print(f"{what}: {done} of {total}", file=sys.stderr, flush=True)

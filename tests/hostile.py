@@ -1,4 +1,4 @@
-"""For tests of shields: a supervisor that sends every agent against something."""
+"""For tests of shields: steers every agent at an obstacle or at another agent."""
 
 from typing import NamedTuple
 
@@ -9,23 +9,23 @@ from marlbc_mj.engine.world import World
 
 
 class Closest(NamedTuple):
-    """The worst at any substep [m]."""
+    """Extreme values over all substeps [m]."""
 
-    clearance: float
-    distance: float  # between two agents
-    off: float  # of an agent from its reference
+    clearance: float  # smallest
+    distance: float  # smallest, between two agents
+    off: float  # largest distance of an agent from its reference
 
 
 def attack(world: World, steps: int, seed: int = 0, *, speed: float, change: int, forget: bool = False) -> Closest:
-    """Send every agent against an obstacle or another agent, one of its own, at ``speed`` [m/s].
+    """Steer every agent at a random obstacle or agent at ``speed``, and return the closest approaches.
 
     Args:
-        world: one world, made with ``record=True``.
-        steps: mission steps.
-        seed: of the choices.
-        speed: of the reference velocities [m/s].
-        change: mission steps after which everybody gets another target.
-        forget: whether references start where agents are, without a memory of where they could not go.
+        world: a World with a single world, made with ``record=True``.
+        steps: number of mission steps.
+        seed: random seed of the targets.
+        speed: magnitude of the reference velocities [m/s].
+        change: number of mission steps after which every agent gets a new target.
+        forget: whether to set the references to the agents' positions at every mission step, so that they do not run ahead.
     """
     rng, agents = np.random.default_rng(seed), world.scenario.agents
     clearance, distance, off = np.inf, np.inf, 0.0

@@ -1,9 +1,10 @@
-"""Kills commands with SIGKILL at random moments, runs them again, and compares what they leave with undisturbed runs.
+"""Kills commands with SIGKILL at random moments, runs them again, and compares their output with that of undisturbed runs.
 
-``python tests/kills.py --kills 50 --seed 0 --out FOLDER [--engine ray] [--commands bench evaluate ...]``. Every kill is checked:
-no half-written file under a final name; the same command (with --resume or --overwrite, where it has them) then finishes; what it
-leaves is equal bit for bit but for times; no process and no temporary file of it stays. Lines of ``kills-ENGINE.jsonl`` in the
-folder say what happened; a second call with the same folder goes on. Exit status 1 if any check failed.
+``python tests/kills.py --kills 50 --seed 0 --out FOLDER [--engine ray] [--commands bench evaluate ...]``. After each kill, no
+process of the command may remain, and no file under a final name may be half-written. The same command (with --resume or
+--overwrite, if it has them) must then finish, with output identical to the last bit except for times, and leave no temporary
+file. ``kills-ENGINE.jsonl`` in the folder records the results, and a second call with the same folder adds to them. The exit
+status is 1 if any check failed.
 """
 
 import argparse
@@ -27,12 +28,12 @@ import numpy as np
 from marlbc_mj.studies.packs import entries, packs
 from marlbc_mj.training.resuming import RESUME
 
-MOST_SECONDS = 400.0  # of one command
-ORPHANS_END = 20.0  # after which nothing of a killed command may run [s]
+MOST_SECONDS = 400.0  # time limit of one command [s]
+ORPHANS_END = 20.0  # time after which no process of a killed command may run [s]
 TIMES = ("decision", "wall", "cpu_s", "solver", "command", "seconds", "steps_per_s", "git_revision")
-"""What may differ between two runs: keys and columns with any of these in their names."""
+"""Keys and columns with any of these in their names may differ between two runs."""
 TEMPORARY = (".partial", ".old-", ".begun-", ".new-")
-"""Parts of names that nothing has that is left in the end."""
+"""Parts of the names of temporary files and folders, none of which may remain at the end."""
 TINY = "worlds=8 hidden=8 batch=16 updates=1 capacity=400 start_length=1.0 evaluate_every=800"
 SMALL = "families=field teams=wedge-4 worlds=2 hidden=8 batch=16 updates=2 layouts=1 evaluate_every=600"
 SHORT = "--duration 4 --overwrite"
@@ -41,12 +42,12 @@ RAY_PARTS = ("ray::", "raylet", "gcs_server")
 
 @dataclass(frozen=True)
 class Target:
-    """A command that is killed."""
+    """A command to kill."""
 
-    arguments: str  # OUT stands for the output
+    arguments: str  # OUT, LOG, ENGINE and WORKERS are filled in
     again: Callable[[Path], tuple[str, ...] | None] = lambda out: None
-    """Arguments for going on, where they differ."""
-    engines: bool = False  # whether it takes --engine
+    """Arguments for the second run, if they differ; None otherwise."""
+    engines: bool = False  # whether it has --engine
     program: tuple[str, ...] = ("-m", "marlbc_mj")
 
 
@@ -75,11 +76,11 @@ TARGETS = {
     "run": Target("run paper --supervisor fsams --duration 20 --overwrite --out OUT"),
     "video": Target("video LOG --size 160x90 --fps 10 --overwrite --out OUT.mp4"),
 }
-"""By name."""
+"""The commands by name."""
 
 
 class Killer:
-    """Runs, kills, and compares, in a folder of its own."""
+    """Runs commands, kills them and compares their output, in a folder of its own."""
 
     def __init__(self, folder: Path, engine: str, workers: int) -> None:
         self.folder, self.engine, self.workers = folder, engine, workers
@@ -87,7 +88,7 @@ class Killer:
         self.environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "MARLBC_KILLS": str(os.getpid())}
 
     def arguments(self, name: str, out: Path) -> list[str]:
-        """The command line of a target."""
+        """Arguments of a target's first run, or of its second run if ``out`` can be resumed."""
         target = TARGETS[name]
         given = [self._filled(word, out) for word in target.again(out) or target.arguments.split()]
         if target.engines and target.program != DIGESTS:
@@ -103,14 +104,14 @@ class Killer:
         return known.get(word, word.replace("OUT", str(out)))
 
     def start(self, name: str, out: Path) -> subprocess.Popen[str]:
-        """A command in a session of its own, with its output in a file."""
+        """Start a command in a session of its own, with its output in ``said.txt``."""
         said = (self.folder / "said.txt").open("w")
         command = [sys.executable, *TARGETS[name].program, *self.arguments(name, out)]
         with said:
             return subprocess.Popen(command, env=self.environment, stdout=said, stderr=said, text=True, start_new_session=True)
 
     def finish(self, name: str, out: Path) -> tuple[int, float]:
-        """Run a command to its end: exit status and time [s]."""
+        """Run a command to its end; return its exit status, -9 after MOST_SECONDS, and the time [s]."""
         began = time.monotonic()
         process = self.start(name, out)
         try:
@@ -122,7 +123,7 @@ class Killer:
         return status, time.monotonic() - began
 
     def reference(self, name: str) -> float:
-        """An undisturbed run, once; its time [s]. It is made twice: the first one compiles."""
+        """Return the time of an undisturbed run [s], made if it does not exist yet: twice, as the first run compiles."""
         out, stamp = self.folder / f"{name}-whole", self.folder / f"{name}-whole.json"
         if not stamp.exists():
             for _ in range(2):
@@ -134,7 +135,7 @@ class Killer:
         return float(json.loads(stamp.read_text()))
 
     def kill(self, name: str, rng: random.Random) -> dict[str, Any]:
-        """One kill, or a few in a row, and what came after; ``faults`` is empty where all is well."""
+        """Kill a command one to four times, finish it, and report; ``faults`` is empty if all checks passed."""
         seconds, out = self.reference(name), self.folder / f"{name}-killed"
         _remove(out)
         faults: list[str] = []
@@ -147,7 +148,7 @@ class Killer:
                 break
             whom = rng.choice(("study", "study", "group", "worker"))
             struck.append(_strike(process, whom, rng))
-            if whom == "worker":  # the command itself goes on, or ends with an error
+            if whom == "worker":  # the command itself continues, or ends with an error
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(MOST_SECONDS)
             process.wait()
@@ -171,7 +172,7 @@ class Killer:
         }
 
     def leftovers(self, name: str, out: Path) -> list[str]:
-        """Processes of the command that stay, and files under final names that are not whole."""
+        """Faults: processes that still run after ORPHANS_END, which are then killed, and unreadable files under final names."""
         until = time.monotonic() + ORPHANS_END
         while (alive := list(self.processes())) and time.monotonic() < until:
             time.sleep(0.2)
@@ -182,7 +183,7 @@ class Killer:
         return [f"{len(alive)} processes stay: {names}"] * bool(alive) + torn(_output(name, out))
 
     def processes(self) -> Iterator[int]:
-        """Those that descend from a command of ours."""
+        """Ids of running processes that descend from a command of this killer."""
         mark = f"MARLBC_KILLS={os.getpid()}".encode()
         for entry in Path("/proc").iterdir():
             if not entry.name.isdigit() or int(entry.name) == os.getpid():
@@ -194,12 +195,12 @@ class Killer:
 
 
 def _kept(out: Path) -> int:
-    """How many results an unfinished run has; −1 where there is none."""
+    """Number of results that an unfinished run has stored; −1 if there is no unfinished run."""
     return sum(1 for pack in packs(out / ".jobs") for _ in entries(pack)) if (out / ".jobs").is_dir() else -1
 
 
 def _wait(process: subprocess.Popen[str], out: Path, seconds: float, stores: bool, rng: random.Random) -> float:
-    """Until a random moment of the run, or until another result is there and a little longer; the time [s]."""
+    """Wait for a random moment of the run, or until shortly after one to three more results; return the time [s]."""
     began, before = time.monotonic(), max(0, _kept(out))
     until, more = began + rng.uniform(0.3, 1.0) * seconds, rng.choice((0, 1, 2, 3)) if stores else 0
     while process.poll() is None:
@@ -213,7 +214,7 @@ def _wait(process: subprocess.Popen[str], out: Path, seconds: float, stores: boo
 
 
 def _strike(process: subprocess.Popen[str], whom: str, rng: random.Random) -> str:
-    """SIGKILL to the study's process, to all processes of its session, or to one of its workers; what was killed."""
+    """Send SIGKILL to the command's process, to its whole group, or to one of its workers; return what was killed."""
     if whom == "group":
         os.killpg(process.pid, signal.SIGKILL)
         return whom
@@ -226,7 +227,7 @@ def _strike(process: subprocess.Popen[str], whom: str, rng: random.Random) -> st
 
 
 def _descendants(parent: int) -> list[int]:
-    """Children of a process, and theirs, but the helpers that Python starts itself."""
+    """Workers among all descendants of a process, without the helpers that Python itself starts."""
     parents: dict[int, int] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():
@@ -245,14 +246,14 @@ def _is_worker(process: int) -> bool:
 
 
 def _command_line(process: int) -> str:
-    """What a process was started as; empty if it has gone."""
+    """Command line of a process; empty if it no longer exists."""
     with suppress(OSError):
         return Path(f"/proc/{process}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace")[:200]
     return ""
 
 
 def _described(process: int) -> str:
-    """A process as in a list of processes: number, state, parent, time since its start [s] and command line."""
+    """Describe a process: id, state, parent, time since its start [s] and command line."""
     with suppress(OSError, IndexError):
         entries = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
         up = float(Path("/proc/uptime").read_text().split()[0]) - int(entries[19]) / os.sysconf("SC_CLK_TCK")
@@ -274,24 +275,27 @@ def _temporary(path: Path) -> bool:
 
 
 def _final(out: Path) -> list[Path]:
-    """Files under final names."""
+    """Files of an output under final names."""
     found = [out] if out.is_file() else sorted(path for path in out.rglob("*") if path.is_file())
     return [p for p in found if not _temporary(p) and not any(_temporary(q) or q.name == ".jobs" for q in p.parents)]
 
 
 def torn(out: Path) -> list[str]:
-    """Files under final names that cannot be read."""
+    """Faults: files under final names that cannot be read."""
     faults = []
     for path in _final(out):
         try:
             content(path)
-        except Exception as error:  # whatever is wrong with it
+        except Exception as error:  # any error means that the file is not whole
             faults.append(f"{path.name} is torn: {type(error).__name__}: {error}"[:200])
     return faults
 
 
 def content(path: Path) -> Any:
-    """What must be equal in two runs of one command; None for what shows times."""
+    """Content of a file that must be equal in two runs of one command; None for other types of files.
+
+    Raises an error if the file is not whole.
+    """
     match path.suffix:
         case ".json":
             return _timeless(json.loads(path.read_text()))
@@ -315,7 +319,7 @@ def content(path: Path) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays as bytes, within tuples too, so that all of it can be compared."""
+    """Replace arrays by their bytes, also within tuples, so that values can be compared with ``==``."""
     if isinstance(value, tuple):
         return tuple(map(_plain, value))
     return value.tobytes() if isinstance(value, np.ndarray) else value
@@ -328,7 +332,7 @@ def _timeless(value: Any) -> Any:
 
 
 def differences(whole: Path, killed: Path) -> list[str]:
-    """In what two outputs differ."""
+    """Faults: the differences between two outputs."""
     here, there = ({(p.relative_to(out) if out.is_dir() else Path()): p for p in _final(out)} for out in (whole, killed))
     faults = [f"{name} is in one only" for name in sorted(here.keys() ^ there.keys())]
     for name in sorted(here.keys() & there.keys()):
@@ -338,7 +342,7 @@ def differences(whole: Path, killed: Path) -> list[str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Kill, and print a table."""
+    """Kill the commands and print a table; return 1 if any check failed."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--kills", type=int, default=10, help="at least so many for every command")
     parser.add_argument("--seed", type=int, default=0)
@@ -351,7 +355,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     killer, until = Killer(given.out, given.engine, given.workers), time.monotonic() + given.seconds
     notes = given.out / f"kills-{given.engine}.jsonl"
     if "video" in given.commands:
-        killer.reference("run")  # whose log it renders
+        killer.reference("run")  # video renders its log
     for name in given.commands:
         done = [line for line in _read(notes) if line["command"] == name]
         count, again = sum(line["kills"] for line in done), len(done)

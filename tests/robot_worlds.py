@@ -1,4 +1,4 @@
-"""For tests of robots: worlds whose forces are known beforehand, and what came of them."""
+"""For tests of robots: worlds with prescribed forces, and the recorded motion."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,7 +23,7 @@ def pushed(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class Push:
-    """The same push for everybody, then nothing."""
+    """A controller that pushes every agent alike up to a time, then applies no force."""
 
     acceleration: tuple[float, float]  # [m/s^2]
     until: float  # [s]
@@ -39,7 +39,7 @@ class Push:
 
 
 def push(name: str, acceleration: tuple[float, float], until: float, duration: float, drag: float = 0.0, **changes: Any):
-    """Robots of one kind pushed and let go: the world, and p, v, force of the first one, (T, 2) each."""
+    """Push robots of one kind, then release them; return the world, and p, v and force of the first robot, (T, 2) each."""
     robot = make_robot(name)
     fields = {"duration": duration, "disturbance": LinearDrag(coefficient=drag), "speed_limit": np.inf, **changes}
     world = World(step_scenario(robot, **fields), Push(acceleration, until), record=True)

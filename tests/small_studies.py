@@ -13,12 +13,12 @@ from marlbc_mj.studies.protocol import Report, Stopped, Watch
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import silent
 
-PATIENCE = 10.0  # [s]
+PATIENCE = 10.0  # longest wait of number 3 for the second try of number 2 [s]
 
 
 @dataclass(frozen=True)
 class Squares:
-    """Squares of numbers; ``trouble`` is what happens instead at number 3."""
+    """A study that squares numbers. At number 3, ``trouble`` happens instead: "death", "stop", or an error with this text."""
 
     count: int = 4
     trouble: str = ""
@@ -53,12 +53,12 @@ class Squares:
 
 @dataclass(frozen=True)
 class Roots:
-    """Roots of numbers. Number 2 kills its worker the first time; number 3 fails after that, where there is ``trouble``."""
+    """A study of square roots. With ``once``, number 2 first kills its worker; with ``trouble``, number 3 then fails."""
 
     count: int = 5
     trouble: str = ""
     once: Path | None = None
-    """File that says whether number 2 has been tried ``once`` or ``again``."""
+    """File that contains ``once`` or ``again`` after the first or second try of number 2."""
 
     def jobs(self) -> list[int]:
         return list(range(self.count))

@@ -1,4 +1,4 @@
-"""Does the basis learn, and what are the other choices worth? The questions of `marlbc ablation`, on shorter runs."""
+"""The questions of `marlbc ablation` on shorter runs: whether the basis learns, and what the other choices are worth."""
 
 import csv
 from collections.abc import Sequence
@@ -29,39 +29,39 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 
 def rows_of(question: Question) -> list[AblationRow]:
-    """One question, run."""
+    """Run one question and return its rows."""
     return AblationStudy((question,)).rows(run_ablation([question]).results)[question.name][1]
 
 
 def compare(scenario: Scenario) -> dict[str, AblationRow]:
-    """Rows of every variant in one scenario, by variant."""
+    """Row of every variant of the controller in one scenario, by variant."""
     cases = [Case((name,), scenario, controller) for name, controller in variants().items()]
     study = replace(QUESTIONS["basis"], parameters=("controller",), block=0, cases=lambda: cases)
     return {row.settings[0]: row for row in rows_of(study)}
 
 
 def shortened(question: Question, duration: float) -> Question:
-    """The same cases, each episode cut."""
+    """The same question with every episode cut to ``duration`` [s]."""
     return replace(
         question, cases=lambda: [c._replace(scenario=replace(c.scenario, duration=duration)) for c in question.cases()]
     )
 
 
 def test_scaled_learns_and_published_does_not() -> None:
-    """Drag times 20 on the cruise: `scaled` at least 5 times better than `off` in RMS velocity error, `published` not at all."""
+    """At 20 times the drag, `scaled` has at most a fifth of the RMS velocity error of `off`, `published` has the same error."""
     rows = compare(cruise(disturbance=PaperDrag(20.0), duration=40.0))
     assert (rows["scaled"].first_over_this or 0.0) >= 5.0
     assert abs((rows["published"].first_over_this or 0.0) - 1.0) < 0.01
 
 
 def test_nothing_beats_the_known_model() -> None:
-    """On the mission's first half the gain of `scaled` stays below what perfect knowledge of the drag would give."""
+    """On the mission's first half `scaled` gains at least a factor of 1.5, but less than perfect knowledge of the drag."""
     rows = compare(half_mission(20.0))
     assert 1.5 < (rows["scaled"].first_over_this or 0.0) < (rows["exact model"].first_over_this or 0.0)
 
 
 def test_whole_case_study_cannot_be_flown_at_drag_20() -> None:
-    """Even the exact model falls within 2 s: the force limit, not the identifier, is what fails; the table says so."""
+    """Even the exact model diverges within 2 s, as the table says: the cause is the force limit, not the identifier."""
     rows = list(compare(paper(disturbance=PaperDrag(20.0), duration=2.0)).values())
     assert all(row.figures is None and row.first_over_this is None for row in rows)
     assert all(row.failure.startswith("diverged: agent ") and "t = 1." in row.failure for row in rows)
@@ -72,7 +72,7 @@ def test_whole_case_study_cannot_be_flown_at_drag_20() -> None:
 
 @pytest.mark.slow
 def test_default_gains_are_the_best_of_the_sweep() -> None:
-    """`SORLC.scaled` has the gains of the sweep's smallest RMS velocity error, and the table's note says so."""
+    """`SORLC.scaled` has the gains with the smallest RMS velocity error of the sweep, and the table's note says so."""
     rows = rows_of(QUESTIONS["sweep"])
     best = max(rows, key=lambda row: row.first_over_this or 0.0)
     default = SORLC.scaled()
@@ -82,7 +82,7 @@ def test_default_gains_are_the_best_of_the_sweep() -> None:
 
 
 def test_studies_cover_every_choice() -> None:
-    """Bases, signs and drag scales in full; modes, sides and four substeps; no two rows alike."""
+    """All combinations of basis, sign and drag scale; both reference modes; both sides; four substeps; no setting twice."""
     settings = {name: [case.settings for case in study.cases()] for name, study in QUESTIONS.items()}
     assert all(len(set(rows)) == len(rows) for rows in settings.values())
     signs = {(c.settings, c.controller.tau_sign) for c in QUESTIONS["sorlc"].cases() if isinstance(c.controller, SORLC)}
@@ -96,7 +96,7 @@ def test_studies_cover_every_choice() -> None:
 
 
 def test_rows_are_compared_within_their_block() -> None:
-    """The first row of each drag scale has ratio one; the sign's and the basis's worth compare rows that are alike otherwise."""
+    """The first row of each drag scale has ratio 1; the effect of the sign compares rows that differ in nothing else."""
     study = shortened(QUESTIONS["sorlc"], 1.0)
     rows = rows_of(study)
     firsts = [row for k, row in enumerate(rows) if k == 0 or row.settings[0] != rows[k - 1].settings[0]]
@@ -110,7 +110,7 @@ def test_rows_are_compared_within_their_block() -> None:
 
 
 def test_a_substep_beyond_the_limit_is_a_row() -> None:
-    """Refused with the limit; the others have figures, and nothing is compared with a row that has none."""
+    """The refused substep is a row that names the limit; the other row has figures, but no ratio to the refused one."""
     cases: Sequence[Case] = [Case((f"{1e3 * h:g}",), paper(substep=h, duration=1.0), SORLC()) for h in (0.025, 0.005)]
     study = replace(QUESTIONS["substep"], cases=lambda: cases)
     refused, ran = rows_of(study)
@@ -121,7 +121,7 @@ def test_a_substep_beyond_the_limit_is_a_row() -> None:
 
 
 def test_page_and_csv_hold_every_row(tmp_path: Path) -> None:
-    """Three files; the CSV has a column for every parameter of any study, and the figures bit for bit."""
+    """Three files are written; the CSV has a column for every parameter of any study, and figures exact to the last bit."""
     studies = [shortened(QUESTIONS[name], 1.0) for name in ("reference", "avoidance", "substep")]
     results = {study.name: (study, rows_of(study)) for study in studies}
     write_ablation_page(results, tmp_path, {"revision": "<abc>"})
@@ -140,7 +140,7 @@ def test_page_and_csv_hold_every_row(tmp_path: Path) -> None:
 
 
 def test_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """One study into a folder; an unknown one, one named twice and a folder that is taken are one line each."""
+    """A study writes into a folder; an unknown study, one named twice and a folder that is not empty give one-line errors."""
     out = tmp_path / "out"
     main(["ablation", "--study", "avoidance", "--out", str(out)])
     assert "two-sided" in capsys.readouterr().out

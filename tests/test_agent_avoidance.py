@@ -1,4 +1,4 @@
-"""Agent avoidance: the law, its place in the orders, and that it keeps agents apart where they collide without it."""
+"""Agent avoidance: its law, its place in the orders, and missions in which agents come close without it."""
 
 from dataclasses import replace
 
@@ -23,7 +23,7 @@ PATH = np.array([[0.0, 0.0], [1.0, -0.5]])
 
 
 def evaluate(team: np.ndarray, agent: int, behavior: AgentAvoidance):
-    """Rows, velocity and Jacobian of one agent."""
+    """Number of rows, velocity (2,) and Jacobian (2, 2) for one agent."""
     velocity, jacobian = np.full(2, np.nan), np.full((2, 2), np.nan)
     gains = laws.as_gains(behavior.law, behavior.params(agent))
     rows = behavior.law(gains, team[agent], PATH, np.zeros((0, 3)), team, agent, velocity, jacobian)
@@ -36,7 +36,7 @@ def distance(p: np.ndarray, team: np.ndarray, agent: int) -> float:
 
 @given(TEAM, st.data())
 def test_its_jacobian_is_the_gradient_of_the_distance_to_the_nearest_neighbor(team, data):
-    """By central differences, away from where two neighbors are equally near."""
+    """Checked by central differences, except where two neighbors are equally near."""
     agent = data.draw(st.integers(0, len(team) - 1))
     apart = np.sort(np.linalg.norm(np.delete(team, agent, axis=0) - team[agent], axis=1))
     assume(apart[0] > 0.05 and (len(apart) == 1 or apart[1] - apart[0] > 1e-3))
@@ -51,7 +51,7 @@ def test_its_jacobian_is_the_gradient_of_the_distance_to_the_nearest_neighbor(te
 
 @given(TEAM)
 def test_it_is_one_sided(team):
-    """Inside d_AA the relative rate is Lambda (d_AA - d) along the normal; from d_AA on it asks for nothing and shuts nothing."""
+    """Below d_AA, v relative to the path is Lambda (d_AA - d) along the normal; from d_AA on there is no velocity and no row."""
     behavior = AgentAvoidance(gain=7.0, distance=1.5)
     for agent in range(len(team)):
         rows, velocity, jacobian = evaluate(team, agent, behavior)
@@ -65,11 +65,9 @@ def test_it_is_one_sided(team):
 
 
 def test_two_agents_in_one_place_part():
-    """In opposite directions."""
+    """They move in opposite directions."""
     team = np.array([[1.0, 1.0], [1.0, 1.0], [9.0, 9.0]])
-    first, second = (
-        evaluate(team, agent, AgentAvoidance())[1] - evaluate(team, agent, AgentAvoidance())[2][0] for agent in (0, 1)
-    )
+    first, second = (evaluate(team, agent, AgentAvoidance())[1] - PATH[1] for agent in (0, 1))
     assert first[0] < 0 < second[0]
 
 
@@ -80,7 +78,7 @@ def test_bad_numbers_are_refused(numbers):
 
 
 def test_four_behaviors_make_24_orders_and_10_commands():
-    """Orders that agree down to FM or FR are one command; OA and AA above it count in their order. The case study keeps six."""
+    """Orders equal down to the first of FM and FR are one command; above it OA and AA count in order. The case study has six."""
     orders = make_scenario("exchange").orders
     assert len(orders) == 24
     assert sorted(orders.commands) == sorted(
@@ -91,7 +89,7 @@ def test_four_behaviors_make_24_orders_and_10_commands():
 
 
 def test_tables_of_orders_do_not_explode():
-    """Six behaviors have 720 orders; a seventh is refused with what it would make."""
+    """Six behaviors have 720 orders; seven are refused, with the number of orders that they would have."""
     scenario = make_scenario("paper")
     more = tuple(AgentAvoidance(name=f"A{k}") for k in range(4))
     assert len(replace(scenario, behaviors=(*scenario.behaviors, *more[:3])).orders) == 720
@@ -101,7 +99,7 @@ def test_tables_of_orders_do_not_explode():
 
 @pytest.mark.parametrize("name", ["fsams", "fsams-hysteresis", "fms", "layered"])
 def test_it_removes_collisions(name):
-    """All paths cross in one place: without AA agents come within centimetres, with it they stay more than their bodies apart."""
+    """All paths cross in one place: without AA agents come closer than 0.5 m, with it they stay more than 1 m apart."""
     scenario = make_scenario("exchange", agents=6)
     without = replace(scenario, behaviors=scenario.behaviors[:3])
     closest = [
@@ -109,13 +107,13 @@ def test_it_removes_collisions(name):
     ]
     assert closest[0]["agent_distance_min"] < 0.5
     assert closest[1]["agent_distance_min"] > 1.0
-    if name != "layered":  # which projects nothing: agents that meet head-on stop each other
+    if name != "layered":  # it projects nothing: agents that meet head-on stop each other
         assert closest[1]["end_error"] < 0.5
 
 
 @pytest.mark.parametrize("name", ["fsams", "fms", "layered", "mpcms"])
 def test_supervisors_put_it_on_top_when_a_neighbor_is_too_close(name):
-    """And only then, and only of agents that are."""
+    """Only the two agents that are close to each other get AA on top, not the two that are far away."""
     scenario = make_scenario("open", agents=4, formation="line")
     supervisor, world = make_supervisor(name), World(scenario)
     near = (0.9 if name == "layered" else 0.9 * REACH) * scenario.behaviors[3].distance

@@ -1,4 +1,4 @@
-"""Ablations of the general policy: what a study of arms trains, flies and leaves."""
+"""Ablations of the general policy: the arms of the study, its trainings and missions, and the files that it writes."""
 
 import csv
 from pathlib import Path
@@ -13,7 +13,7 @@ from marlbc_mj.util.files import MANIFEST
 
 
 def test_every_arm_changes_what_it_says():
-    """One setting each, but MAPPO, which also pays nothing for switches; a family that is left out is named nowhere."""
+    """Each arm changes one setting, but MAPPO also drops the switch cost; without a family, all other families remain."""
     for name, arm in ARMS.items():
         config = GeneralConfig(**arm.changes)
         assert (config == GeneralConfig()) == (name == "full") and len(arm.changes) <= (2 if name == "mappo" else 1)
@@ -24,7 +24,7 @@ def test_every_arm_changes_what_it_says():
 
 @pytest.mark.usefixtures("coarse_figures")
 def test_a_study_trains_flies_and_reports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    """From the command line, with a small team: a line per training and mission, table and figure."""
+    """`marlbc arms` with a small team writes a table, a figure, and a CSV with a line per training and mission."""
     small = {"teams": ("wedge-4",), "families": ("gates",), "batch": 16, "updates": 1, "hidden": (8,), "capacity": 500}
     monkeypatch.setitem(ARMS, "no-pooling", ARMS["no-pooling"]._replace(changes={**ARMS["no-pooling"].changes, **small}))
     for name, value in (("MISSIONS", (("field", "wedge-4", "straight"),)), ("MARGINS", (0.05,)), ("TRIED", 1)):
@@ -41,7 +41,7 @@ def test_a_study_trains_flies_and_reports(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_the_margin_is_that_with_the_most_successes_and_of_those_with_the_greatest_return():
-    """Scores of two missions, by hand."""
+    """Checked on made-up scores of three margins on two missions."""
     tried = {
         margin: [
             ArmScore(mission, 8, count, 0, total, 1.0, margin) for mission, count, total in (("a", 8, 50.0), ("b", least, more))
@@ -52,7 +52,7 @@ def test_the_margin_is_that_with_the_most_successes_and_of_those_with_the_greate
 
 
 def test_shares_are_of_all_layouts_of_a_training():
-    """Two trainings of one arm on two missions, by hand."""
+    """Checked on made-up results of two trainings of one arm on two missions."""
     rows = [
         {"arm": "full", "seed": seed, "mission": mission, "layouts": 4, "succeeded": count, "violated": 1}
         for seed, mission, count in ((1, "a", 4), (1, "b", 2), (2, "a", 3), (2, "b", 0))

@@ -1,4 +1,4 @@
-"""Draws flown together: to the bit what each gives alone, and a draw that fails takes no other with it."""
+"""Draws flown together: each gives the same as alone, to the last bit, and a draw that fails does not affect the others."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,12 +25,12 @@ SEEDS = (70_000, 70_001, 3)
 
 
 def without_clock(metrics: Any) -> Any:
-    """All metrics but the time that decisions took."""
+    """All metrics except decision times."""
     return metrics["agents"], {key: value for key, value in metrics["team"].items() if key not in CLOCK}
 
 
 def alone(scenario: Scenario, supervisor: Any, seed: int, *, controller: str = "sorlc", shield: bool = False) -> Any:
-    """Metrics of one draw in a world of its own."""
+    """Metrics of one draw flown alone, without decision times."""
     world = World(scenario, make_controller(controller), record=True, shield=shield)
     return without_clock(measure(run_episode(world, supervisor, seed=seed)))
 
@@ -48,7 +48,7 @@ def alone(scenario: Scenario, supervisor: Any, seed: int, *, controller: str = "
     ],
 )
 def test_a_draw_gives_the_same_with_others_and_alone(mission: str, supervisor: str, composition: str, shield: bool) -> None:
-    """Every metric of every agent and of the team, and the instance, whatever else flies; the clock apart."""
+    """Together and alone, a draw has the same layout and the same metrics of agents and team, except decision times."""
     scenario = make_scenario(mission, duration=2.0)
     scenario = perturbed(scenario) if mission == "paper" else held_out(scenario)
     runs = evaluate_batch(scenario, SEEDS, supervisor, composition=composition, shield=shield)
@@ -64,7 +64,7 @@ def test_a_draw_gives_the_same_with_others_and_alone(mission: str, supervisor: s
 
 
 def test_groups_of_any_size_give_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seven draws, two at a time; progress is told for each."""
+    """Seven draws give the same all together and two at a time; progress is reported after each draw."""
     scenario = held_out(make_scenario("field", duration=1.0))
     told: list[tuple[str, float, float]] = []
     whole = evaluate_batch(scenario, range(7), "fsams", progress=lambda *step: told.append(step))
@@ -81,12 +81,12 @@ def test_the_number_of_draws_together_is_bounded_by_memory() -> None:
     assert draws_together(make_scenario("field")) == min(MOST_TOGETHER, int(RECORD_BYTES // each))
 
 
-# What fails ---------------------------------------------------------------------------------------------------------------------
+# Failures -----------------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Troubled:
-    """Constant FM; on the one draw whose first obstacle is at ``place``, trouble after a second."""
+    """Constant FM; on the one draw with its first obstacle at x = ``place`` [m], ``trouble`` begins after 1 s."""
 
     place: float
     trouble: str
@@ -104,7 +104,7 @@ class Troubled:
         if self.trouble == "NaN":
             velocity[troubled] = np.nan
         if self.trouble == "diverges":
-            velocity[troubled] = 9e8  # allowed, and more than a force without limit can follow
+            velocity[troubled] = 9e8  # allowed, but even a controller without a force limit cannot follow it
         return Blend(memory, velocity), memory
 
 
@@ -113,7 +113,7 @@ class Troubled:
     [("diverges", "t = 1.0"), ("raises", "no plan for"), ("slips", "KeyError: 'nothing'"), ("NaN", "must be finite")],
 )
 def test_a_draw_that_fails_leaves_the_others_as_they_are(trouble: str, reason: str) -> None:
-    """Whether a world diverges, or a supervisor does not say which team it failed for; the reason is that of the draw alone."""
+    """A world diverges, or a supervisor raises an error without naming a team; the reason is the same as for the draw alone."""
     scenario, controller = held_out(make_scenario("field", duration=2.0)), "finite-time"
     world = World(scenario)
     world.reset(SEEDS[1])
@@ -129,7 +129,7 @@ def test_a_draw_that_fails_leaves_the_others_as_they_are(trouble: str, reason: s
 
 @dataclass(frozen=True)
 class Fickle:
-    """A disc far away, for half of all layouts; for the others there is none."""
+    """One disc far away, for half of all draws; the other half have no valid layout."""
 
     def sample(self, rng: np.random.Generator) -> Sample:
         x = rng.uniform(-1.0, 1.0)
@@ -139,7 +139,7 @@ class Fickle:
 
 
 def test_draws_without_a_layout_are_named_and_the_others_flown() -> None:
-    """The draws with which worlds are made may be such, too."""
+    """Some of the draws that the worlds are constructed with have no layout either."""
     scenario = replace(make_scenario("open", duration=0.5), obstacles=((100.0, 100.0, 1.0),), layout=Fickle())
     assert _has_layout(scenario, 0) and not all(_has_layout(scenario, 0, world) for world in range(10))
     runs = evaluate_batch(scenario, range(10), "fixed")
@@ -157,7 +157,7 @@ def _has_layout(scenario: Scenario, seed: int, world: int = 0) -> bool:
 
 
 def test_what_cannot_run_at_all_is_said_of_every_draw() -> None:
-    """A law that the substep is too long for, and a supervisor without a schedule."""
+    """Two causes: a substep that is too long for the controller, and a supervisor without a schedule."""
     coarse = evaluate_batch(paper(duration=0.5, substep=0.025), (0, 1), "scripted", "pd")
     assert all("25 ms" in str(run.failure) and run.instance is None for run in coarse)
     field = evaluate_batch(held_out(make_scenario("field", duration=0.5)), (0, 1), "scripted")

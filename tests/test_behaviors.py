@@ -1,4 +1,4 @@
-"""Elementary behaviors (8)-(11): Jacobians by finite differences, closed forms, and what one-sided means."""
+"""Elementary behaviors (8)-(11): Jacobians against finite differences, closed forms, and one-sided avoidance."""
 
 import numpy as np
 import pytest
@@ -10,14 +10,14 @@ from marlbc_mj.core import laws
 from marlbc_mj.core.behaviors import Behavior, Formation, LineFormation, ObstacleAvoidance, nearest_obstacle
 from marlbc_mj.util.errors import ConfigurationError
 
-STEP = 1e-6  # of the finite differences [m]
+STEP = 1e-6  # step of the finite differences [m]
 
 coordinates = st.floats(-20.0, 20.0)
 points = arrays(np.float64, 2, elements=coordinates)
 paths = arrays(np.float64, (2, 2), elements=coordinates)
 obstacle_fields = arrays(
     np.float64, st.tuples(st.integers(1, 6), st.just(3)), elements=st.floats(0.0, 5.0)
-)  # (K, 3): a corner of the plane with discs, so that the nearest one changes often
+)  # (K, 3): discs crowded into a corner of the plane, so that the nearest one changes often
 
 
 def evaluate(behavior: Behavior, p, *, path=None, obstacles=None, agent=0):
@@ -50,7 +50,7 @@ def gaps(p, obstacles) -> np.ndarray:
 
 @given(points, obstacle_fields)
 def test_avoidance_jacobian_is_the_gradient_of_the_clearance(p, obstacles):
-    """J_OA = d rho_OA / d p with rho_OA the clearance (9), wherever the nearest obstacle is unique and not reached."""
+    """J_OA = d rho_OA / d p with rho_OA the clearance (9), away from its center and from ties of nearest obstacles."""
     ordered = np.sort(gaps(p, obstacles))
     assume(len(ordered) == 1 or ordered[1] - ordered[0] > 1e-3)
     assume(np.linalg.norm(p - obstacles[:, :2], axis=1).min() > 0.05)
@@ -61,7 +61,7 @@ def test_avoidance_jacobian_is_the_gradient_of_the_clearance(p, obstacles):
 
 @given(points, obstacle_fields)
 def test_clearance_is_the_smallest_distance_to_a_surface_and_the_normal_points_outwards(p, obstacles):
-    """d = min(|p - o| - r) (erratum 7), n is a unit vector, and one step along n gains exactly that step of clearance."""
+    """d = min(|p - o| - r) (erratum 7), n is a unit vector, and 1 m along n leads 1 m away from the obstacle."""
     clearance, normal = clearance_of(p, obstacles)
     assert clearance == pytest.approx(gaps(p, obstacles).min(), abs=1e-12)
     assert np.linalg.norm(normal) == pytest.approx(1.0, abs=1e-12)
@@ -107,14 +107,14 @@ def test_two_sided_avoidance_attracts_from_beyond(p, obstacles):
 
 @pytest.mark.parametrize("two_sided", [False, True])
 def test_without_obstacles_avoidance_asks_for_nothing(two_sided):
-    """An empty field: infinite clearance, no velocity, a Jacobian without direction, so that nothing is projected away."""
+    """Without obstacles the clearance is infinite; velocity and Jacobian are zero, so that nothing is projected away."""
     assert clearance_of((1.0, 2.0), np.zeros((0, 3)))[0] == np.inf
     velocity, jacobian = evaluate(ObstacleAvoidance(two_sided=two_sided), (1.0, 2.0))
     assert not velocity.any() and not jacobian.any()
 
 
 def test_at_the_centre_of_an_obstacle_there_still_is_a_way_out():
-    """No direction is defined there; (1, 0) is taken, and the velocity is finite and pushes out."""
+    """The normal is not defined there; (1, 0) is used, and the velocity is finite and points along it."""
     clearance, normal = clearance_of((60.0, 9.0), [(60, 9, 5)])
     assert clearance == -5.0 and normal.tolist() == [1.0, 0.0]
     velocity, _ = evaluate(ObstacleAvoidance(), (60.0, 9.0), obstacles=np.array([[60.0, 9.0, 5.0]]))
@@ -136,7 +136,7 @@ def test_formation_is_the_closed_loop_of_its_own_task_variable(p, path, offsets,
 
 
 def test_on_its_slot_an_agent_moves_with_the_path():
-    """No lag: the feed-forward is the path's velocity alone (erratum 3)."""
+    """On its slot, v is the path's velocity, so that the agent does not lag (erratum 3)."""
     velocity, _ = evaluate(Formation("FM", ((2.5, 6.0),)), (12.5, 6.0), path=np.array([[10.0, 0.0], [1.0, 0.0]]))
     assert velocity.tolist() == [1.0, 0.0]
 
@@ -147,20 +147,20 @@ def test_on_its_slot_an_agent_moves_with_the_path():
     [lambda x: ObstacleAvoidance(gain=x), lambda x: ObstacleAvoidance(safe_distance=x), lambda x: Formation("FM", ((0, 0),), x)],
 )
 def test_numbers_that_are_not_positive_and_finite_are_refused(make, value):
-    """Gains and safe distance; the message names the value."""
+    """This holds for gains and the safe distance; the message shows the value."""
     with pytest.raises(ConfigurationError, match=str(value)):
         make(value)
 
 
 def test_offsets_that_are_not_finite_are_refused():
-    """The message shows them."""
+    """The message shows the offsets."""
     with pytest.raises(ConfigurationError, match="nan"):
         Formation("FM", ((0.0, np.nan),))
 
 
 @given(points, paths, points)
 def test_along_the_line_of_a_slot_only_near_that_line(p, path, slot):
-    """Across the path it is FR. Along the path it is FR on the line, between 0 and FR near it, and 0 from the width on."""
+    """Across the path it equals FR. Relative to the path's motion, it is FR on the line, less near it, 0 from ``width`` on."""
     assume(np.linalg.norm(path[1]) > 1e-3)
     along = path[1] / np.linalg.norm(path[1])
     across = np.array([-along[1], along[0]])

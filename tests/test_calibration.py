@@ -1,4 +1,4 @@
-"""The rivals' velocity gains come from Table 6's maxima: the search finds them again."""
+"""The search finds the velocity gains of the baselines again, which come from the maxima in Table 6."""
 
 from dataclasses import replace
 
@@ -16,7 +16,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 @pytest.fixture(scope="module")
 def switch() -> Scenario:
-    """Half a second into the formation, the column; the maxima occur there (see test_maxima_occur_at_the_switch)."""
+    """A switch to the column after 0.5 s in formation; the maxima occur there (see test_maxima_occur_at_the_switch)."""
     starts = tuple((x - 2.5, y) for x, y in SLOTS)
     return paper(starts=starts, duration=1.0, schedule=(Window(0.5, 2.0, -1, "FR"),))
 
@@ -27,7 +27,7 @@ def result(request: pytest.FixtureRequest, switch: Scenario) -> Calibration:
 
 
 def test_search_finds_the_published_maximum(result: Calibration) -> None:
-    """The largest maximum is the published one, within the tolerance; found gain and default differ by less than 1 %."""
+    """The largest maximum is the published one, within the tolerance; the found and the shipped gain differ by less than 1 %."""
     assert max(result.at_found) == pytest.approx(max(result.published), rel=1e-4)
     assert result.found == pytest.approx(result.shipped, rel=0.01)
     assert result.shipped == CALIBRATED[result.controller].velocity_gain
@@ -35,7 +35,7 @@ def test_search_finds_the_published_maximum(result: Calibration) -> None:
 
 
 def test_one_gain_explains_all_agents_but_one(result: Calibration) -> None:
-    """Every other maximum is within half a percent of the published one, too; agent 2's under fixed-time is not."""
+    """All maxima are within half a percent of the published ones, except that of agent 2 under fixed-time."""
     exceptions = {"finite-time": set(), "fixed-time": {1}}[result.controller]
     for errors in (result.errors, result.shipped_errors):
         assert {agent for agent, error in enumerate(errors) if abs(error) > 0.005} == exceptions
@@ -43,12 +43,12 @@ def test_one_gain_explains_all_agents_but_one(result: Calibration) -> None:
 
 @pytest.mark.parametrize("name", list(CALIBRATED))
 def test_maxima_occur_at_the_switch(name: str, switch: Scenario) -> None:
-    """The whole case study has the maxima of the short scenario, to a thousandth."""
+    """The whole case study and the short scenario have the same maxima, to a relative 1e-3."""
     np.testing.assert_allclose(maxima(CALIBRATED[name], paper()), maxima(CALIBRATED[name], switch), rtol=1e-3)
 
 
 def test_shipped_gains_are_the_registered_ones() -> None:
-    """The calibrated laws are those that `--controllers` offers, with published maxima to compare with."""
+    """The calibrated laws are the registered controllers, and there are published maxima for each."""
     for name, law in CALIBRATED.items():
         assert make_controller(name) == law
         assert name in PUBLISHED_INPUT_MAX.values
@@ -64,7 +64,7 @@ def test_wrong_requests_are_refused(switch: Scenario) -> None:
 
 
 def test_command_prints_the_table(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, switch: Scenario) -> None:
-    """Published, found and shipped row of each controller; an unknown controller is one line."""
+    """The table has three rows per controller: published, found, shipped. An unknown controller gives a one-line error."""
     monkeypatch.setattr("marlbc_mj.studies.calibration.paper", lambda: switch)
     main(["calibrate", "--controllers", "fixed-time"])
     lines = capsys.readouterr().out.splitlines()

@@ -1,4 +1,4 @@
-"""The grid: whatever the points, it says what trying them all says, to the last bit, and so do missions that use it."""
+"""The grid gives the same result as trying all points, to the last bit, for any points and in whole missions."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def filled(points: np.ndarray) -> np.ndarray:
 
 
 def by_definition(p: np.ndarray, points: np.ndarray, own: int) -> int:
-    """The first index of the least gap."""
+    """Index of the least gap, the lowest on ties, without the point ``own``; -1 if there is no other point."""
     gaps = np.sqrt((p[0] - points[:, 0]) ** 2 + (p[1] - points[:, 1]) ** 2)
     if points.shape[1] > 2:
         gaps = gaps - points[:, 2]
@@ -36,7 +36,7 @@ def by_definition(p: np.ndarray, points: np.ndarray, own: int) -> int:
 @settings(deadline=None, max_examples=60)
 @given(POINTS, arrays(np.float64, 2, elements=COORDINATE))
 def test_the_nearest_point_is_that_of_the_definition(points, p):
-    """From anywhere, with points that coincide, lie on a line, or are a world apart; the first of equals."""
+    """Query points are anywhere; points may coincide, lie on a line or be far apart; on ties the lowest index counts."""
     grid = filled(points)
     assert nearest(p, points, grid, -1) == by_definition(p, points, -1)
     for own in range(len(points)):
@@ -46,7 +46,7 @@ def test_the_nearest_point_is_that_of_the_definition(points, p):
 @settings(deadline=None, max_examples=60)
 @given(POINTS, st.integers(0, 2**31))
 def test_the_nearest_disc_gives_the_clearance_of_all(points, seed):
-    """Radii from 0 to larger than the spread of the middles."""
+    """Radii range from 0 to more than the spread of the centers."""
     rng = np.random.default_rng(seed)
     discs = np.ascontiguousarray(np.column_stack([points, rng.exponential(rng.choice([0.1, 10.0, 1e4]), len(points))]))
     grid = filled(discs)
@@ -61,7 +61,7 @@ def test_the_nearest_disc_gives_the_clearance_of_all(points, seed):
 @settings(deadline=None, max_examples=30)
 @given(st.integers(0, 2**31), st.floats(0.01, 1e6))
 def test_spacing_is_the_distance_to_the_nearest_other(seed, scale):
-    """Of a team large enough for a grid."""
+    """Checked for a team that is large enough for a grid."""
     positions = np.random.default_rng(seed).normal(0, scale, (3, 70, 2)).round(2)
     apart = np.sqrt(((positions[:, :, None] - positions[:, None]) ** 2).sum(-1))
     apart[:, range(70), range(70)] = np.inf
@@ -70,7 +70,7 @@ def test_spacing_is_the_distance_to_the_nearest_other(seed, scale):
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e300])
 def test_numbers_that_are_not_finite_do_not_go_into_a_grid(bad):
-    """All points are tried then, what is not finite being nearest to nothing; nor does a query that is not find anything."""
+    """All points are then tried, and a bad point is nearest to nothing; a query from a bad position finds no point."""
     points = np.random.default_rng(0).uniform(0, 1, (40, 2))
     points[7, 1] = bad
     grid = filled(points)
@@ -80,7 +80,7 @@ def test_numbers_that_are_not_finite_do_not_go_into_a_grid(bad):
 
 
 def test_a_query_from_far_away_is_answered():
-    """Where cells of a small team no longer tell anything."""
+    """The query is so far away that the grid's cells no longer help."""
     points = np.random.default_rng(0).uniform(0, 1, (100, 2))
     for far in (10.0, 2.0 * FARTHEST):
         p = np.array([far, -far])
@@ -94,7 +94,7 @@ def crowd(agents: int) -> Scenario:
 
 @pytest.mark.parametrize("name", ["field", "traffic"])
 def test_a_mission_with_grids_is_the_same_mission(name, monkeypatch):
-    """Every order, obstacles at rest and moving: bit for bit the mission in which all pairs are tried."""
+    """With and without grids a mission is identical to the last bit, for random orders and obstacles at rest or moving."""
     scenario = crowd(16) if name == "field" else make_scenario(name, duration=20.0)
     without = World(scenario)
     assert without.plan.grid_room == 0
@@ -108,6 +108,6 @@ def test_a_mission_with_grids_is_the_same_mission(name, monkeypatch):
 
 
 def test_large_teams_use_grids_and_the_case_study_does_not():
-    """The threshold, seen from outside."""
+    """The threshold lies between the case study and 64 agents among 64 obstacles."""
     assert World(make_scenario("paper")).plan.grid_room == 0
     assert World(crowd(64)).plan.grid_room > 0

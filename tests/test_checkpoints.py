@@ -1,4 +1,4 @@
-"""Policy checkpoints: what is in them is what was written, and what cannot be used is refused with one line."""
+"""Policy checkpoints are read back as they were written; unusable ones are refused with a one-line error."""
 
 import itertools
 import json
@@ -51,7 +51,7 @@ def test_a_policy_is_read_as_it_was_written(tmp_path):
 
 @pytest.mark.parametrize("folded", [False, True])
 def test_a_changed_bit_is_refused_anywhere(tmp_path, folded):
-    """In the arrays, in what the header says of them, and in how it is spelled."""
+    """The bit may be in the arrays or in the header, even if it only changes a letter's case (``folded``)."""
     path = tmp_path / "p.safetensors"
     write_arrays(
         path, {"x": np.arange(3, dtype=np.float32)}, {"margin": 1e-7, "name": "\u00e9", "rows": [1.5e300, -2, True, None]}
@@ -137,7 +137,7 @@ def test_descriptions_of_another_kind_are_named(description, fragment, tmp_path)
 
 
 def test_a_signature_says_all_or_it_is_refused(tmp_path):
-    """Without any one entry it is not a signature."""
+    """Each entry of the signature is required."""
     whole = signed()["signature"]
     for name in whole:
         path = tmp_path / "p.safetensors"
@@ -162,7 +162,7 @@ def test_what_a_policy_depends_on_must_be_the_same(changes, name, tmp_path):
 
 
 def test_what_a_policy_copes_with_is_free(tmp_path):
-    """Obstacles, starts, drag and duration."""
+    """Obstacles, starts, drag and duration may differ from those of training."""
     write_policy(tmp_path / "p.safetensors", policy_of(), signed())
     learned = Learned.load(tmp_path / "p.safetensors")
     for changes in ({"obstacles": ((5.0, 0.0, 1.0),)}, {"perturbation": Perturbation(1.0, 0.5, (0.0, 5.0))}, {"duration": 20.0}):

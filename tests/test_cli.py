@@ -1,4 +1,4 @@
-"""The command line as a newcomer meets it: what it writes, and one clear line for everything that cannot be done."""
+"""The command line: the files that commands write, and one clear line for everything that cannot be done."""
 
 import json
 import os
@@ -31,7 +31,7 @@ SHORT = ("--duration", "1.0")
 
 
 def refused(arguments: list[str], capsys: pytest.CaptureFixture[str], status: int = 2) -> str:
-    """Run a command that must fail with ``status``; returns its one line."""
+    """Run a command that must fail with ``status``, and return its one line on standard error."""
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == status
@@ -50,7 +50,7 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_bench_leaves_what_it_promises(results: Path) -> None:
-    """Every file of the run directory is there, and nothing else beside it."""
+    """The output folder has exactly the expected files, and there is nothing next to it."""
     names = {p.name for p in results.iterdir()}
     files = {MANIFEST, "config.json", "summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"}
     assert names == files | {"figures", "logs", "video"}
@@ -61,7 +61,7 @@ def test_bench_leaves_what_it_promises(results: Path) -> None:
 
 
 def test_summary_and_config_hold_what_the_design_fixes(results: Path) -> None:
-    """Keys of summary.json by method, agent and team; config.json names versions, CPU, revision and seed."""
+    """summary.json has all keys per method, agent and team; config.json has versions, CPU, revision, seed and settings."""
     summary = json.loads((results / "summary.json").read_text())
     assert (summary["schema"], summary["scenario"]) == (1, "paper")
     for method in summary["methods"].values():
@@ -74,7 +74,7 @@ def test_summary_and_config_hold_what_the_design_fixes(results: Path) -> None:
 
 
 def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder with something in it is refused, and left as it is, unless --overwrite says so."""
+    """A folder that is not empty is refused and left unchanged, except with --overwrite."""
     before = (results / "summary.json").read_bytes()
     line = refused(["bench", "paper", "--out", str(results), *SHORT], capsys)
     assert str(results) in line
@@ -120,7 +120,7 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
 def test_wrong_settings_are_one_line(
     arguments: list[str], fragments: tuple[str, ...], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    """Each is named together with what would be right, with exit status 2 and nothing written."""
+    """The line names the wrong value and the valid ones; the exit status is 2, and nothing is written."""
     out = [] if arguments[0] == "perf" else ["--out", str(tmp_path / "out")]
     line = refused([*arguments, *out], capsys)
     assert all(fragment in line for fragment in fragments), line
@@ -128,7 +128,7 @@ def test_wrong_settings_are_one_line(
 
 
 def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    """A drag that nothing can hold: `run` stops with where it happened; `bench` reports it beside the methods that ran."""
+    """If the drag is too strong, `run` stops and reports agent and time, and `bench` reports them in the method's row."""
     line = refused(["run", "--drag-scale", "20", "--duration", "5", "--out", str(tmp_path / "run")], capsys, status=3)
     assert "agent 1, t = 1.31" in line
     quick = [
@@ -149,7 +149,7 @@ def test_a_failed_run_is_status_3_and_a_failed_method_a_row(capsys: pytest.Captu
 
 
 def test_the_matrix_is_all_supervisors_and_all_controllers() -> None:
-    """Each once, the video's method first; names make a cross product, and what is not named is sorlc or scripted."""
+    """Each method once, that of the video first; named ones are all combined, with sorlc or scripted if one kind is not named."""
     methods, usual = matrix(), set(SUPERVISORS) - set(ON_REQUEST)
     assert methods[0] == ("scripted", "sorlc") and len(set(methods)) == len(methods) == len(usual) + len(CONTROLLERS) - 1
     assert {s for s, c in methods if c == "sorlc"} == usual
@@ -160,7 +160,7 @@ def test_the_matrix_is_all_supervisors_and_all_controllers() -> None:
 
 
 def test_some_supervisors_run_only_where_they_are_named() -> None:
-    """MPCMS that simulates its candidates takes minutes an episode: no part of the default matrix."""
+    """MPCMS that simulates its candidates is not in the default matrix, as it takes minutes per episode."""
     assert "mpcms-mujoco" in ON_REQUEST and not set(ON_REQUEST) & {s for s, _ in matrix()}
     assert matrix(("mpcms", "mpcms-mujoco")) == [("mpcms", "sorlc"), ("mpcms-mujoco", "sorlc")]
     slow = make_supervisor("mpcms-mujoco")
@@ -170,7 +170,7 @@ def test_some_supervisors_run_only_where_they_are_named() -> None:
 
 @pytest.mark.parametrize("seeds", [[], ["--seeds", "2"]], ids=["one", "seeds"])
 def test_a_method_that_cannot_start_is_a_row(seeds: list[str], tmp_path: Path) -> None:
-    """The oracle has no schedule for this mission: the others are reported beside its reason."""
+    """The oracle has no schedule for this mission: its row has the reason, and the other methods have results."""
     quick = ["--supervisors", "scripted", "oracle", "--controllers", "pd", "--video", "none", "--no-figures", "--no-logs"]
     main(["bench", *quick, "--out", str(tmp_path / "out"), *seeds, *SHORT])
     methods = json.loads((tmp_path / "out" / "summary.json").read_text())["methods"]
@@ -180,7 +180,7 @@ def test_a_method_that_cannot_start_is_a_row(seeds: list[str], tmp_path: Path) -
 
 
 def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
-    """The share of its solver's time in all decisions, nothing where the memory says nothing; one start serves one episode."""
+    """It reads the solver's share of decision times, None if the memory has none; its own start serves one episode."""
     starts = []
 
     class Memory(NamedTuple):
@@ -200,12 +200,12 @@ def test_a_stopwatch_reads_what_a_supervisor_tells() -> None:
         _, memory = watch.decide(None, memory)  # type: ignore[arg-type]
     assert watch.share(np.array([4.0, 8.0])) == 0.5 and len(starts) == 1
     watch.start(paper(), 1)
-    assert len(starts) == 2  # another episode has a memory of its own
+    assert len(starts) == 2  # another episode has its own memory
     assert Stopwatch(make_supervisor("scripted"), paper()).share(np.ones(2)) is None
 
 
 def test_a_run_assembles_no_model_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One world, and one start of a supervisor that predicts with a plan of its own; the log takes the world's model."""
+    """A run makes one World and starts the supervisor once, and the log uses the model of the World."""
     made: list[str] = []
     for kind, method in ((World, "__init__"), (MPCMS, "start")):
         original = getattr(kind, method)
@@ -221,7 +221,7 @@ def test_a_run_assembles_no_model_twice(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:
-    """`bench --seeds` writes every method's draws, and medians with their intervals, and no log."""
+    """`bench --seeds` writes all draws of each method, and medians with intervals, but no logs."""
     quick = ["--supervisors", "scripted", "fsams", "--controllers", "pd", "--seeds", "3", "--no-figures"]
     main(["bench", *quick, "--out", str(tmp_path / "out"), "--duration", "2.0"])
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -233,7 +233,7 @@ def test_seeds_leave_medians_and_intervals(tmp_path: Path) -> None:
 
 
 def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """And the log's commands: info, export, video; a truncated log is one line, and recover brings it back."""
+    """The log works with info, export and video. A truncated log is refused in one line until `recover` repairs it."""
     out = tmp_path / "run"
     main(["run", "--out", str(out), *SHORT])
     capsys.readouterr()
@@ -258,7 +258,7 @@ def test_run_leaves_log_metrics_and_config(tmp_path: Path, capsys: pytest.Captur
 
 
 def test_json_is_one_document_and_quiet_is_silent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """On standard output; what the user should know goes to standard error, unless the command is quiet."""
+    """With --json, standard output is one document and notes go to standard error; with --quiet there is no output."""
     line = ["run", "paper", "--controller", "pd", *SHORT, "--seed", "3", "--out", str(tmp_path / "run")]
     main([*line, "--json"])
     said = capsys.readouterr()
@@ -274,7 +274,7 @@ def test_json_is_one_document_and_quiet_is_silent(tmp_path: Path, capsys: pytest
 
 
 def test_a_team_and_a_robot_of_another_kind(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Wherever a scenario is changed; a scenario with a team of its own says so."""
+    """They can be set by options and in files; a scenario with a fixed team refuses them and says why."""
     options = ScenarioOptions(agents=6, formation="circle", robot="omni")
     scenario, scale = options.build("field"), make_robot("omni").scale()
     assert scenario.agents == 6 and "circle" in scenario.description
@@ -286,27 +286,27 @@ def test_a_team_and_a_robot_of_another_kind(tmp_path: Path, capsys: pytest.Captu
 
 
 def test_what_a_scenario_draws() -> None:
-    """Starts, obstacles, drag, layouts, noise or lost messages; the published mission has none of these."""
+    """A scenario can draw starts, obstacles, drag, layouts, noise or lost messages; the published mission draws nothing."""
     assert not paper().draws and make_scenario("field").draws and paper(perturbation=Perturbation(start_spread=1.0)).draws
     for setting in ("imperfections.position_noise=0.1", "communication.loss=0.2"):
         assert ScenarioOptions(set=(setting,)).build("paper").draws
 
 
 def test_unwritable_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder inside a file cannot be made: one line names it."""
+    """A folder inside a file cannot be created; one line names it."""
     (tmp_path / "file").touch()
     assert "file" in refused(["bench", "--out", str(tmp_path / "file" / "out"), *SHORT], capsys)
 
 
 def test_view_without_a_display(results: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """It says so, and what to use instead."""
+    """`view` fails with one line that names the command to use instead."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     assert "marlbc video" in refused(["view", str(results / "logs" / "scripted+pd.mcap")], capsys)
 
 
 def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
-    """Every registry's names, each with a description."""
+    """`list` prints the names of all registries, each with a description."""
     main(["list"])
     text = capsys.readouterr().out
     for name in ("paper", "fsams-hysteresis", "sorlc-scaled", "finite-time-limited", "actual", "quadratic", "point_mass"):
@@ -317,7 +317,7 @@ def test_list_names_everything(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_broken_gl_loses_the_video_and_nothing_else(tmp_path: Path) -> None:
-    """With a MUJOCO_GL that is no backend, `bench` still writes all results; `video` says what to set."""
+    """If MUJOCO_GL is not a backend, `bench` still writes all other results, and `video` fails with the valid values."""
     environment = {**os.environ, "MUJOCO_GL": "nothing"}
     quick = ["--supervisors", "scripted", "--controllers", "pd", "--no-figures", "--duration", "0.5"]
     command = [sys.executable, "-m", "marlbc_mj", "bench", *quick, "--out", str(tmp_path / "out")]

@@ -1,4 +1,4 @@
-"""The communication layer, by property: over random graphs, losses, delays and silences."""
+"""Properties of the communication layer over random graphs, losses, delays and silent agents."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from marlbc_mj.supervisors.communication import Consensus, Flooding, Layer, Radi
 from marlbc_mj.util.errors import ConfigurationError
 
 STEP = 0.05
-ROOM = 10.0  # side of the square that agents are in [m]
+ROOM = 10.0  # side of the square that the agents are in [m]
 
 teams = st.integers(2, 7).flatmap(
     lambda agents: st.lists(st.tuples(st.floats(0, ROOM), st.floats(0, ROOM)), min_size=agents, max_size=agents)
@@ -28,7 +28,7 @@ def layer_of(agents: int, **settings) -> Layer:
 
 
 def distances(link: np.ndarray) -> np.ndarray:
-    """(N, N) hops between agents of a graph (N, N); infinite between its components."""
+    """(N, N) number of hops between agents of a graph (N, N); infinite between components."""
     agents = len(link)
     hops = np.where(np.eye(agents, dtype=bool), 0.0, np.where(link, 1.0, np.inf))
     for k in range(agents):
@@ -37,7 +37,7 @@ def distances(link: np.ndarray) -> np.ndarray:
 
 
 def talk(layer, position, messages, seed=None, first: int = 0):
-    """Exchange at every mission step: ``position`` (T, B, N, 2), ``messages`` (T, B, N, M); all knowledge, and the memory."""
+    """Exchange ``messages`` (T, B, N, M) at ``position`` (T, B, N, 2) for T mission steps; return all knowledge, and memory."""
     memory = layer.start(position.shape[1], messages.shape[3])
     known = []
     for k, (where, said) in enumerate(zip(position, messages, strict=True)):
@@ -47,7 +47,7 @@ def talk(layer, position, messages, seed=None, first: int = 0):
 
 
 def wandering(rng, steps: int, worlds: int, agents: int, size: int = 2):
-    """Agents that move, and messages that change."""
+    """Random positions of moving agents, and random messages."""
     position = np.cumsum(rng.normal(0, 0.3, (steps, worlds, agents, 2)), axis=0) + rng.uniform(0, ROOM, (worlds, agents, 2))
     return position, rng.normal(size=(steps, worlds, agents, size))
 
@@ -57,7 +57,7 @@ def wandering(rng, steps: int, worlds: int, agents: int, size: int = 2):
 
 @given(teams, reaches, st.integers(1, 3), st.integers(0, 3))
 def test_flooding_reaches_one_hop_further_with_every_period(points, reach, period, delay):
-    """An entry h hops away is as old as h hops take; after as many periods as the diameter, everyone knows its component."""
+    """An entry from h hops away is as old as h hops take; in the end every agent knows all of its component."""
     place = np.array(points)
     agents = len(place)
     hops = distances(within_range(place[None], reach)[0])
@@ -66,7 +66,7 @@ def test_flooding_reaches_one_hop_further_with_every_period(points, reach, perio
     steps = max(1, diameter * max(period, delay)) + period
     layer = layer_of(agents, range=reach, period=period * STEP, delay=delay * STEP)
     position = np.broadcast_to(place, (steps, 1, agents, 2))
-    said = np.arange(steps)[:, None, None, None] + 100.0 * np.arange(agents)[None, None, :, None]  # when, and by whom
+    said = np.arange(steps)[:, None, None, None] + 100.0 * np.arange(agents)[None, None, :, None]  # encodes time and sender
     for k, (heard, stamp) in enumerate(talk(layer, position, said)[0]):
         last = k - k % period  # the last broadcast
         sent = np.where(hops == 0, k, k - hops * delay if delay else last - (hops - 1) * period)
@@ -80,7 +80,7 @@ def test_flooding_reaches_one_hop_further_with_every_period(points, reach, perio
 
 @given(st.integers(0, 2**31), st.integers(2, 6), reaches, st.integers(0, 3), st.floats(0, 0.9))
 def test_stamps_never_go_backwards_and_are_those_of_what_is_heard(seed, agents, reach, delay, loss):
-    """While agents move, messages are lost and one agent falls silent."""
+    """Checked while agents move, messages are lost and one agent falls silent."""
     layer = layer_of(agents, range=reach, delay=delay * STEP, loss=loss, silent=(0,), silent_from=0.4)
     position, said = wandering(np.random.default_rng(seed), 20, 1, agents)
     before = np.full((1, agents, agents), -np.inf)
@@ -93,7 +93,7 @@ def test_stamps_never_go_backwards_and_are_those_of_what_is_heard(seed, agents, 
 
 @given(st.integers(0, 2**31), st.integers(2, 6))
 def test_ideal_is_the_limit_of_infinite_range_without_delay_and_loss(seed, agents):
-    """To the bit, while everything changes; everyone knows what everyone says now."""
+    """Both are equal to the last bit while agents move: every agent knows the current message of every other."""
     position, said = wandering(np.random.default_rng(seed), 5, 2, agents)
     ideal, far = (talk(layer_of(agents, range=reach), position, said)[0] for reach in (np.inf, 1e9))
     for k, (one, other) in enumerate(zip(ideal, far, strict=True)):
@@ -105,7 +105,7 @@ def test_ideal_is_the_limit_of_infinite_range_without_delay_and_loss(seed, agent
 
 @given(teams, reaches, st.sampled_from(["flooding", "consensus"]), st.floats(0, 0.5))
 def test_components_never_hear_each_other(points, reach, protocol, loss):
-    """Whatever the others say, what an agent knows is the same."""
+    """An agent's knowledge does not depend on messages from other components."""
     place = np.array(points)
     agents = len(place)
     part = components(within_range(place[None], reach))[0]
@@ -120,7 +120,7 @@ def test_components_never_hear_each_other(points, reach, protocol, loss):
 
 
 def test_a_silent_agent_hears_and_is_not_heard():
-    """From its time on; its last message goes on being known, and older."""
+    """From ``silent_from`` on, the others keep its last message, whose age grows."""
     layer = layer_of(3, range=100.0, silent=(1,), silent_from=0.2)
     position = np.zeros((10, 1, 3, 2))
     known, memory = talk(layer, position, np.arange(30.0).reshape(10, 1, 3, 1))
@@ -136,7 +136,7 @@ def test_a_silent_agent_hears_and_is_not_heard():
 
 @given(st.integers(0, 2**31), st.integers(2, 6), reaches, st.integers(0, 3), st.floats(0, 0.9))
 def test_consensus_conserves_the_sum_whatever_is_lost(seed, agents, reach, delay, loss):
-    """While agents move, messages change and are lost, and one agent falls silent."""
+    """Checked while agents move, messages change or are lost, and one agent falls silent."""
     layer = layer_of(agents, protocol="consensus", range=reach, delay=delay * STEP, loss=loss, silent=(0,), silent_from=0.4)
     position, said = wandering(np.random.default_rng(seed), 20, 1, agents)
     for (heard, _), now in zip(talk(layer, position, said, np.array([seed]))[0], said, strict=True):
@@ -171,12 +171,12 @@ def test_a_round_of_consensus_is_metropolis_weights_by_hand():
     np.testing.assert_allclose(heard[0, :, 0, 0], [2.0 + 1.0, 5.0, 8.0 - 1.0])
 
 
-# Both ---------------------------------------------------------------------------------------------------------------------------
+# Both protocols -----------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("protocol", ["flooding", "consensus"])
 def test_a_team_is_the_same_in_any_batch_and_when_it_begins_anew(protocol):
-    """Bit for bit: losses are the seed's, and what was known is forgotten."""
+    """Losses depend only on the seed and the time, and a new episode forgets all knowledge; checked to the last bit."""
     layer = layer_of(4, protocol=protocol, range=6.0, delay=0.1, loss=0.4)
     position, said = wandering(np.random.default_rng(1), 15, 3, 4)
     seeds = np.array([5, 6, 5])
@@ -193,7 +193,7 @@ def test_a_team_is_the_same_in_any_batch_and_when_it_begins_anew(protocol):
 
 
 def test_losses_have_their_share_and_are_independent():
-    """Of the seed, the mission step and the direction."""
+    """Losses are independent between seeds, mission steps and directions."""
     numbers = uniform(np.arange(20), np.full(20, 3), np.arange(1000))
     assert numbers.shape == (20, 1000) and numbers.min() >= 0.0 and numbers.max() < 1.0
     assert abs(numbers.mean() - 0.5) < 0.01 and abs((numbers < 0.2).mean() - 0.2) < 0.01
@@ -242,7 +242,7 @@ def test_a_range_that_leaves_two_parts_names_them():
 
 
 def test_a_file_and_a_family_set_it(tmp_path):
-    """As a table; a scenario without it is ideal."""
+    """A scenario file has it as a table; without one, communication is ideal."""
     (tmp_path / "a.toml").write_text(
         'family = "gates"\n[communication]\nrange = 8\ndelay = 0.1\nloss = 0.2\nsilent = [2]\nsilent_from = 10.0\n'
     )

@@ -1,4 +1,4 @@
-"""Teams that talk, in whole missions: the distributed look-ahead, its logs and pictures, and the study of what it costs."""
+"""Communication in whole missions: the distributed look-ahead, logs and pictures of links, and the study of networks."""
 
 import json
 from dataclasses import fields, replace
@@ -14,7 +14,7 @@ from marlbc_mj.controllers import PD
 from marlbc_mj.core.communication import Communication
 from marlbc_mj.engine.world import World
 from marlbc_mj.episode import Trajectory, run_episode
-from marlbc_mj.recording.links import CLEAREST, FAINTEST, HALF_LIFE, MOST_LINKS, drawn_links
+from marlbc_mj.recording.links import HALF_LIFE, MAX_OPACITY, MIN_OPACITY, MOST_LINKS, drawn_links
 from marlbc_mj.recording.log import EpisodeLog, from_trajectory
 from marlbc_mj.recording.reader import read_log
 from marlbc_mj.recording.schemas import COMMUNICATION, decode_hearing, encode_hearing
@@ -37,7 +37,7 @@ def gates(**changes) -> Scenario:
 
 
 def orders_of(supervisor, scenario: Scenario, steps: int, worlds: int = 1) -> np.ndarray:
-    """(T, B, N) under the supervisor itself."""
+    """Orders (T, B, N) that a supervisor gives in the mission that it flies."""
     world, given = World(scenario, worlds=worlds), []
     observation, memory = world.reset(3), supervisor.start(scenario, worlds)
     for _ in range(steps):
@@ -55,9 +55,9 @@ def orders_of(supervisor, scenario: Scenario, steps: int, worlds: int = 1) -> np
     [("gates", "set-based", 400), ("field", "null-space", 300), ("corridor", "null-space", 850)],
 )
 def test_with_ideal_communication_it_is_the_central_rule(family, composition, steps):
-    """Order for order, also by flooding over a range that reaches everyone at once.
+    """All orders are equal, with ideal communication and with flooding over a range that reaches all agents at once.
 
-    Without the two conditions of null-space other orders are given from step 178 of the field and 787 of the corridor on.
+    Without the two extra conditions of null-space, orders would differ from step 178 of the field and 787 of the corridor on.
     """
     scenario = make_scenario(family, composition=composition)
     central = orders_of(LookAhead(), scenario, steps)
@@ -78,10 +78,10 @@ def test_poor_communication_changes_decisions_and_no_team_depends_on_the_batch()
         ([0, 1, 1, 0], [0, 0, 0, 0], True),
         ([0, 1, 0, 0], [0, 0, 0, 0], False),
         ([0, 1, 1, 0], [0, 0, 2.0, 0], True),
-        ([0, 1, 1, 0], [0, 0, 2.1, 0], False),  # what is older than 2 s does not count
-        ([1, 0, 0, 0], [0, np.inf, np.inf, np.inf], True),  # alone, by its own lane
+        ([0, 1, 1, 0], [0, 0, 2.1, 0], False),  # votes older than 2 s do not count
+        ([1, 0, 0, 0], [0, np.inf, np.inf, np.inf], True),  # an agent without contact decides by its own lane
         ([0, 1, 1, 1], [0, np.inf, np.inf, np.inf], False),
-        ([0.49] * 4, [0.1] * 4, True),  # an estimate of the mean of consensus: two of four, nearly
+        ([0.49] * 4, [0.1] * 4, True),  # consensus estimates of the mean: nearly two of four
         ([0.3] * 4, [0.1] * 4, False),
     ],
 )
@@ -95,9 +95,9 @@ def test_an_agent_counts_the_votes_that_it_knows(votes, age, expected):
     ("narrow", "shut", "last", "expected"),
     [
         (0, 0, IN_FORMATION, IN_COLUMN),
-        (1, 0, IN_FORMATION, IN_FORMATION),  # a column whose own lane is blocked helps nobody
+        (1, 0, IN_FORMATION, IN_FORMATION),  # a column with a blocked lane does not help
         (1, 1, IN_FORMATION, IN_FORMATION),
-        (1, 1, IN_COLUMN, IN_COLUMN),  # nobody leaves the column while one is shut in
+        (1, 1, IN_COLUMN, IN_COLUMN),  # the column stays while an agent is shut in
         (1, 0, IN_COLUMN, IN_FORMATION),
     ],
 )
@@ -129,7 +129,7 @@ def flown(tmp_path_factory) -> tuple[Path, Trajectory]:
 
 
 def test_a_log_tells_who_heard_whom(flown):
-    """Bit for bit, and as a row per agent whose numbers fit each other."""
+    """Links and ages are equal to the last bit, and the log has a consistent row per agent."""
     path, trajectory = flown
     log, expected = read_log(path), from_trajectory(trajectory, PD())
     for name in ("link", "age"):
@@ -171,7 +171,7 @@ def test_links_fade_with_the_age_of_the_older_side():
     link[0, 1], link[2, 1], age[1, 0], age[2, 1] = True, True, HALF_LIFE, np.inf
     links = drawn_links(np.zeros((3, 2)), link, age)
     assert links.ends.tolist() == [[0, 1], [1, 2]]
-    np.testing.assert_allclose(links.opacity, [0.5 * CLEAREST, FAINTEST])
+    np.testing.assert_allclose(links.opacity, [0.5 * MAX_OPACITY, MIN_OPACITY])
     many = ~np.eye(40, dtype=bool)
     place = np.column_stack([np.arange(40.0), np.zeros(40)])
     ends = drawn_links(place, many, np.zeros((40, 40))).ends
@@ -179,14 +179,14 @@ def test_links_fade_with_the_age_of_the_older_side():
 
 
 def test_links_are_in_the_picture(flown):
-    """One strip per link in the video, one line in the scene of a viewer, none where there is no network."""
+    """There is one strip per link in the video, and one line per link in the scene of a viewer."""
     stage = make_stage(read_log(flown[0]))
     assert len(stage._links(0.5)) == len(drawn_links(stage.log.position[10], stage.log.link[10], stage.log.age[10]).ends) == 3
     with open(flown[0], "rb") as stream:
         scenes = [SceneUpdate.FromString(m.data) for _, _, m in make_reader(stream).iter_messages(topics=["/scene"])]
     (links,) = (entity for entity in scenes[10].entities if entity.id == "links")
     assert len(links.lines[0].points) == len(links.lines[0].colors) == 6
-    assert links.lines[0].colors[0].a < scenes[10].entities[0].lines[0].color.a or links.lines[0].colors[0].a <= CLEAREST
+    assert links.lines[0].colors[0].a < scenes[10].entities[0].lines[0].color.a or links.lines[0].colors[0].a <= MAX_OPACITY
 
 
 def test_links_are_in_a_recording_of_rerun(flown, tmp_path):
@@ -205,7 +205,7 @@ def test_links_are_in_a_recording_of_rerun(flown, tmp_path):
 
 @pytest.mark.parametrize("supervisor", [DistributedLookAhead(), make_supervisor("fsams-hysteresis")])
 def test_episodes_flown_together_are_those_flown_alone(supervisor):
-    """Every array that is kept of them, bit for bit, whatever is drawn with the seed; only the clock differs."""
+    """Arrays of the trajectory are equal to the last bit, except decision times and those that joint flights do not keep."""
     scenario = gates(duration=1.0, communication=POOR)
     flight = JointFlight(Flown(scenario, supervisor, PD(), ("supervisor", "controller"), False), (4, 9))
     flight.fly(supervisor)
@@ -222,7 +222,7 @@ def test_episodes_flown_together_are_those_flown_alone(supervisor):
 
 
 def test_settings_of_the_command_line(tmp_path, capsys):
-    """--set reaches the table of communication and that of imperfections, and nothing else."""
+    """--set changes entries of communication; other settings and invalid values are refused."""
     run = ["run", "gates", "--supervisor", "lookahead-distributed", "--controller", "pd", "--duration", "0.2"]
     main([*run, "--out", str(tmp_path / "a"), "--set", "communication.range=8", "communication.silent=1,2"])
     config = json.loads((tmp_path / "a" / "config.json").read_text())["scenario"]
@@ -239,7 +239,7 @@ def test_settings_of_the_command_line(tmp_path, capsys):
 
 
 def test_the_study_flies_every_case(tmp_path):
-    """Two cases, two layouts; the table has a row each, the file too."""
+    """With two cases on two layouts, the table and the file have a row per case."""
     scenario = gates(duration=0.5, split="test")
     assert neighbor_distance(scenario) == pytest.approx(6.0) and len(CASES) == 29
     study = CommunicationStudy(
@@ -255,7 +255,7 @@ def test_the_study_flies_every_case(tmp_path):
 
 
 def test_flooding_agrees_before_consensus_does():
-    """Five agents in a row: four hops, of which the first takes no time."""
+    """Five agents in a row: flooding takes four hops, the first of which takes no time."""
     row = np.column_stack([np.arange(5.0), np.zeros(5)])
     assert time_to_agree(row, Communication(range=1.0)) == pytest.approx(0.15)
     assert 0.15 < time_to_agree(row, Communication(range=1.0, protocol="consensus")) < 10.0

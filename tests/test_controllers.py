@@ -1,4 +1,4 @@
-"""Controllers against textbook forms: (30), (36)-(41) written out in NumPy, closed forms, gain checks and step sizes."""
+"""Controllers against (30), (36)-(41) written out in NumPy and against closed forms; checks of gains and substeps."""
 
 from dataclasses import replace
 
@@ -18,7 +18,7 @@ BASIS_TOLERANCE = 2e-13
 
 
 def call(controller: Controller, state, p, v, p_r, v_r, *, limit=200.0, h=H, agent=0) -> np.ndarray:
-    """Force of one substep; ``state`` is the law's row, which it changes."""
+    """Force of one substep; ``state`` is the row of the law's state, changed in place."""
     law, force = controller.law, np.full(2, np.nan)
     law(
         laws.as_gains(law, controller.params(agent, limit)), laws.interface(law).state.view(state), p, v, p_r, v_r, ZERO, h, force
@@ -77,14 +77,14 @@ class Textbook:
 
 
 def assert_close(actual, expected, relative=1e-12):
-    """Relative to the largest entry, and never tighter than relative to 1."""
+    """Compare with a tolerance relative to the largest entry, or to 1 if that is larger."""
     np.testing.assert_allclose(actual, expected, rtol=0, atol=relative * max(1.0, np.abs(expected).max()))
 
 
 @pytest.mark.parametrize("tau_sign", [-1, 1])
 @pytest.mark.parametrize("basis", ["published", "scaled", "own scales", "off"])
 def test_sorlc_is_the_textbook_law(basis, tau_sign):
-    """Force, weights and tau equal (30), (36)-(41) over 2000 substeps of random states, half of them saturated."""
+    """Force, weights and tau equal (30), (36)-(41) over 2000 substeps of random states, some of them saturated."""
     if basis == "own scales":
         changes = {"position_scale": 0.5, "velocity_scale": 3.0, "tau_scale": 7.0, "control_weight": 1.3}
         gains = SORLC.scaled(tau_sign=tau_sign, **changes)
@@ -107,11 +107,11 @@ def test_sorlc_is_the_textbook_law(basis, tau_sign):
     for actual, reference in ((w_f, textbook.w_f), (w_a, textbook.w_a), (w_c, textbook.w_c), (tau, textbook.tau)):
         assert_close(actual, reference)
     if basis != "off":
-        assert not np.allclose(w_a, gains.actor_weights[agent])  # the comparison has seen learning
+        assert not np.allclose(w_a, gains.actor_weights[agent])  # so the comparison includes learning
 
 
 def test_sorlc_off_is_pd_with_the_compensator():
-    """Without networks: u = clip(-100 e_p - 100 e_v - tau), and plain PD as long as nothing saturates."""
+    """Without networks u = clip(-100 e_p - 100 e_v - tau), which is PD as long as nothing saturates."""
     rng = np.random.default_rng(1)
     off, pd = SORLC(basis="off"), PD()
     state = start(off)
@@ -122,7 +122,7 @@ def test_sorlc_off_is_pd_with_the_compensator():
 
 
 def test_far_from_its_centres_the_published_basis_is_silent():
-    """Positions beyond [-6, 6]: Psi = 0, actor and critic stand still and the identifier only leaks (erratum 13)."""
+    """At positions beyond [-6, 6], Psi = 0: actor and critic do not change, and the identifier only leaks (erratum 13)."""
     gains = SORLC()
     state = start(gains)
     p = np.array([100.0, 6.0])
@@ -134,7 +134,7 @@ def test_far_from_its_centres_the_published_basis_is_silent():
 
 
 def gaussians_of(gains: SORLC, p, v) -> np.ndarray:
-    """Psi_f(chi), read off one identifier step (37) from zero weights without leak, with h Gamma_f (e_p + e_v) = 1."""
+    """Psi_f(chi): the identifier weights (37) after one step from zero without leak, with h Gamma_f (e_p + e_v) = 1."""
     gains = replace(gains, identifier_weights=(0.0,), identifier_leak=0.0, identifier_rate=1.0 / H)
     state = start(gains)
     call(gains, state, p, v, p - 0.5, v - 0.5)
@@ -142,7 +142,7 @@ def gaussians_of(gains: SORLC, p, v) -> np.ndarray:
 
 
 def basis_error(middle, offsets, width) -> float:
-    """Largest difference between the law's basis and twelve separate exponentials, max |Psi| being 1."""
+    """Largest difference between the law's basis and twelve separate exponentials; the largest Psi possible is 1."""
     z = middle + np.array(offsets)
     expected = np.exp(-((z - np.linspace(-6.0, 6.0, NEURONS)[:, None]) ** 2).sum(axis=1) / width**2)
     actual = gaussians_of(SORLC(width=width), z[:2], z[2:])
@@ -157,11 +157,11 @@ def test_two_exponentials_are_twelve_gaussians(middle, spread, offsets, width):
 
 @pytest.mark.parametrize("width", [0.5, 0.2])
 def test_narrow_gaussians_are_right_or_refused(width):
-    """A width so small that exp(-|c_12 - c_1|^2 / width^2) underflows must not silence the far centres."""
+    """A width so small that exp(-|c_12 - c_1|^2 / width^2) underflows must not set the far Gaussians to 0."""
     try:
         gains = SORLC(width=width)
     except ConfigurationError:
-        return  # refused is right too
+        return  # a refusal is also right
     assert basis_error(6.0, np.zeros(4), gains.width) < BASIS_TOLERANCE
 
 
@@ -200,7 +200,7 @@ def test_pd_closed_form(seed, k_p, k_v, limit):
 
 @given(st.floats(1e-2, 1e4), st.floats(1e-2, 1e3))
 def test_largest_stable_substep_is_where_the_spectral_radius_is_one(k_p, k_v):
-    """v += h (-k_p e - k_v v), e += h v: contracting just below the step, growing just above it."""
+    """v += h (-k_p e - k_v v), e += h v is stable just below this substep, and unstable just above it."""
 
     def spectral_radius(h):
         step = np.array([[1.0 - h * h * k_p, h * (1.0 - h * k_v)], [-h * k_p, 1.0 - h * k_v]])
@@ -211,7 +211,7 @@ def test_largest_stable_substep_is_where_the_spectral_radius_is_one(k_p, k_v):
 
 
 def test_the_papers_gains_need_substeps_below_19_8_ms():
-    """|1 - 100 h| and the position loop together: h < 19.8 ms for gains 100 and 100."""
+    """For gains 100 and 100, h < 19.8 ms; without a position gain the limit is 20 ms, without both gains infinite."""
     assert largest_stable_substep(100.0, 100.0) == pytest.approx(0.0198, abs=5e-5)
     assert largest_stable_substep(0.0, 100.0) == pytest.approx(0.02)
     assert largest_stable_substep(0.0, 0.0) == np.inf
@@ -234,7 +234,7 @@ def test_the_papers_gains_need_substeps_below_19_8_ms():
     ids=str,
 )
 def test_gains_that_break_condition_42_are_refused(broken):
-    """xi_p > 2, xi_v > 3, xi_tau > 3/2, gamma_a > 1/(2 beta_V^2), gamma_a > gamma_c > gamma_a/2, all strict; the value shown."""
+    """xi_p > 2, xi_v > 3, xi_tau > 3/2, gamma_a > 1/(2 beta_V^2), gamma_a > gamma_c > gamma_a/2, strict; the value is shown."""
     with pytest.raises(ConfigurationError, match=r"condition \(42\)") as error:
         SORLC(**broken)
     for name, value in broken.items():
@@ -258,7 +258,7 @@ def test_pd_gains_must_be_positive_and_finite(name, value):
 
 
 def test_unknown_names_are_refused_with_the_valid_ones():
-    """Controller, basis, sign of tau."""
+    """This holds for controllers, bases and the sign of tau."""
     with pytest.raises(ConfigurationError, match="'nonsense'; choose from: sorlc"):
         make_controller("nonsense")
     with pytest.raises(ConfigurationError, match="'nonsense'; choose from: published, scaled, off"):
@@ -269,7 +269,7 @@ def test_unknown_names_are_refused_with_the_valid_ones():
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_every_named_controller_keeps_the_protocol(name):
-    """Factory, law, finite parameters for any agent, a state that belongs to the caller."""
+    """It has a factory, a law, finite gains for any agent, a new state per call, and obeys its force limit."""
     controller = make_controller(name)
     assert isinstance(controller, Controller)
     assert np.isfinite(laws.pack_gains(controller.law, controller.params(7, 200.0))).all()
@@ -280,7 +280,7 @@ def test_every_named_controller_keeps_the_protocol(name):
 
 
 def test_weights_start_as_the_paper_fills_them():
-    """Table of section 4.1: constant matrices, agent by agent; tau(0) = 0."""
+    """They are constant matrices, with the values of section 4.1 for each agent; tau(0) = 0."""
     for agent, (f, a, c) in enumerate([(1, 0.5, 1), (0.98, 0.48, 0.96), (0.96, 0.46, 0.92), (0.94, 0.44, 0.88)]):
         w_f, w_a, w_c, tau = weights(start(SORLC(), agent))
         assert w_f.shape == w_a.shape == w_c.shape == (12, 2)

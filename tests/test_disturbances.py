@@ -1,4 +1,4 @@
-"""Unknown dynamics f(chi): each law's closed form, its scale, and f(0) = 0 where (1) asks for it."""
+"""Unknown dynamics f(chi): each law's closed form, its scale, and f(0) = 0 where (1) requires it."""
 
 import numpy as np
 import pytest
@@ -37,7 +37,7 @@ def force_of(disturbance, p, v, t=0.0) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "numbers", "closed_form"), CLOSED_FORMS, ids=lambda x: getattr(x, "__name__", ""))
 @given(p=vectors, v=vectors, scale=scales)
 def test_closed_form_times_scale(kind, numbers, closed_form, p, v, scale):
-    """(43) and the project's own laws, multiplied by ``scale``."""
+    """(43) and the project's own laws equal their closed forms times ``scale``."""
     expected = scale * np.array(closed_form(p, v))
     np.testing.assert_allclose(force_of(kind(scale=scale, **numbers), p, v), expected, rtol=1e-12, atol=1e-12)
 
@@ -45,7 +45,7 @@ def test_closed_form_times_scale(kind, numbers, closed_form, p, v, scale):
 @pytest.mark.parametrize("kind", [PaperDrag, LinearDrag, QuadraticDrag])
 @given(p=vectors)
 def test_drag_vanishes_at_rest(kind, p):
-    """f = 0 without velocity, in particular f(0) = 0 as (1) asks."""
+    """f = 0 without velocity, in particular f(0) = 0 as (1) requires."""
     assert not force_of(kind(), p, np.zeros(2)).any()
     assert not force_of(kind(), np.zeros(2), np.zeros(2)).any()
 
@@ -53,13 +53,13 @@ def test_drag_vanishes_at_rest(kind, p):
 @pytest.mark.parametrize("kind", [LinearDrag, QuadraticDrag])
 @given(v=vectors)
 def test_passive_drag_takes_energy(kind, v):
-    """f . v <= 0 for drag proper; (43) is not one, it may push."""
+    """f . v <= 0 for true drag, unlike (43), which can add energy."""
     assert force_of(kind(), np.zeros(2), v) @ v <= 0.0
 
 
 @pytest.mark.parametrize("kind", [kind for kind, _, _ in CLOSED_FORMS])
 def test_gains_begin_with_the_scale(kind):
-    """The first number of the row is what a perturbation draw multiplies."""
+    """The first number of the row is the scale, which random draws multiply."""
     assert laws.pack_gains(kind.law, kind(scale=0.25).params())[0] == 0.25
     assert not force_of(kind(scale=0.0), np.ones(2), np.ones(2)).any()
 
@@ -75,6 +75,6 @@ def test_gains_begin_with_the_scale(kind):
     ],
 )
 def test_numbers_that_are_not_finite_are_refused(make, value):
-    """The message shows them."""
+    """The message shows the value."""
     with pytest.raises(ConfigurationError, match=str(value)):
         make(value)

@@ -1,4 +1,4 @@
-"""What the documentation shows runs as shown: each how-to in a folder of its own, files, Python and commands in reading order."""
+"""The documentation runs as shown: files, Python and commands of each how-to, in reading order and in its own folder."""
 
 import re
 import runpy
@@ -36,7 +36,7 @@ class Block(NamedTuple):
     """A fenced block of a page."""
 
     language: str
-    title: str  # the file that it is; empty for what is run
+    title: str  # name of the file to write; empty for a block to run
     text: str
 
 
@@ -45,7 +45,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def joined(text: str) -> list[str]:
-    """Lines of shell; one that ends with a backslash goes on in the next."""
+    """Lines of shell, with lines that end in a backslash joined to the next."""
     return text.replace("\\\n", " ").splitlines()
 
 
@@ -68,7 +68,7 @@ def run_page(page: Path, folder: Path) -> None:
 
 @pytest.fixture
 def own_names():
-    """What a page registers is forgotten again."""
+    """Remove the names that a page has registered after the test."""
     before = [(registry, dict(registry)) for registry in (CONTROLLERS, DISTURBANCES, SUPERVISORS, LEARNERS, METHODS, VARIANTS)]
     yield
     for registry, entries in before:
@@ -79,7 +79,7 @@ def own_names():
 @pytest.mark.usefixtures("own_names")
 @pytest.mark.parametrize("page", HOW_TO, ids=lambda page: page.stem)
 def test_a_how_to_runs(page, tmp_path, monkeypatch):
-    """Everything on the page, in an empty folder."""
+    """Everything on the page runs in an empty folder."""
     monkeypatch.chdir(tmp_path)
     run_page(page, tmp_path)
 
@@ -90,7 +90,7 @@ def test_there_is_a_how_to_for_everything_of_ones_own():
 
 
 def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():
-    """The how-to's two files are all of it."""
+    """The how-to has exactly these two files."""
     files = {block.title: block.text for block in blocks(DOCS / "how-to" / "robot.md") if block.title}
     assert sorted(Path(name).suffix for name in files) == [".py", ".xml"]
     (script,) = (text for name, text in files.items() if name.endswith(".py"))
@@ -98,7 +98,7 @@ def test_a_new_robot_takes_one_mjcf_and_fewer_than_60_lines_of_python():
 
 
 def test_pictures_are_there_and_small():
-    """Every picture and clip that a page shows is in the repository, every one there is shown, and all together are small."""
+    """The pictures and clips in the repository are exactly those that pages show; each is small, and so is their sum."""
     pages = [page for page in DOCS.rglob("*.md") if "out" not in page.parts]
     shown = {(page.parent / path).resolve() for page in pages for path in re.findall(MEDIA, page.read_text())}
     kept = {path.resolve() for path in DOCS.rglob("*") if path.suffix in (".png", ".jpg", ".mp4", ".webp")}
@@ -108,21 +108,21 @@ def test_pictures_are_there_and_small():
 
 
 def test_pages_load_nothing_from_elsewhere():
-    """No script, style, font or picture from another host; links are links."""
+    """Pages load no script, style, font or picture from another host; plain links are allowed."""
     for page in DOCS.rglob("*.md"):
         assert not re.search(r"""<(?:script|link|iframe)|src=["']?(?:https?:)?//|!\[[^]]*\]\(http""", page.read_text()), page
     assert "font: false" in (DOCS.parent / "mkdocs.yml").read_text()
 
 
 def test_search_works_in_pages_opened_from_the_disk():
-    """Browsers start no workers there: the index is a script, and a shim of the project's own pages stands in for workers."""
+    """Browsers start no web workers for local files: the index is a script, and a shim in the docs replaces the worker."""
     settings = (DOCS.parent / "mkdocs.yml").read_text()
     assert "  - offline" in settings and "polyfills: [assets/iframe-worker.js]" in settings
     assert "window.Worker=o" in (DOCS / "assets" / "iframe-worker.js").read_text()
 
 
 def test_every_page_is_in_the_navigation():
-    """And everything in the navigation is a page."""
+    """Conversely, every entry of the navigation is a page."""
     listed = set(re.findall(r"^\s+- [^:]+: (\S+\.md)$", (DOCS.parent / "mkdocs.yml").read_text(), re.MULTILINE))
     assert listed == {page.relative_to(DOCS).as_posix() for page in DOCS.rglob("*.md")}
 
@@ -145,7 +145,7 @@ def prose(page: Path) -> str:
 
 
 def anchors(page: Path) -> set[str]:
-    """What can be linked to on a page: its headings, and the names that the reference shows there."""
+    """Link targets on a page: its headings, and the names that its reference shows."""
     headings = re.findall(r"^#+ (.*)$", prose(page), re.MULTILINE)
     plain = (re.sub(r"\[([^]]*)\]\([^)]*\)|[^\w\s-]", r"\1", heading) for heading in headings)
     return {re.sub(r"[-\s]+", "-", each.strip().lower()) for each in plain} | set(
@@ -155,7 +155,7 @@ def anchors(page: Path) -> set[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS.parent).as_posix())
 def test_links_lead_somewhere(page):
-    """Relative links to files, headings and names of the reference, in a form that a repository's host understands, too."""
+    """Relative links lead to existing files, headings and names, in a form that repository hosts also understand."""
     text = re.sub(r"`[^`\n]*`", "", prose(page))
     assert not re.search(r"\] ?\[[^]]", text), "a cross-reference that only the site resolves"
     for link in re.findall(r"\]\((?!https?:)([^)\s]+)\)", text):
@@ -166,7 +166,7 @@ def test_links_lead_somewhere(page):
 
 
 def shown_commands(page: Path) -> list[str]:
-    """Lines of shell, in blocks and in the text, without comments."""
+    """Commands in blocks and in the text of a page, without comments."""
     fenced = [block for language, block in FENCED.findall(page.read_text()) if language in ("sh", "text", "")]
     lines = joined("\n".join(fenced)) + re.findall(r"`([^`\n]+)`", prose(page))
     return [line.partition(" #")[0].strip() for line in lines]
@@ -174,7 +174,7 @@ def shown_commands(page: Path) -> list[str]:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(DOCS.parent).as_posix())
 def test_commands_can_be_given(page):
-    """Commands, options and names of every ``marlbc`` line; targets of make; modules and scripts that Python runs."""
+    """Commands, options and names of ``marlbc`` lines, targets of make, and modules and scripts of Python lines exist."""
     makefile = (DOCS.parent / "Makefile").read_text()
     for line in shown_commands(page):
         if line.startswith("marlbc "):
@@ -188,7 +188,7 @@ def test_commands_can_be_given(page):
 
 
 def check_command(line: str) -> None:
-    """Fail for what the command line would refuse; files need not be there, and capitals stand for anything."""
+    """Fail if the command line would refuse ``line``; files need not exist, and words in capitals stand for any value."""
     words = [word for word in shlex.split(line)[1:] if not PLACEHOLDER.fullmatch(word)]
     chosen = parsing.choose_command(Command, words, "marlbc")
     given = {word.partition("=")[0] for word in chosen.rest if word.startswith("--")}
@@ -199,7 +199,7 @@ def check_command(line: str) -> None:
 
 
 def test_the_site_is_built_strictly():
-    """With --quiet mkdocs counts no warnings, and --strict refuses nothing."""
+    """The build uses --strict, and not --quiet, with which mkdocs counts no warnings and --strict never fails."""
     (build,) = (line for line in (DOCS.parent / "Makefile").read_text().splitlines() if "mkdocs build" in line)
     assert "--strict" in build and "--quiet" not in build
     assert "anchors: warn" in (DOCS.parent / "mkdocs.yml").read_text()

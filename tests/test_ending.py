@@ -1,4 +1,4 @@
-"""How commands end: readers that stop early, full disks, old terminals, signals, and folders that cannot be written."""
+"""How commands end: closed pipes, full disks, terminals without Unicode, signals, and folders that cannot be written."""
 
 import errno
 import json
@@ -26,7 +26,7 @@ AS_ROOT = pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, re
 
 
 def shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """What a line of a shell leaves, with ``marlbc`` for the command."""
+    """Run a line of shell, with ``marlbc`` replaced by the command, and return the completed process."""
     line = line.replace("marlbc", " ".join(COMMAND))
     return subprocess.run(
         ["bash", "-c", line], env={**ENVIRONMENT, **environment}, capture_output=True, text=True, check=False, timeout=300
@@ -64,12 +64,12 @@ def test_a_command_that_is_interrupted_while_it_is_read(monkeypatch, capsys):
     assert stopped.value.code == 130 and capsys.readouterr().err == "marlbc: interrupted\n"
 
 
-LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # many times as long as until the signal comes
+LONG = ["--supervisors", "mpcms", "fsams", "--substep", "0.001"]  # runs much longer than the wait for the signal
 
 
 @pytest.fixture(scope="module")
 def compiled_before(tmp_path_factory):
-    """The command has run once, so that a signal meets episodes and not the compiler."""
+    """Run the command once, so that signals arrive during episodes and not during compilation."""
     main(["bench", *QUICK, *LONG, "--out", str(tmp_path_factory.mktemp("before") / "out"), "--quiet"])
 
 
@@ -78,7 +78,7 @@ def compiled_before(tmp_path_factory):
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 @pytest.mark.parametrize("workers", [[], ["--seeds", "40", "--workers", "2"]])
 def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers):
-    """In this process or in workers: nothing beside the output folder, no process, one line."""
+    """With and without workers, the interrupted command leaves no files and no process, and prints one line last."""
     command = [*COMMAND, "bench", *QUICK[:-2], *LONG, *workers, "--out", str(tmp_path / "out")]
     with subprocess.Popen(command, env=ENVIRONMENT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
         until = time.monotonic() + 120
@@ -89,7 +89,7 @@ def test_a_signal_leaves_nothing_half_written(tmp_path, number, status, workers)
         try:
             _, said = process.communicate(timeout=100)
         finally:
-            if process.poll() is None:  # whatever is wrong, it does not stay
+            if process.poll() is None:  # end it in any case
                 os.killpg(process.pid, signal.SIGKILL)
         assert process.returncode == status
     assert said.strip().splitlines()[-1] in ("marlbc: terminated", "marlbc: interrupted") and "Traceback" not in said
@@ -117,7 +117,7 @@ with in_one_line("marlbc"):
 @pytest.mark.parametrize(("number", "status", "said"), [(signal.SIGTERM, 143, "terminated"), (signal.SIGINT, 130, "interrupted")])
 @pytest.mark.parametrize("way", ["dropped", "through"])
 def test_a_signal_is_not_lost_in_a_callback_and_does_not_stop_the_removal(number, status, said, way):
-    """What a handler raises while C code calls back into Python is dropped, and so raised again; what got through is not."""
+    """An exception raised in a callback from C is dropped, so it is raised again; one that propagates is raised only once."""
     began = time.monotonic()
     command = [sys.executable, "-c", DROPPED, str(int(number)), way]
     done = subprocess.run(command, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=60)
@@ -126,7 +126,7 @@ def test_a_signal_is_not_lost_in_a_callback_and_does_not_stop_the_removal(number
 
 
 def test_a_full_disk_anywhere_is_status_3(monkeypatch, capsys):
-    """Also where nobody has thought of one: the file is named if the system names it."""
+    """This also holds where no code expects it; the line names the file if the system does."""
     error = OSError(errno.ENOSPC, "No space left on device", "figure.pdf")
     monkeypatch.setattr("marlbc_mj.cli.ListCommand.run", lambda _: (_ for _ in ()).throw(error))
     with pytest.raises(SystemExit) as stopped:
@@ -135,14 +135,14 @@ def test_a_full_disk_anywhere_is_status_3(monkeypatch, capsys):
 
 
 def pictures(count: int, size: int):
-    """Frames that no encoder makes small."""
+    """Frames of noise, which no encoder can compress."""
     rng = np.random.default_rng(0)
     yield from (rng.integers(256, size=(size, size, 3), dtype=np.uint8) for _ in range(count))
 
 
 @AS_ROOT
 def test_a_video_that_does_not_fit_is_an_error(tmp_path):
-    """ffmpeg writes what it can and looks finished: its exit status tells."""
+    """ffmpeg writes as much as fits and ends; only its exit status shows the error."""
     with small_disk(tmp_path / "disk") as disk:
         with pytest.raises(SimulationError, match="encoder failed.*No space left"):
             _encode(pictures(40, 128), disk / "a.mp4", VideoStyle(size=(128, 128)), 40)
@@ -151,7 +151,7 @@ def test_a_video_that_does_not_fit_is_an_error(tmp_path):
 
 
 def test_an_encoder_that_ends_early_is_an_error(tmp_path, monkeypatch):
-    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "true")  # takes nothing, and says that all is well
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", lambda: "true")  # reads nothing, and exits with status 0
     with pytest.raises(SimulationError, match="encoder failed"):
         _encode(pictures(40, 256), tmp_path / "a.mp4", VideoStyle(size=(256, 256)), 40)
 
@@ -165,7 +165,7 @@ def test_an_interrupted_video_ends_its_encoder(tmp_path):
 
 
 def test_rendering_that_is_switched_off_renders_nothing(tmp_path):
-    """Neither `video` nor a benchmark draws with MUJOCO_GL=off; the rest of the benchmark is there."""
+    """With MUJOCO_GL=off a benchmark writes everything but videos, and `video` fails with one line."""
     quick = [each if each != "none" else "first" for each in QUICK]
     done = shell(f"marlbc bench {' '.join(quick)} --out {tmp_path / 'out'}", MUJOCO_GL="off")
     assert done.returncode == 0 and not list(tmp_path.rglob("*.mp4")) and "switches rendering off" in done.stderr
@@ -217,7 +217,7 @@ def test_mujoco_writes_neither_to_the_terminal_nor_into_the_folder(tmp_path):
 
 @AS_ROOT
 def test_package_and_home_that_cannot_be_written(tmp_path):
-    """A container or a cluster: compiled code has no place to be kept; everything works, and one line says what would help."""
+    """As in a container: compiled code cannot be cached, everything works, and one line says what to set."""
     package = Path(sys.modules["marlbc_mj"].__file__).resolve().parents[1]
     line = (
         f"mount --bind {package} {package} && mount -o remount,ro,bind {package} && mkdir {tmp_path}/home && "

@@ -1,4 +1,4 @@
-"""World: the physics' closed form, one loop in two faces, batches, divergence, and laws that a user brings."""
+"""World: physics against closed forms, compiled loop against Python path, batches, divergence, and users' laws."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ two_threads = pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one
 
 @laws.controller
 def replayed(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """The k-th call gives the k-th pair of ``params``."""
+    """Call k returns pair k of ``params``."""
     k = int(state[0])
     force_out[0] = params[2 * k]
     force_out[1] = params[2 * k + 1]
@@ -53,7 +53,7 @@ def replayed(params, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class Replay:
-    """Forces (T, N, 2) by the clock; zero once they are used up."""
+    """A controller that replays forces (T, N, 2), one per substep, for at most T substeps."""
 
     forces: np.ndarray
     limited: bool = True
@@ -69,7 +69,7 @@ class Replay:
 
 @laws.controller
 def faulty(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """Zero force; ``params[2]`` from call number ``params[1]`` on where ``params[0]`` is 1 and x > ``params[3]``."""
+    """Zero force; if ``params[0]`` is 1 and x > ``params[3]``, force ``params[2]`` from call number ``params[1]`` on."""
     broken = params[0] == 1.0 and state[0] >= params[1] and p[0] > params[3]
     force_out[0] = params[2] if broken else 0.0
     force_out[1] = 0.0
@@ -78,7 +78,7 @@ def faulty(params, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class Faulty:
-    """A controller that fails for one agent, at one substep, in the worlds where that agent is right of ``beyond``."""
+    """A controller that fails for one agent, from one substep on, in the worlds where this agent has x > ``beyond``."""
 
     agent: int
     substep: int
@@ -97,7 +97,7 @@ class Faulty:
 
 @laws.disturbance
 def pulse(params, t, p, v, force_out):
-    """f = scale (sin 3t + 0.1 p2, -0.2 v1); uses everything a disturbance is given. ``params`` = scale, value after t = 0.1 s."""
+    """f = scale (sin 3t + 0.1 p2, -0.2 v1); uses all arguments. ``params``: scale; force added after t = 0.1 s."""
     force_out[0] = params[0] * (np.sin(3.0 * t) + 0.1 * p[1])
     force_out[1] = -params[0] * 0.2 * v[0]
     if t > 0.1001:
@@ -118,7 +118,7 @@ class Pulse:
 
 @laws.behavior
 def line_following(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):
-    """Stay at height ``params[1]``: rho = p_2, J = (0, 1), gain ``params[0]``; moves with the mean of the team's x."""
+    """Stay at height ``params[1]``: rho = p_2, J = (0, 1), gain ``params[0]``."""
     velocity_out[0] = 0.0
     velocity_out[1] = params[0] * (params[1] - p[1])
     jacobian_out[0, 0] = 0.0
@@ -142,7 +142,7 @@ class Line:
 
 @laws.controller
 def user_pd(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """A user's controller: PD that knows the drag, and counts its calls."""
+    """A user's controller: PD that compensates the drag, which it knows, and counts its calls."""
     for axis in range(2):
         force_out[axis] = -params[0] * (p[axis] - p_r[axis]) - params[1] * (v[axis] - v_r[axis]) - drag[axis]
     state[0] += 1.0
@@ -150,7 +150,7 @@ def user_pd(params, state, p, v, p_r, v_r, drag, h, force_out):
 
 @dataclass(frozen=True)
 class UserPD:
-    """``UserPD(law=laws.plain(user_pd))`` is the same as plain Python."""
+    """PD by :func:`user_pd`; ``UserPD(law=laws.plain(user_pd))`` runs it as plain Python."""
 
     law: Callable = staticmethod(user_pd)
     limited: bool = True
@@ -165,7 +165,7 @@ class UserPD:
 
 @laws.controller
 def allocating(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """Not allowed: creates an array."""
+    """An invalid law, as it creates an array."""
     wish = np.zeros(2)
     force_out[0] = wish[0]
     force_out[1] = wish[1]
@@ -181,7 +181,7 @@ def advance(world: World, steps: int, order: str = "FM") -> None:
 
 
 def trace(world: World, orders: np.ndarray) -> list[np.ndarray]:
-    """Everything a world shows over random ``orders`` (T, B, N), stacked over time."""
+    """All outputs of a world under ``orders`` (T, B, N), stacked over time, and the final controller states."""
     steps = [world.step(o) for o in orders]
     fields = [[*s.observation, s.reward, s.done, *(s.record or ())] for s in steps]
     return [np.stack(column) for column in zip(*fields, strict=True)] + [world.state.controller.copy()]
@@ -211,7 +211,7 @@ def test_a_point_mass_in_mujoco_is_the_closed_form_of_semi_implicit_euler(mass):
 
 
 def test_without_force_an_agent_coasts():
-    """After one push velocity is constant to the bit: nothing in the model brakes or pulls."""
+    """After a push the velocity is constant to the last bit: nothing in the model brakes or pulls."""
     forces = np.zeros((400, 4, 2))
     forces[:10] = np.random.default_rng(0).uniform(-200, 200, (10, 4, 2))
     trajectory = run_episode(
@@ -224,7 +224,7 @@ def test_without_force_an_agent_coasts():
 
 
 def test_unsaturated_pd_errors_follow_the_closed_loop_matrix():
-    """Within a mission step v_r is held, so (e_p, e_v)_k = A^k (e_p, e_v)_0 with A of semi-implicit Euler."""
+    """v_r is constant within a mission step, so (e_p, e_v)_k = A^k (e_p, e_v)_0 with A from semi-implicit Euler."""
     k_p, k_v, h = 40.0, 12.0, 0.005
     world = World(paper(disturbance=STILL), PD(k_p, k_v, limited=False), record=True)
     step = np.array([[1 - h * h * k_p, h * (1 - h * k_v)], [-h * k_p, 1 - h * k_v]])
@@ -237,7 +237,7 @@ def test_unsaturated_pd_errors_follow_the_closed_loop_matrix():
 
 
 def test_drag_acts_at_the_current_state_and_with_its_own_time():
-    """v' = u + f(t, p, v): forces and drag of a recorded run, integrated by hand, give the run."""
+    """v' = u + f(t, p, v): integrating the recorded forces and the drag in NumPy gives the recorded motion."""
     trajectory = run_episode(World(paper(duration=2.0, disturbance=Pulse(3.0)), record=True), make_supervisor("scripted"))
     t, p, v = trajectory.time[:, None], trajectory.position[:-1], trajectory.velocity[:-1]
     drag = 3.0 * np.stack([np.sin(3.0 * t) + 0.1 * p[..., 1], -0.2 * v[..., 0]], axis=-1)
@@ -267,19 +267,19 @@ def test_reference_velocity_is_equation_8_at_the_reference_or_at_the_measured_po
             np.testing.assert_allclose(record.reference_velocity[0, 0], [1.0, 0.0] + 8.0 * (slots - x), rtol=0, atol=1e-12)
 
 
-# One loop, two faces -----------------------------------------------------------------------------------------------------------
+# Compiled loop and Python path ------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("controller", ["sorlc", "sorlc-scaled"])
 def test_compiled_loop_and_python_path_agree_to_the_bit(episode, controller):
-    """Every array of the scripted episode of 2000 mission steps, five substeps each (500, of ten, with the scaled basis)."""
+    """All arrays of the scripted episode: 2000 mission steps of 5 substeps; 500 steps of 10 for the scaled basis."""
     changes = {"substep": 0.01} if controller == "sorlc" else {"duration": 25.0}
     compiled, python = (episode("scripted", controller, native, **changes) for native in (None, False))
     assert_same_bits([getattr(compiled, name) for name in ARRAYS], [getattr(python, name) for name in ARRAYS])
 
 
 def test_whole_episodes_are_deterministic():
-    """A world used before, reset to the same seed, repeats the episode of a fresh one to the bit."""
+    """A used world that is reset to the same seed repeats the episode of a new one to the last bit."""
     scenario = paper(duration=20.0, perturbation=PERTURBED)
     world = World(scenario, record=True)
     first, _, again = (run_episode(world, make_supervisor("fsams"), seed=seed) for seed in (3, 4, 3))
@@ -291,7 +291,7 @@ def test_whole_episodes_are_deterministic():
 @two_threads
 @pytest.mark.parametrize("controller", ["sorlc", "pd"])
 def test_a_world_depends_on_neither_batch_size_nor_threads(controller):
-    """World b of B = 5 equals world b of B = 1, 2, 3 and of two threads, to the bit, each with its own draw and orders."""
+    """World b is equal to the last bit for B = 1, 2, 3, 5 and for two threads; each world has its own draw and orders."""
     scenario = paper(perturbation=PERTURBED)
     orders = np.repeat(np.random.default_rng(0).integers(0, 6, (20, 5, 4)), 3, axis=0)
     make = partial(World, scenario, make_controller(controller), record=True)
@@ -305,14 +305,14 @@ def test_a_world_depends_on_neither_batch_size_nor_threads(controller):
 
 
 def test_a_batch_on_the_python_path_is_the_compiled_batch():
-    """The same for B = 3 perturbed worlds with native=False."""
+    """B = 3 perturbed worlds are equal with native=False and on the compiled path."""
     orders = np.random.default_rng(1).integers(0, 6, (20, 3, 4))
     make = partial(World, paper(perturbation=PERTURBED), record=True, worlds=3)
     assert_same_bits(trace(make(native=False), orders), trace(make(), orders))
 
 
 def test_reset_mask_starts_only_the_worlds_it_names():
-    """The named world repeats its episode, the others go on as if nothing had happened; an empty mask changes nothing."""
+    """The masked world repeats its episode, and the others continue unaffected; an empty mask changes nothing."""
     orders = np.random.default_rng(2).integers(0, 6, (30, 3, 4))
     make = partial(World, paper(perturbation=PERTURBED), worlds=3, record=True)
     undisturbed = trace(make(), orders)
@@ -330,7 +330,7 @@ def test_reset_mask_starts_only_the_worlds_it_names():
 
 
 def test_a_copied_world_goes_on_like_its_source():
-    """``copy_world`` takes physics, references, controllers, draw and clock along; the other world is left alone."""
+    """``copy_world`` copies physics, references, controllers, draw and clock, and does not change the other world."""
     orders = np.random.default_rng(3).integers(0, 6, (30, 2, 4))
     make = partial(World, paper(perturbation=PERTURBED), worlds=2, record=True)
     source, target = make(), make()
@@ -345,7 +345,7 @@ def test_a_copied_world_goes_on_like_its_source():
 
 
 def test_seeds_draw_within_the_perturbation_and_are_reproducible():
-    """Starts, obstacles and drag scale stay in their ranges; another seed is another draw; no perturbation, no difference."""
+    """Starts, obstacles and drag scale stay in their ranges; seeds differ, unless nothing is perturbed."""
     scenario = paper(perturbation=PERTURBED)
     world = World(scenario, worlds=20)
     first = world.reset(7).position
@@ -371,9 +371,7 @@ def test_record_is_what_mujoco_applied_within_the_limit(episode):
 
 
 def test_the_actuator_holds_the_limit_even_if_the_law_does_not():
-    """A limited controller that asks for 1e6 N gets 200; an unlimited one gets actuators without a range, and all that it asks
-    for.
-    """
+    """If a law returns 1e6 N, a limited controller applies 200 N; an unlimited one has actuators without a range."""
     wish = np.full((20, 4, 2), 1e6)
     for limited, force in ((True, 200.0), (False, 1e6)):
         world = World(paper(disturbance=STILL), Replay(wish, limited=limited), record=True)
@@ -383,20 +381,20 @@ def test_the_actuator_holds_the_limit_even_if_the_law_does_not():
 
 
 def test_done_comes_with_the_last_mission_step():
-    """duration / mission_step steps make an episode."""
+    """An episode has duration / mission_step steps."""
     world = World(paper(duration=0.25))
     assert [bool(world.step(orders_of(world.scenario, "FM")).done[0]) for _ in range(5)] == [False] * 4 + [True]
 
 
 def resting(**changes) -> Scenario:
-    """Everybody starts on its FM slot, the path stands still, nothing is in the way."""
+    """Every agent starts on its FM slot, the path is at rest, and there are no obstacles."""
     slots = paper().behaviors[1].offsets
     fields = {"starts": slots, "obstacles": (), "disturbance": STILL, "path_origin": (0.0, 0.0), "path_velocity": (0.0, 0.0)}
     return paper(**{**fields, **changes})
 
 
 def test_a_switch_costs_3_once_per_team():
-    """However many agents switch; none for an aliased order or at the first step (15), erratum 11. 1 N hardly moves anybody."""
+    """For any number of agents; no cost for an aliased order or in the first step (15), erratum 11. 1 N hardly moves agents."""
     scenario = resting(force_limit=1.0)
     world = World(scenario, PD())
     for names, reward in (
@@ -411,7 +409,7 @@ def test_a_switch_costs_3_once_per_team():
 
 
 def test_the_team_earns_5_times_g():
-    """10 on the slots, 0 on the way, 5 in the column (14)."""
+    """A team earns 10 in the formation, 0 between formations and 5 in the column (14)."""
     world = World(resting(), PD())
     for steps, order, formation in ((1, "FM", 2), (12, "FR", 0), (90, "FR", 1)):
         advance(world, steps, order)
@@ -427,7 +425,7 @@ def test_a_violation_costs_10_whatever_the_formation():
 
 
 def test_the_formation_identifier_is_relative_to_the_centroid():
-    """G ignores where the team is, and ends where one agent is over 0.5 m off its slot: 3/4 of its displacement, one of four."""
+    """G does not depend on the team's position. It is 0 if a slot error, 3/4 of one agent's displacement, exceeds 0.5 m."""
     scenario = resting()
     for which, expected in ((0, 2), (1, 1)):
         for displacement, held in ((0.0, True), (0.66, True), (0.67, False), (-0.66, True), (-0.67, False)):
@@ -445,7 +443,7 @@ def test_the_formation_identifier_is_relative_to_the_centroid():
 @pytest.mark.parametrize("native", [None, False])
 @pytest.mark.parametrize("value", [np.nan, np.inf, -1e12])
 def test_a_force_that_is_nan_or_huge_stops_the_run_and_spares_the_other_worlds(value, native):
-    """SimulationError names world, agent and time; MuJoCo never saw the number, and no MjData was reset silently."""
+    """SimulationError names world, agent and time; MuJoCo never receives the force, and no MjData is reset."""
     scenario = paper(disturbance=STILL, perturbation=Perturbation(start_spread=0.5))
     starts = World(scenario, PD(), worlds=4).observe().position[:, 2, 0]
     bad = int(starts.argmax())
@@ -462,7 +460,7 @@ def test_a_force_that_is_nan_or_huge_stops_the_run_and_spares_the_other_worlds(v
 
 
 def test_a_limited_law_that_returns_nan_is_not_clipped_into_silence():
-    """NaN from SORLC's and PD's own arithmetic, here from a broken reference, is reported and not held at the limit."""
+    """NaN forces of SORLC and PD, here due to a NaN reference, are reported instead of clipped to the limit."""
     for controller in (SORLC(), SORLC.scaled(), SORLC(basis="off"), PD()):
         for native in (None, False):
             world = World(paper(), controller, native=native)
@@ -473,7 +471,7 @@ def test_a_limited_law_that_returns_nan_is_not_clipped_into_silence():
 
 
 def test_a_disturbance_that_is_nan_or_huge_stops_the_run():
-    """Also the drag is looked at before MuJoCo sees it."""
+    """The drag, too, is checked before MuJoCo receives it."""
     for value in (np.nan, 1e12):
         world = World(paper(disturbance=Pulse(1.0, value)), PD())
         advance(world, 2)
@@ -482,11 +480,11 @@ def test_a_disturbance_that_is_nan_or_huge_stops_the_run():
         assert world.data[0].time == pytest.approx(0.105) and np.isfinite(world.data[0].qvel).all()
 
 
-# Laws that a user brings -------------------------------------------------------------------------------------------------------
+# Laws of users ------------------------------------------------------------------------------------------------------------------
 
 
 def user_scenario(**changes) -> Scenario:
-    """OA and a user's behavior above FM and FR, under a user's disturbance."""
+    """The case study with an additional behavior of a user, and with a user's disturbance."""
     fm, fr = paper().behaviors[1:]
     fields = {"behaviors": (ObstacleAvoidance(), Line(3.0), fm, fr), "disturbance": Pulse(2.0), "duration": 5.0, **changes}
     return paper(**fields)
@@ -499,7 +497,7 @@ def run(scenario: Scenario, controller, order: str, native=None) -> list[np.ndar
 
 @pytest.mark.parametrize("order", ["LINE>FM", "OA>LINE>FR>FM", "FR"])
 def test_a_users_compiled_laws_are_the_equals_of_those_shipped(order):
-    """Behavior, disturbance and controller written in this file: compiled loop = Python path = plain controller."""
+    """Laws from this file give the same bits in the compiled loop, on the Python path, and with a plain controller."""
     scenario = user_scenario()
     compiled = run(scenario, UserPD(), order)
     assert_same_bits(run(scenario, UserPD(), order, native=False), compiled)
@@ -508,7 +506,7 @@ def test_a_users_compiled_laws_are_the_equals_of_those_shipped(order):
 
 
 def test_a_users_behavior_does_what_it_says():
-    """LINE>FM: y obeys the line alone, x is what FM asks for in the direction that the line leaves free."""
+    """Under LINE>FM, y follows the line alone, and x follows FM, as the line leaves this direction free."""
     world = World(user_scenario(), UserPD(), record=True)
     record = world.step(orders_of(world.scenario, "LINE>FM")).record
     at, v_r = record.reference[0, 0], record.reference_velocity[0, 0]
@@ -518,7 +516,7 @@ def test_a_users_behavior_does_what_it_says():
 
 
 def test_a_plain_python_law_takes_the_python_path_and_nothing_else():
-    """``World.native`` says so, and asking for the compiled loop is refused."""
+    """``World.native`` is False, and ``native=True`` is refused."""
     plain = UserPD(law=laws.plain(user_pd))
     assert World(paper(), UserPD()).native and not World(paper(), plain).native
     assert not World(paper(disturbance=Pulse(law=laws.plain(pulse))), PD()).native
@@ -527,7 +525,7 @@ def test_a_plain_python_law_takes_the_python_path_and_nothing_else():
 
 
 def test_a_learners_batch_takes_a_plain_python_law_too():
-    """To the same states and rewards."""
+    """States and rewards are the same as with the compiled law."""
     plain = UserPD(law=laws.plain(user_pd))
     compiled, python = (FormationBatch(paper(), law, worlds=2, interval=10) for law in (UserPD(), plain))
     assert_same_bits([compiled.reset(3)], [python.reset(3)])
@@ -545,13 +543,13 @@ def test_a_learners_batch_takes_a_plain_python_law_too():
     ],
 )
 def test_a_law_of_another_kind_is_refused(scenario, controller, name):
-    """A disturbance cannot be a controller or a behavior, nor a controller a disturbance; the message names the law."""
+    """A disturbance cannot serve as controller or behavior, nor a controller as disturbance; the message names the law."""
     with pytest.raises(ConfigurationError, match=f"law {name!r} was declared as"):
         World(scenario, controller)
 
 
 def test_a_law_that_creates_arrays_is_refused():
-    """Counting references would cost more than the law; the message says where scratch belongs."""
+    """Reference counting would cost more than the law itself; the message suggests its state for scratch."""
     with pytest.raises(ConfigurationError, match="'allocating' .* cannot create arrays; keep scratch in its state"):
         World(paper(), replace(UserPD(), law=allocating))
 
@@ -566,7 +564,7 @@ def test_a_plain_python_behavior_is_refused_by_name():
 
 
 def test_addresses_are_those_of_mujocos_own_arrays():
-    """MjData, qpos, qvel, ctrl, qfrc_applied, actuator_force of every world, still the same after steps and resets."""
+    """Addresses of MjData and its arrays in every world are right, also after steps and a reset."""
     world = World(paper(), worlds=3)
     advance(world, 2)
     world.reset(1)
@@ -583,7 +581,7 @@ def _step_by_address(step, model, data):
 
 
 def test_mj_step_by_address_is_mj_step():
-    """One call each on equal MjData gives equal bits in every state."""
+    """One call of each on equal MjData gives the same state, to the last bit."""
     model = mujoco.MjModel.from_xml_string(assemble(paper(), 200.0))
     by_name, by_address = mujoco.MjData(model), mujoco.MjData(model)
     for data in (by_name, by_address):
@@ -597,7 +595,7 @@ def test_mj_step_by_address_is_mj_step():
 
 
 def test_the_model_keeps_the_scenarios_numbers_and_never_resets_itself():
-    """Time step, masses, ranges, no contacts, automatic reset off."""
+    """The model has the scenario's time step, masses and force ranges, no contacts, and no automatic reset."""
     plan = make_plan(paper(mass=1.5, force_limit=120.0), PD())
     model = plan.model
     assert model.opt.timestep == 0.005 and model.nq == model.nv == model.nu == 8
@@ -609,7 +607,7 @@ def test_the_model_keeps_the_scenarios_numbers_and_never_resets_itself():
 
 
 def test_a_scenario_without_avoidance_runs():
-    """Two behaviors, two orders, two commands."""
+    """Two behaviors give two orders and two commands."""
     fm, fr = (Formation(b.name, b.offsets) for b in paper().behaviors[1:])
     scenario = paper(behaviors=(fm, fr))
     assert scenario.orders.commands == ("FM", "FR")
@@ -618,7 +616,7 @@ def test_a_scenario_without_avoidance_runs():
 
 @pytest.mark.parametrize(("worlds", "threads"), [(1, 1), (3, 2)])
 def test_a_rollout_is_its_steps(worlds, threads):
-    """Orders known beforehand give, in one call, the states and returns of as many single steps, bit for bit."""
+    """A rollout over given orders equals as many single steps in states and returns, to the last bit."""
     scenario = paper(duration=3.0, perturbation=Perturbation(start_spread=1.0))
     orders = np.random.default_rng(5).integers(0, 6, (60, worlds, 4))
     stepped, rolled = World(scenario, worlds=worlds), World(scenario, worlds=worlds, threads=threads)
@@ -629,7 +627,7 @@ def test_a_rollout_is_its_steps(worlds, threads):
 
 
 def test_a_rollout_that_diverges_or_is_no_order_says_so():
-    """The same errors as single steps: world, agent and time; the index that is no order."""
+    """Its errors are those of single steps: world, agent and time of a divergence, or the valid indices of orders."""
     with pytest.raises(SimulationError, match=r"world 0, agent 1, t = 1\.310 s"):
         World(paper(disturbance=PaperDrag(20.0))).rollout(np.full((60, 1, 4), 2))
     with pytest.raises(ConfigurationError, match="from 0 to 5"):
@@ -637,7 +635,7 @@ def test_a_rollout_that_diverges_or_is_no_order_says_so():
 
 
 def test_the_age_of_an_order_is_the_time_since_the_last_switch_to_it():
-    """Infinite until a first switch; the first mission step switches nothing; an aliased order is the same command."""
+    """It is infinite before the first switch. The first mission step and an aliased order are no switches."""
     world = World(paper(duration=2.0), worlds=2)
     fm, fr, alias = (world.scenario.orders.index(name) for name in ("FM", "FR", "FR>OA>FM"))
     steps = [fr, fm, fm, fr, alias, fr]

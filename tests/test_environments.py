@@ -1,4 +1,4 @@
-"""Gymnasium, vector and PettingZoo views: their libraries' own checkers, and the same mission as World."""
+"""Gymnasium, vector and PettingZoo environments: they pass the checkers of their libraries and fly the mission of World."""
 
 import gymnasium
 import numpy as np
@@ -38,7 +38,7 @@ def test_action_sets(actions, count):
 
 
 def test_a_whole_episode_is_the_mission_of_world():
-    """Same orders, same rewards and states, for a decision every mission step and every fourth."""
+    """The same orders give the same rewards and states, with a decision in every mission step or in every fourth."""
     world, rng = World(paper(duration=20.0)), np.random.default_rng(3)
     actions = rng.integers(4, size=(100, 4))
     for interval in (1, 4):
@@ -87,7 +87,7 @@ def test_vector_env_restarts_by_itself_and_keeps_the_final_state():
     assert infos["_final_obs"].all()
     for b in range(3):
         assert (infos["final_obs"][b] == last).all()
-    assert (states == start).all()  # nothing is perturbed, so the new episode starts as the first did
+    assert (states == start).all()  # nothing is perturbed, so all episodes start alike
 
 
 def test_worlds_of_a_vector_env_do_not_depend_on_their_number():
@@ -101,7 +101,7 @@ def test_worlds_of_a_vector_env_do_not_depend_on_their_number():
 
 @pytest.mark.parametrize("starts", [Starts(), Starts(0.7, 1.0), Starts(0.7, 0.5, focus=0.5, turning=0.5)])
 def test_worlds_do_not_depend_on_the_others_over_many_episodes(starts):
-    """World b does the same whatever B is and whatever orders the others get, over dozens of restarts of different lengths."""
+    """World b is the same for any B and any orders of other worlds, over many episodes of different lengths."""
     small, large = (FormationBatch(paper(duration=4.0, perturbation=AROUND), worlds=n, starts=starts) for n in (2, 5))
     assert (small.reset(4) == large.reset(4)[:2]).all()
     rng, ends = np.random.default_rng(0), np.zeros(2, dtype=int)
@@ -115,7 +115,7 @@ def test_worlds_do_not_depend_on_the_others_over_many_episodes(starts):
 
 
 def test_a_feature_that_never_happens_draws_no_number():
-    """Starts with a share of 0 leave the random stream as if they did not exist."""
+    """Kinds of starts with a share of 0 do not advance the random stream."""
 
     def drawn(**shares):
         batch = FormationBatch(paper(perturbation=AROUND), starts=Starts(**shares))
@@ -132,7 +132,7 @@ def test_a_feature_that_never_happens_draws_no_number():
 @given(st.integers(0, 3), st.integers(0, 3), st.sampled_from([-1, 4, 2**40, -(2**40)]))
 @settings(max_examples=20)
 def test_actions_that_are_none_are_named(world, agent, value):
-    """Any index outside the action set is refused, wherever it stands, before a world has moved."""
+    """Any index outside the action set is refused, in any world and agent, before a world has moved."""
     batch = FormationBatch(paper(duration=1.0), worlds=4)
     actions = np.zeros((4, 4), dtype=np.int64)
     actions[world, agent] = value
@@ -187,7 +187,7 @@ def test_a_mask_chooses_the_worlds_that_begin_anew():
     other, _ = vector.reset(options={"reset_mask": ~mask})
     assert (other[mask] == begun[mask]).all() and (other[~mask] != begun[~mask]).any(axis=1).all()
     ends = [vector.step(actions)[2] for _ in range(20)]
-    assert (ends[19] == True).all() and not np.any(ends[:19])  # noqa: E712  # all had the same time left
+    assert (ends[19] == True).all() and not np.any(ends[:19])  # noqa: E712  # all worlds had the same time left
 
 
 def test_a_list_has_a_seed_for_every_world():
@@ -214,7 +214,7 @@ def test_wrong_resets_are_named(arguments, fragment):
 
 
 def test_infos_are_those_of_gymnasiums_own_vector_env():
-    """Step by step, over an episode's end: the same keys, masks and masked values as a SyncVectorEnv of single environments."""
+    """Keys, masks and masked values equal those of a SyncVectorEnv at every step, also when episodes end."""
     same = gymnasium.vector.AutoresetMode.SAME_STEP
     reference = gymnasium.vector.SyncVectorEnv([lambda: PaperFormation(duration=0.5)] * 2, autoreset_mode=same)
     vector = PaperFormationVector(2, duration=0.5)
@@ -259,11 +259,11 @@ def test_exploring_starts_lie_on_the_route_and_are_cut():
 
 
 def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
-    """Against copies of the worlds that go on past the ends: in worlds that end it is the old episode's, in others the state."""
+    """Checked against copies that do not end: in worlds that end it is the old episode's next state, in others the new state."""
     batch = FormationBatch(paper(perturbation=AROUND), worlds=12, interval=2, starts=Starts(exploring=0.8, length=1.0))
     batch.reset(5)
     twin, rng, partial = World(paper(perturbation=AROUND), worlds=12), np.random.default_rng(0), 0
-    batch.cut[batch.cut < 2000] += rng.integers(10, size=(batch.cut < 2000).sum())  # so that they end apart
+    batch.cut[batch.cut < 2000] += rng.integers(10, size=(batch.cut < 2000).sum())  # so that they end at different times
     for _ in range(25):
         twin.restore(batch.world.snapshot())
         actions, before = rng.integers(4, size=(12, 4)), twin.observe().age
@@ -283,7 +283,7 @@ def test_the_final_state_is_the_true_successor_where_only_some_worlds_end():
 
 
 def test_focused_starts_lie_shortly_before_the_moments_that_the_geometry_gives():
-    """Slots pass a point at 1 m, sqrt(3) m to either side; the gate is unsafe within 7 m of a disc, which slots pass at 3 m."""
+    """A slot is within d_OA up to sqrt(3) m from a point passed at 1 m, and up to sqrt(40) m from a 5 m disc passed at 3 m."""
     points = [20.0 - np.sqrt(3.0), 20.0 + np.sqrt(3.0), 45.0 - np.sqrt(3.0), 45.0 + np.sqrt(3.0)]
     gate = [60.0 - np.sqrt(40.0), 65.0 - np.sqrt(40.0), 70.0 + np.sqrt(40.0), 75.0 + np.sqrt(40.0)]
     batch = FormationBatch(paper(), worlds=200, interval=1, starts=Starts(exploring=1.0, focus=1.0, lead=3.0))
@@ -335,7 +335,7 @@ def test_nearest_points_at_the_nearest_surface(points, discs):
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from([2, 3, 4, 5, 9]))
 def test_the_extended_state_is_what_it_says(seed, agents):
-    """Every entry against its definition, with numbers beyond the range of some, for any team; NaN stays NaN."""
+    """Every entry equals its definition for any team, clipped if out of range; NaN stays NaN."""
     scenario, rng = paper() if agents == 4 else Family(agents=agents).build(), np.random.default_rng(seed)
     commands = len(scenario.orders.commands)
     read, world = make_state("extended", scenario), World(scenario, worlds=3)
@@ -365,7 +365,7 @@ def test_the_extended_state_is_what_it_says(seed, agents):
 
 
 def test_a_command_that_an_episode_began_with_is_as_old_as_can_be():
-    """Its age is infinite, and the state saturates: the same as at ``OLD`` or any later time."""
+    """Its age is infinite, which saturates the state as any age from ``OLD`` on does."""
     read, seen = make_state("extended", paper()), World(paper(), worlds=2).observe()
     assert np.isinf(seen.age).all()
     for age in (OLD, 2.0 * OLD):
@@ -374,7 +374,7 @@ def test_a_command_that_an_episode_began_with_is_as_old_as_can_be():
 
 
 def test_the_extended_state_does_not_know_where_on_the_path_it_is():
-    """Team and obstacles moved together along the path: the same state."""
+    """Moving team and obstacles together along the path does not change the state."""
     scenario = paper()
     read = make_state("extended", scenario)
     world = World(scenario)
@@ -392,7 +392,7 @@ def test_ages_count_from_the_last_change_of_command():
     batch.reset(0)
     plan = [[2, 2, 2, 2], [2, 2, 2, 2], [3, 2, 2, 2], [3, 2, 2, 0], [2, 2, 2, 0]]
     ages = [batch.step(np.array([row, [2] * 4])).age[0] for row in plan]
-    assert np.isinf(ages[:3]).all()  # the first decision switches nothing
+    assert np.isinf(ages[:3]).all()  # the first decision is no switch
     assert ages[3][0] == pytest.approx(0.5) and ages[4][0] == pytest.approx(1.0) and ages[4][3] == pytest.approx(0.5)
     assert batch.world.observe().age[0].tolist() == pytest.approx([0.5, np.inf, np.inf, 1.0])
 

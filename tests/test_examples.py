@@ -1,4 +1,4 @@
-"""Every script in examples/ runs and says something."""
+"""Every script in examples/ runs and prints something."""
 
 import runpy
 from pathlib import Path
@@ -14,6 +14,6 @@ def test_there_are_examples():
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_runs(path, capsys):
-    """As a user would run it."""
+    """It runs as a script and prints something."""
     runpy.run_path(str(path), run_name="__main__")
     assert capsys.readouterr().out.strip()

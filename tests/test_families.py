@@ -1,4 +1,4 @@
-"""Families of missions and scenario files: what a seed draws, what is refused and why, and TOML as the same dataclass."""
+"""Families of missions and scenario files: layouts drawn by seeds, reasons for refusals, and TOML files."""
 
 import re
 from dataclasses import fields, replace
@@ -15,7 +15,7 @@ from marlbc_mj.core.motion import moved
 from marlbc_mj.engine.world import World
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import FAMILIES, SCENARIOS, Perturbation, held_out, load_scenario, make_scenario
-from marlbc_mj.scenarios.families import Corridor, Crossing, Exchange, Field, Forest, Gates
+from marlbc_mj.scenarios.families import Corridor, Exchange, Field, Forest, Gates, TrafficFamily
 from marlbc_mj.scenarios.family import Family
 from marlbc_mj.scenarios.formations import FORMATIONS, column, make_formation
 from marlbc_mj.scenarios.layout import layout_number
@@ -37,7 +37,7 @@ def distances(points: np.ndarray) -> np.ndarray:
 @settings(deadline=None, max_examples=25)
 @given(agents=st.integers(2, 256), spacing=st.floats(0.1, 20.0))
 def test_formations_are_centred_and_keep_their_spacing(name, agents, spacing):
-    """From 2 to 256 agents the nearest two are ``spacing`` apart, and a column of the same team is as loose."""
+    """For 2 to 256 agents the two nearest are ``spacing`` apart, in the formation and in its column."""
     slots = make_formation(name, agents, spacing)
     assert slots.shape == (agents, 2)
     np.testing.assert_allclose(slots.mean(axis=0), 0.0, atol=1e-9 * agents * spacing)
@@ -54,7 +54,7 @@ def test_teams_have_2_to_256_agents(agents):
 
 @pytest.mark.parametrize("name", FAMILIES)
 def test_a_family_is_a_scenario_like_any_other(name):
-    """It builds, has a description, takes changes of both kinds, runs, and its seeds are reproducible."""
+    """It has a description, accepts changes of family and scenario, runs, and gives the same layouts for the same seed."""
     scenario = make_scenario(name, duration=1.0, agents=6, safe_distance=0.7)
     assert scenario.agents == 6 and scenario.mission_steps == 20 and scenario.description
     assert scenario.behaviors[0].safe_distance == scenario.safe_distance == 0.7
@@ -67,7 +67,7 @@ def test_a_family_is_a_scenario_like_any_other(name):
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_every_seed_draws_another_layout(name):
-    """As many obstacles each time; the starts clear of them by the safe distance."""
+    """All layouts differ and have the same number of obstacles; starts keep more than the safe distance from them."""
     scenario = make_scenario(name)
     draws = [scenario.draw(np.random.default_rng(seed)) for seed in range(6)]
     assert len({draw.obstacles.tobytes() + draw.motions.tobytes() for draw in draws}) == 6
@@ -79,14 +79,14 @@ def test_every_seed_draws_another_layout(name):
 
 @given(st.integers(0, 2**62), st.integers(0, 2**62))
 def test_train_and_test_draw_from_disjoint_layouts(one, other):
-    """By construction: whatever the seeds, training layouts have even numbers and held-out ones odd."""
+    """For any seeds, training layouts have even numbers and held-out layouts odd ones."""
     train, test = (layout_number(np.random.default_rng(seed), split) for seed, split in ((one, "train"), (other, "test")))
     assert train % 2 == 0 and test % 2 == 1
 
 
 @pytest.mark.parametrize("name", DRAWN)
 def test_held_out_scenarios_draw_what_training_does_not(name):
-    """The same seed gives another layout, and the draw says its number."""
+    """The same seed gives another layout, and each draw has its layout's number."""
     scenario = make_scenario(name)
     train, test = (one.draw(np.random.default_rng(4)) for one in (scenario, held_out(scenario)))
     assert (train.layout % 2, test.layout % 2) == (0, 1)
@@ -103,7 +103,7 @@ def test_only_what_is_drawn_can_be_held_out():
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32), st.sampled_from(["field", "forest"]))
 def test_an_agent_can_pass_between_any_two_discs(seed, name):
-    """Surfaces are at least ``gap``, more than twice the safe distance, apart."""
+    """Surfaces are at least ``gap`` apart, which is more than twice the safe distance."""
     family = FAMILIES[name]()
     discs = make_scenario(name).draw(np.random.default_rng(seed)).obstacles
     between = np.linalg.norm(discs[:, None, :2] - discs[None, :, :2], axis=-1) - discs[:, None, 2] - discs[None, :, 2]
@@ -114,7 +114,7 @@ def test_an_agent_can_pass_between_any_two_discs(seed, name):
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 2**32), st.floats(0.0, 1.0), st.floats(5.0, 9.0), st.booleans())
 def test_openings_are_as_wide_as_asked(seed, shift, width, corridor):
-    """The free interval of each wall that holds the path is ``width`` long, within ``shift`` of it; walls hide the formation."""
+    """Each wall's opening is ``width`` wide, with its middle within ``shift`` of the path; walls are wider than the formation."""
     family = (Corridor if corridor else Gates)(width=width, shift=shift)
     discs = family.build().draw(np.random.default_rng(seed)).obstacles
     for first, last in family.passages():
@@ -131,8 +131,8 @@ def test_openings_are_as_wide_as_asked(seed, shift, width, corridor):
 @settings(deadline=None, max_examples=10)
 @given(st.integers(0, 2**32))
 def test_moving_obstacles_keep_apart_and_leave_both_ends_free(seed):
-    """At every quarter of a second."""
-    family = Crossing()
+    """Checked every 0.25 s: gaps between obstacles, and the team's slots at the start and at the end."""
+    family = TrafficFamily()
     draw = family.build().draw(np.random.default_rng(seed))
     tracks = moved(np.arange(0.0, 60.25, 0.25), draw.obstacles, draw.motions)
     for place in tracks:
@@ -158,9 +158,9 @@ def test_moving_obstacles_keep_apart_and_leave_both_ends_free(seed):
         (Gates(gates=20), ("20 passages", "do not fit")),
         (Gates(post=0.0), ("post must be positive", "0.0")),
         (Corridor(depth=-1.0), ("depth must be non-negative", "-1.0")),
-        (Crossing(swinging=9), ("swinging at most as many", "6 and 9")),
-        (Crossing(obstacles=60, swinging=0), ("no room for 60 moving obstacles",)),
-        (Crossing(swing=(0.0, 1.0)), ("swing must be an ordered range",)),
+        (TrafficFamily(swinging=9), ("swinging at most as many", "6 and 9")),
+        (TrafficFamily(obstacles=60, swinging=0), ("no room for 60 moving obstacles",)),
+        (TrafficFamily(swing=(0.0, 1.0)), ("swing must be an ordered range",)),
         (Exchange(spacing=1.0), ("spacing must be at least 1.1 times the agent_distance of 2.5 m", "1 m")),
         (Family(speed=0.0), ("speed must be positive", "0.0")),
         (Family(files=5), ("files must be from 1 to 4", "5")),
@@ -171,7 +171,7 @@ def test_moving_obstacles_keep_apart_and_leave_both_ends_free(seed):
     ids=lambda value: type(value).__name__ if isinstance(value, Family) else None,
 )
 def test_what_cannot_be_flown_is_refused_with_the_reason(family, fragments):
-    """When the scenario is built, or its world."""
+    """It is refused when the scenario or its World is built."""
     with refusal(*fragments):
         World(family.build())
 
@@ -183,7 +183,7 @@ def test_changes_that_no_field_has_are_named():
 
 @pytest.mark.parametrize("name", ["field", "forest", "traffic"])
 def test_schedules_belong_to_known_places(name):
-    """Scripted and oracle refuse with the reason; gates and corridors, whose walls stand still, have a schedule."""
+    """These random layouts have no schedule, so scripted and oracle refuse them with the reason; gates have one."""
     with refusal(f"scenario {name!r} has no schedule"):
         make_supervisor("scripted").start(make_scenario(name), 1)
     with refusal("marlbc oracle"):
@@ -201,7 +201,7 @@ def write(tmp_path, text: str):
 
 
 def test_a_file_loads_into_the_same_dataclass(tmp_path):
-    """Every field that TOML names, and the file's name where it gives none."""
+    """All fields in the file are set; without a name in the file, its file name is used."""
     path = write(
         tmp_path,
         """
@@ -286,7 +286,7 @@ def test_the_case_study_with_changes(tmp_path, name):
     ],
 )  # fmt: skip
 def test_what_a_file_has_wrong_is_named(tmp_path, text, fragments):
-    """The file, the key, the value and the valid ones."""
+    """The message names the file, the key, the value and the valid ones."""
     with refusal("mine.toml", *fragments):
         load_scenario(write(tmp_path, text))
 
@@ -300,7 +300,7 @@ def test_files_that_are_not_there_or_no_text(tmp_path):
 
 
 def test_every_key_of_every_family_can_be_written(tmp_path):
-    """No field of a family is out of a file's reach: the defaults written out are the family."""
+    """A file with all fields of a family at their defaults gives the same scenario as the family."""
     for name, family in FAMILIES.items():
         lines = [f'family = "{name}"']
         for entry in fields(family):
@@ -318,7 +318,7 @@ def test_every_key_of_every_family_can_be_written(tmp_path):
 
 @pytest.mark.parametrize("name", ["field", "gates"])
 def test_a_real_robot_flies_a_family_of_its_scale(name):
-    """Lengths times the robot's unit, its mass and limits; solid obstacles of one radius each."""
+    """Lengths are scaled to the robot, with its mass and limits; its obstacles are solid and all have one radius."""
     body = make_robot("disc")
     unit = body.length
     lengths = {key: unit * getattr(FAMILIES[name](), key) for key in ("spacing", "column_spacing", "length", "safe_distance")}
@@ -340,7 +340,7 @@ def test_a_real_robot_flies_a_family_of_its_scale(name):
 
 
 def test_what_solid_obstacles_cannot_do_is_refused():
-    """Radii that a seed would change, and motion."""
+    """Solid obstacles cannot have radii that depend on the seed, and cannot move."""
     scale = make_robot("disc").scale()
     with refusal("robot 'disc' collides with obstacles, whose radii no seed can change", "[r, r]"):
         World(make_scenario("field", duration=1.0, **scale)).reset(5)
@@ -353,7 +353,7 @@ def test_what_solid_obstacles_cannot_do_is_refused():
 
 @given(st.integers(0, 10**6), st.floats(0, 300), st.floats(0.1, 2.0))
 def test_gusts_depend_on_time_and_seed_alone(seed, t, scale):
-    """The same for every place and speed, again and again; scaled, and another for another seed."""
+    """They do not depend on position or velocity, are proportional to ``scale``, and differ between seeds."""
 
     def force(gusts: WindGusts, p: float = 0.0) -> np.ndarray:
         out = np.empty(2)
@@ -368,7 +368,7 @@ def test_gusts_depend_on_time_and_seed_alone(seed, t, scale):
 
 
 def test_gusts_have_the_strength_and_the_mean_that_they_say():
-    """Over an hour."""
+    """Checked over an hour."""
     gusts, out = WindGusts(steady=(3.0, -1.0), strength=8.0, seed=5), np.empty(2)
     rows = []
     for t in np.arange(0.0, 3600.0, 0.5):

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, on real disks that are full."""
+"""Files appear whole or not at all, also on a full disk and when writers are killed."""
 
 import os
 import subprocess
@@ -21,12 +21,12 @@ WRITERS = {
     "table": lambda path, size: write_table(path.with_suffix(".csv"), [{"x": float(k)} for k in range(size)]),
 }
 LIMIT = 64 * 1024  # bytes
-LARGE = 20_000  # entries that do not fit
+LARGE = 20_000  # number of entries that exceeds LIMIT
 
 
 @contextmanager
 def small_disk(folder: Path):
-    """A file system of LIMIT bytes, which takes root."""
+    """A mounted file system of LIMIT bytes; mounting needs root."""
     folder.mkdir()
     made = subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={LIMIT}", "none", str(folder)], capture_output=True, check=False)
     if made.returncode:
@@ -67,7 +67,7 @@ for kind, write in WRITERS.items():
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such limit there")
 def test_a_limit_of_the_file_size_is_one_line(tmp_path):
-    """The same without root: the system refuses what goes beyond a limit of the process."""
+    """As on a full disk, but without root: the process has a limit on the size of files."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
     command = [sys.executable, "-c", LIMITED, str(tmp_path)]
     said = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.splitlines()
@@ -82,7 +82,7 @@ def test_leftovers_of_killed_writers_go_and_nothing_else(tmp_path):
         path.write_text("{}")
     killed = [staged_file(folder / "c.json") for folder in (tmp_path, tmp_path / "inner")]
     for folder, writer in zip((tmp_path, tmp_path / "inner"), killed, strict=True):
-        writer.__enter__().write_text("torn")  # and never left, as by kill -9
+        writer.__enter__().write_text("torn")  # not exited, as after kill -9
         staging = [path for path in folder.iterdir() if "partial-" in path.name]
         assert len(staging) == 1
     remove_leftovers(tmp_path)
@@ -105,12 +105,12 @@ def fill(out: Path, names: tuple[str, ...] = ("a.json", "logs/b.mcap"), text: st
 
 
 def listed(folder: Path) -> set[str]:
-    """All files below a folder, without the list of them."""
+    """All files below a folder, except the manifest."""
     return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if not p.is_dir()} - {MANIFEST}
 
 
 def test_the_second_of_two_jobs_is_refused_when_it_comes_to_the_name(tmp_path):
-    """Both began with no folder there; what the first has left stays, and nothing of the second does."""
+    """Both begin without the folder; the files of the first stay, and those of the second are removed."""
     first, second = staged_folder(tmp_path / "out"), staged_folder(tmp_path / "out")
     folders = first.__enter__(), second.__enter__()
     for folder, text in zip(folders, ("first", "second"), strict=True):
@@ -167,7 +167,7 @@ def test_a_list_of_files_cannot_point_elsewhere(tmp_path):
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "out" / MANIFEST).write_text(f'["../mine", "{tmp_path}/mine", 3, "a.json", "logs/b.mcap"]')
     with pytest.raises(ConfigurationError, match="not written by marlbc"):
-        fill(tmp_path / "out", overwrite=True)  # a list that is none names nothing
+        fill(tmp_path / "out", overwrite=True)  # an invalid list counts as empty
     (tmp_path / "out" / MANIFEST).write_text(f'["../mine", "{tmp_path}/mine", "a.json", "logs/b.mcap"]')
     fill(tmp_path / "out", overwrite=True)
     assert (tmp_path / "mine").read_text() == "mine"
@@ -185,7 +185,7 @@ def test_a_link_to_a_folder_stays_one(tmp_path, overwrite):
 
 
 def test_the_current_folder_stays_the_same_one(tmp_path, monkeypatch):
-    """A shell that is in it would otherwise be nowhere."""
+    """Otherwise a shell in this folder would be in a deleted one."""
     monkeypatch.chdir(tmp_path)
     before = tmp_path.stat().st_ino
     fill(Path())
@@ -226,7 +226,7 @@ def test_orphans_of_killed_writers_go_and_those_of_living_ones_stay(tmp_path):
 
 
 def test_a_folder_that_was_being_replaced_comes_back(tmp_path):
-    """Killed between two renames, the old results had another name only."""
+    """If a writer is killed between its two renames, the old results exist only under a temporary name."""
     fill(tmp_path / "out", text="old")
     (tmp_path / "out").rename(tmp_path / "out.old-17-abcdef")
     with pytest.raises(ZeroDivisionError), staged_folder(tmp_path / "out", overwrite=True):
@@ -254,7 +254,7 @@ def test_names_that_the_system_refuses_are_one_line(tmp_path, name):
 
 @pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="mounting takes root")
 def test_a_full_disk_during_a_study_is_one_line_and_status_3(tmp_path):
-    """Whatever writes into the folder; also where the folder is where the disk is mounted, as in a container."""
+    """This also holds if the output folder is a mount point, as in a container."""
     with small_disk(tmp_path / "disk") as disk:
         for out in (disk / "out", disk):
             with pytest.raises(ConfigurationError, match=f"cannot write {out}: No space left") as error:
@@ -265,7 +265,7 @@ def test_a_full_disk_during_a_study_is_one_line_and_status_3(tmp_path):
 
 
 def test_one_process_writes_into_a_folder(tmp_path):
-    """A second is refused while the first is at it, and afterwards unless it may overwrite; a folder without a file goes."""
+    """A second one is refused meanwhile, and afterwards without overwrite; an empty folder is removed."""
     out = tmp_path / "runs" / "run"
     for content in ("", "a.json"):
         with alone_in(out, overwrite=False):
@@ -282,7 +282,7 @@ def test_one_process_writes_into_a_folder(tmp_path):
 
 
 def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path, capsys):
-    """The trial leaves no folder; the commands that work for minutes make it first."""
+    """The check leaves no folder behind; commands that run for minutes make it first."""
     check_writable(tmp_path / "new" / "folder" / "a.json", overwrite=False)
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").touch()

@@ -1,4 +1,4 @@
-"""FMS: fuzzy sets that add up, the rules one by one, and a whole episode."""
+"""FMS: its fuzzy sets, the rules one by one, and a whole episode."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ rates = st.floats(-100.0, 100.0)
 
 
 def run(clearance, supervisor=None) -> np.ndarray:
-    """Orders (T, 4) for clearances (T,) that all agents share [m]; the safe distance is 2 m."""
+    """Orders (T, 4) for clearances (T,) [m], the same for all agents; the safe distance is 2 m."""
     supervisor = supervisor or FMS()
     memory, out = supervisor.start(PAPER, 1), []
     for step, d in enumerate(clearance):
@@ -72,14 +72,14 @@ def test_each_rule_alone():
 
 
 def test_opening_in_the_middle_keeps_the_order_in_force():
-    """Coming out of danger: OA stays while mid and opening, until far."""
+    """After near, OA stays in force while the clearance is mid and opening, until it is far."""
     orders = run([1.5, 2.8, 3.2, 3.6, 6.0])
     assert (orders[:4] == OA).all()
     assert (orders[4] == FM).all()
 
 
 def test_a_lead_below_the_threshold_does_not_switch():
-    """x = 1.15, first step: near 0.5, mid and closing 0.25, keep (FM) 0.25: the lead is 0.25."""
+    """At x = 1.15 in the first step, OA has 0.5, FR 0.25 and keeping FM 0.25, so OA leads by 0.25."""
     assert (run([2.3])[-1] == OA).all()
     assert (run([2.3], FMS(lead=0.3))[-1] == FM).all()
 
@@ -91,7 +91,7 @@ def test_a_lead_outside_the_range_of_strengths_is_refused(lead):
 
 
 def test_on_the_case_study_it_is_deterministic_and_chatters():
-    """Decisions on clearance alone undo what caused them: tens of switches, as any such automaton."""
+    """Decisions on clearance alone undo their own causes, so every agent switches more than ten times."""
     first, second = (run_episode(World(PAPER, record=True), FMS()) for _ in range(2))
     np.testing.assert_array_equal(first.command, second.command)
     metrics = measure(first)

@@ -1,4 +1,4 @@
-"""The older frameworks: their weights, hand-made cases, and the engine's way to take a reference velocity that is given."""
+"""Subsumption, motor schemas and fuzzy blending: weights, cases computed by hand, and given velocities in the engine."""
 
 from dataclasses import dataclass
 
@@ -28,7 +28,7 @@ clearances = st.lists(st.floats(-5.0, 20.0) | st.just(np.inf), min_size=1, max_s
 
 
 def at(position, clearance, *, reference=None, obstacles=(), step: int = 0) -> Observation:
-    """One team seen at ``position``, its reference there too unless given; clearances are what the test says."""
+    """Observation of one team at ``position`` with ``clearance``; references are at the same place unless given."""
     position = np.array(position, dtype=float)
     reference = position if reference is None else np.array(reference, dtype=float)
     discs, clearance = np.array(obstacles, dtype=float).reshape(-1, 3), np.array(clearance, dtype=float)
@@ -38,7 +38,7 @@ def at(position, clearance, *, reference=None, obstacles=(), step: int = 0) -> O
 
 
 def decided(supervisor, now: Observation, scenario: Scenario = PAPER) -> Blend:
-    """The decision for the one team."""
+    """The decision for a single team: orders (N,) and velocities (N, 2)."""
     blend, _ = supervisor.decide(now, supervisor.start(scenario, 1))
     return Blend(blend.orders[0], blend.velocity[0])
 
@@ -49,7 +49,7 @@ def slots(which: int, step: int = 0) -> np.ndarray:
 
 
 def composed(scenario: Scenario, orders: np.ndarray, position) -> np.ndarray:
-    """(N, 2) v_r that the engine makes of ``orders`` (N,) at t = 0 with the references at ``position``."""
+    """v_r (N, 2) that the engine composes from ``orders`` (N,) at t = 0 with the references at ``position``."""
     world = World(scenario, PD(), record=True)
     world.state.reference[0] = position
     return world.step(orders[None]).record.reference_velocity[0, 0]
@@ -60,7 +60,7 @@ def composed(scenario: Scenario, orders: np.ndarray, position) -> np.ndarray:
 
 @given(clearances)
 def test_layered_gives_one_behavior_everything(d):
-    """Weights are 0 or 1 and sum to 1: OA from d_OA down, FR from 2 d_OA down, FM beyond."""
+    """Weights are 0 or 1 and sum to 1: OA up to d_OA, FR up to 2 d_OA, FM beyond."""
     weights = Layered().weights(d, 2.0)
     assert (weights.sum(axis=0) == 1.0).all() and ((weights == 0.0) | (weights == 1.0)).all()
     np.testing.assert_array_equal(weights.argmax(axis=0), np.where(d <= 2.0, 2, np.where(d <= 4.0, 1, 0)))
@@ -68,7 +68,7 @@ def test_layered_gives_one_behavior_everything(d):
 
 @given(clearances)
 def test_fuzzy_weights_are_a_mean(d):
-    """In [0, 1], sum 1."""
+    """They are in [0, 1], and their sum is 1."""
     weights = FuzzyBlend().weights(d, 2.0)
     np.testing.assert_allclose(weights.sum(axis=0), 1.0, rtol=0, atol=1e-15)
     assert ((weights >= -1e-15) & (weights <= 1.0)).all()
@@ -76,7 +76,7 @@ def test_fuzzy_weights_are_a_mean(d):
 
 @given(clearances, clearances)
 def test_schema_weights_fall_with_distance_and_end_at_the_sphere(d, other):
-    """FM's is its gain everywhere; those of OA and FR are their gains within R and 0 beyond S."""
+    """FM's weight is its gain everywhere; those of OA and FR are their gains within R and 0 beyond S."""
     schema = MotorSchema()
     d, other = np.sort(np.stack([np.resize(d, 6), np.resize(other, 6)]), axis=0)
     near, far = schema.weights(d), schema.weights(other)
@@ -89,7 +89,7 @@ def test_schema_weights_fall_with_distance_and_end_at_the_sphere(d, other):
 
 @pytest.mark.parametrize(("d", "m"), [(-3, 1), (2, 1), (2.5, 0.75), (3, 0.5), (3.5, 0.25), (4, 0), (9, 0), (np.inf, 0)])
 def test_the_obstacles_magnitude_at_its_corners(d, m):
-    """0 beyond S = 4 m, linear, 1 within R = 2 m."""
+    """It is 1 within R = 2 m, 0 beyond S = 4 m, and linear in between."""
     assert MotorSchema().magnitude(np.array([float(d)])) == pytest.approx([m], abs=1e-15)
 
 
@@ -97,7 +97,7 @@ def test_the_obstacles_magnitude_at_its_corners(d, m):
 
 
 def test_a_schema_is_never_faster_than_its_gain_allows():
-    """FM alone, 30 m off its slot: 10 m/s on top of the path's velocity, towards the slot; at the slot the path's velocity."""
+    """FM alone, 30 m from the slot: the path's velocity plus 10 m/s towards the slot; on the slot, the path's velocity."""
     p = slots(0) + (0.0, 30.0)
     p[1] = slots(0)[1]
     velocity = decided(MotorSchema(), at(p, [9.0] * 4)).velocity
@@ -107,7 +107,7 @@ def test_a_schema_is_never_faster_than_its_gain_allows():
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("obstacles", [(), ((1000.0, 0.0, 1.0),)])
 def test_far_from_obstacles_all_are_formation_maintenance(name, obstacles):
-    """v_r is what the order FM composes, and FM the label, without obstacles and with one far away."""
+    """v_r is that of the order FM, and the label is FM, without obstacles and with one far away."""
     p = slots(0) + np.random.default_rng(0).uniform(-0.8, 0.8, (4, 2))
     blend = decided(make_supervisor(name), at(p, [np.inf if not obstacles else 900.0] * 4, obstacles=obstacles))
     assert (blend.orders == FM).all()
@@ -115,7 +115,7 @@ def test_far_from_obstacles_all_are_formation_maintenance(name, obstacles):
 
 
 def test_layered_avoids_without_following_the_path():
-    """Agent 1 half a metre inside d_OA above a point: 20 * 0.5 m/s along the normal and nothing else; the others as composed."""
+    """Agent 1 is 0.5 m inside d_OA: its velocity is 20 * 0.5 m/s along the normal, without the path's velocity."""
     p = slots(0)
     p[0] = 10.0, 6.5
     blend = decided(Layered(), at(p, (1.5, 3.0, 2.0, 4.1), obstacles=[(10.0, 5.0, 0.0)]))
@@ -127,14 +127,14 @@ def test_layered_avoids_without_following_the_path():
 
 
 def test_layered_rests_at_the_safe_distance():
-    """At d = d_OA avoidance is active and asks for nothing, however far the slot is ahead: the framework's deadlock."""
+    """At d = d_OA avoidance is active with zero velocity, however far ahead the slot is: the framework's deadlock."""
     p = slots(0, step=1000) - (30.0, 0.0)
     discs = [(*(p[0] - (0.0, 2.0)), 0.0)]
     assert (decided(Layered(), at(p, (2.0, 9.0, 9.0, 9.0), obstacles=discs, step=1000)).velocity[0] == 0.0).all()
 
 
 def test_layered_changes_where_the_automaton_does():
-    """Its labels are FSAMS's orders for any clearances; ``reach`` moves the outer threshold."""
+    """Its labels equal the orders of FSAMS for any clearances; ``reach`` sets the outer threshold."""
     automaton = FSAMS()
     for row in np.random.default_rng(1).uniform(-1, 6, (50, 4)):
         now = at(slots(0), row)
@@ -143,7 +143,7 @@ def test_layered_changes_where_the_automaton_does():
 
 
 def test_the_fuzzy_mean_by_hand():
-    """x = 1.15: half OA, half FR. x = 1.5: FR. x = 2.3: half FR, half FM, and the first of equals is the label."""
+    """x = 1.15: half OA, half FR. x = 1.5: FR. x = 2.3: half FR, half FM."""
     p = slots(0) + (0.5, 0.0)
     blend = decided(FuzzyBlend(), at(p, (2.3, 3.0, 4.6, 9.0), obstacles=[(p[0, 0], p[0, 1] - 1.5, 0.0)]))
     fm, fr = (PATH_VELOCITY + 8.0 * (slots(which) - p) for which in (0, 1))
@@ -171,7 +171,7 @@ def test_the_schemas_sum_by_hand():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_behaviors_are_evaluated_where_the_mission_does(name):
-    """At p_r in ``virtual`` mode, at the measured p in ``actual`` mode; the clearance is the measured one in both."""
+    """At p_r in ``virtual`` mode and at the measured p in ``actual`` mode; the clearance is the measured one in both."""
     here, there = slots(0), slots(0) + (0.6, -1.0)
     for mode, seen in (("virtual", there), ("actual", here)):
         scenario = paper(reference=mode)
@@ -182,7 +182,7 @@ def test_behaviors_are_evaluated_where_the_mission_does(name):
 @pytest.mark.parametrize("agents", [2, 3, 7])
 @pytest.mark.parametrize("name", NAMES)
 def test_any_number_of_agents(name, agents):
-    """A whole short episode; every agent decides on its own clearance."""
+    """A short episode runs, in which agents get different orders by their own clearances."""
     column = tuple((3.0 * i, 0.0) for i in range(agents))
     line = tuple((0.0, 3.0 * i) for i in range(agents))
     scenario = paper(starts=line, behaviors=standard_behaviors(line, column), obstacles=((1.5, -1.5),), schedule=(), duration=3.0)
@@ -237,14 +237,14 @@ def test_a_scenario_without_one_of_the_behaviors_is_refused(name):
 
 
 def test_the_fuzzy_mean_is_safe_and_slow(episode):
-    """No violation; less return than the scripted 15 017, since it leaves the formation wherever an obstacle is not far."""
+    """It has no violation, but less return than the schedule's 15 017, as it leaves the formation near any obstacle."""
     metrics = measure(episode("fuzzy-blend", "sorlc"))
     assert [agent["violation_time"] for agent in metrics["agents"]] == [0.0] * 4
     assert 5_000 < metrics["team"]["return"] < 15_017
 
 
 def test_layered_gets_stuck_in_the_gate(episode):
-    """At least one agent ends up at rest at d_OA of a disc, in violation by (14), while the path goes on."""
+    """At least one agent comes to rest at d_OA from a disc, a violation by (14), while the path continues."""
     trajectory = episode("layered", "sorlc")
     stuck = [agent["violation_time"] > 10.0 for agent in measure(trajectory)["agents"]]
     assert any(stuck)
@@ -252,7 +252,7 @@ def test_layered_gets_stuck_in_the_gate(episode):
 
 
 def test_the_schemas_compromise_is_not_quite_safe(episode):
-    """A sum has no priorities: FM and FR together push an agent a little into d_OA, for seconds in all."""
+    """A sum has no priorities: FM and FR push agents slightly inside d_OA, for less than 5 s in total."""
     metrics = measure(episode("motor-schema", "sorlc"))
     assert 0.0 < sum(agent["violation_time"] for agent in metrics["agents"]) < 5.0
     assert 5_000 < metrics["team"]["return"] < 15_017
@@ -263,7 +263,7 @@ def test_the_schemas_compromise_is_not_quite_safe(episode):
 
 @dataclass(frozen=True)
 class Drift:
-    """Everybody moves at one velocity, under the order of ``label``."""
+    """A supervisor that gives all agents the same velocity, with ``label`` as their order."""
 
     velocity: tuple[float, float] = (0.5, -0.25)
     label: str = "FR"
@@ -287,7 +287,7 @@ def assert_same_bits(actual, expected) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_compiled_loop_and_python_path_agree_to_the_bit(name):
-    """The first 25 s, past the first obstacle, with the velocities that a framework gives."""
+    """Checked over the first 25 s, past the first obstacle, with the velocities of each framework."""
     runs = [
         run_episode(World(paper(duration=25.0), record=True, native=native), make_supervisor(name)) for native in (None, False)
     ]
@@ -297,7 +297,7 @@ def test_compiled_loop_and_python_path_agree_to_the_bit(name):
 @pytest.mark.parametrize("reference", ["virtual", "actual"])
 @pytest.mark.parametrize("native", [None, False])
 def test_given_what_would_be_composed_the_episode_is_the_same(native, reference):
-    """The composed v_r of three perturbed worlds, given back step by step: every number of the episode to the bit."""
+    """If the v_r composed in three perturbed worlds is given step by step, all numbers are equal to the last bit."""
     scenario = paper(perturbation=PERTURBED, reference=reference)
     orders = np.repeat(np.random.default_rng(0).integers(0, 6, (20, 3, 4)), 3, axis=0)
     threads = min(2, numba.config.NUMBA_NUM_THREADS)
@@ -311,7 +311,7 @@ def test_given_what_would_be_composed_the_episode_is_the_same(native, reference)
 
 @pytest.mark.parametrize("native", [None, False])
 def test_a_given_velocity_is_held_for_one_mission_step_and_the_orders_only_label_it(native):
-    """v_r is what was given, p_r its integral; command and r2 are the orders'; the next step is composed again."""
+    """v_r is the given velocity, p_r its integral; command and r2 follow from the orders; the next step composes v_r again."""
     scenario = paper()
     world, label = World(scenario, PD(), record=True, native=native), np.full((1, 4), FR)
     given_velocity = np.random.default_rng(2).uniform(-3, 3, (1, 4, 2))
@@ -328,7 +328,7 @@ def test_a_given_velocity_is_held_for_one_mission_step_and_the_orders_only_label
 
 
 def test_a_rollout_is_composed_whatever_was_given_before():
-    """The same schedule after the same given step: rollout equals single steps."""
+    """After a step with given velocities, a rollout still equals single steps."""
     schedule = np.random.default_rng(3).integers(0, 6, (20, 2, 4))
     worlds = [World(paper(), worlds=2) for _ in range(2)]
     for world in worlds:
@@ -339,7 +339,7 @@ def test_a_rollout_is_composed_whatever_was_given_before():
 
 
 def test_run_episode_passes_a_supervisors_velocities_on():
-    """Position follows them, the log has the label."""
+    """The reference follows them, and the trajectory has the label as its command."""
     trajectory = run_episode(World(paper(duration=1.0), record=True), Drift())
     assert (trajectory.reference_velocity == (0.5, -0.25)).all()
     assert (trajectory.command == PAPER.orders.command_of[FR]).all()
@@ -356,7 +356,7 @@ def test_the_observation_has_the_reference_as_a_copy():
 
 
 def test_velocities_need_not_be_float64_nor_contiguous():
-    """Integers, float32, lists and views are taken by value."""
+    """Integers, float32, lists and strided views give the same result."""
     orders, values = np.full((2, 4), FM), np.arange(16).reshape(2, 4, 2)
     expected = World(paper(), worlds=2).step(orders, values.astype(float)).observation
     views = np.zeros((2, 4, 4))
@@ -383,7 +383,7 @@ BROKEN[1, 2, 0] = np.nan
     ],
 )
 def test_velocities_that_cannot_be_followed_are_refused(velocity, message, native):
-    """Before anything moves."""
+    """They are refused before anything moves."""
     world = World(paper(), worlds=2, native=native)
     with pytest.raises(ConfigurationError, match=message):
         world.step(np.full((2, 4), FM), velocity)

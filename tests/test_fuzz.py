@@ -1,4 +1,4 @@
-"""The fuzzing of :mod:`fuzz` itself: a few dozen cases go well, and faults that are planted are found."""
+"""Tests of the fuzzer :mod:`fuzz` itself: a few cases pass, and planted faults are found."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The general policy: one network for all teams, how it chooses an order, what it refuses, its checkpoints and its flights."""
+"""The general policy: one network for all teams, its decisions, refusals, checkpoints and missions."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +39,7 @@ def random_policy(seed: int = 0, margin: float = 0.0, actions: int = 2, **flown)
 
 
 def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
-    """The policy with another layer between its two."""
+    """The policy with a third layer between its two."""
     weight = np.random.default_rng(seed).normal(size=(1, 16, 16)).astype(np.float32)
     weights, biases = policy.network.weights, policy.network.biases
     return make_general((weights[0], weight, weights[1]), (biases[0], biases[0], biases[1]), 0.0)
@@ -62,7 +62,7 @@ def test_who_hears_nothing_decides_by_itself() -> None:
 
 @pytest.mark.parametrize("dwell", [1, 2, 4])
 def test_a_new_order_is_kept_for_the_dwell(dwell: int) -> None:
-    """At least so many decisions; the first change of an episode may come at once, and without a dwell orders last a decision."""
+    """It is kept for at least ``dwell`` decisions; the first change of an episode can come after one decision."""
     scenario = field(split="test", duration=20.0)
     lasted, first = [], []
     for seed in range(4):
@@ -82,14 +82,14 @@ def test_a_new_order_is_kept_for_the_dwell(dwell: int) -> None:
 
 
 def returns(distance: float, left: float, deadline: float) -> bool:
-    """Whether an agent so far from its slot in the formation [d_OA], with so much time left [T], must return."""
+    """Whether an agent at ``distance`` from its slot in the formation [d_OA] with the time ``left`` [T] must return."""
     entries = np.float32([np.tanh(distance / inputs.COARSE), np.exp(-left / inputs.COARSEST)])
     return bool(must_return(*entries, deadline))
 
 
 @given(st.floats(0.0, 30.0), st.floats(0.05, 60.0), st.floats(0.2, 3.0))
 def test_an_agent_returns_when_its_way_takes_the_time_left(distance: float, left: float, deadline: float) -> None:
-    """In the units of the features, whose entries saturate; farther than 36 d_OA counts as 36."""
+    """Distance and time are in the units of the features, which saturate: distances above 36 d_OA count as 36."""
     if abs(left / (deadline * distance + 1e-9) - 1.0) > 1e-2:
         assert returns(distance, left, deadline) == (left < deadline * distance)
     assert not returns(1e3, 40.0, 1.0)
@@ -98,7 +98,7 @@ def test_an_agent_returns_when_its_way_takes_the_time_left(distance: float, left
 
 @pytest.mark.parametrize("actions", [2, 4])
 def test_the_deadline_brings_everybody_into_formation(actions: int) -> None:
-    """In the last decision, whatever the networks say; avoidance stays as it is, and without a deadline nothing is forced."""
+    """If no time is left, all agents return, whatever the networks prefer, and keep avoidance; without a deadline none must."""
     rng = np.random.default_rng(0)
     features = rng.uniform(0.1, 0.9, size=(20, 4, inputs.FEATURES)).astype(np.float32)
     features[10:, :, inputs.ENDING + 1], features[:10, :, inputs.ENDING + 1] = 1.0, 1e-3
@@ -124,7 +124,7 @@ def test_one_policy_flies_teams_of_any_size(formation: str, agents: int) -> None
 
 
 def test_teams_do_not_depend_on_each_other() -> None:
-    """Values and decisions of a team are the same, bit for bit, whatever other teams are asked about."""
+    """The values of a team are the same alone and together with other teams, to the last bit."""
     scenario = field(split="test")
     world = World(scenario, worlds=5)
     seen = world.reset(3)
@@ -138,7 +138,7 @@ def test_teams_do_not_depend_on_each_other() -> None:
 
 
 def test_a_policy_with_four_actions_decides_about_avoidance() -> None:
-    """Under the null-space composition alone; its orders are those of its best actions, and close neighbors give way."""
+    """It needs the null-space composition; its orders are those of the best actions, with AA on top near neighbors."""
     scenario, policy = make_scenario("field"), random_policy(actions=4)
     names = [scenario.orders.names[k] for k in orders_for(policy, scenario)]
     assert names == ["FM>OA>FR>AA", "FR>OA>FM>AA", "OA>FM>FR>AA", "OA>FR>FM>AA"]
@@ -222,7 +222,7 @@ def test_a_checkpoint_of_one_team_is_no_general_policy() -> None:
 
 
 def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
-    """Also of three layers; a mean of none, or of networks of two sizes, is refused."""
+    """This also holds for three layers; a mean of no policies, or of networks of different sizes, is refused."""
     deep = [with_middle_layer(random_policy(seed), seed) for seed in range(3)]
     seen = np.random.default_rng(0).normal(size=(7, inputs.INPUTS)).astype(np.float32)
     for policies in ([random_policy(1), random_policy(2)], deep):
@@ -235,7 +235,7 @@ def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
 
 
 def test_the_shipped_policy_flies_what_it_never_saw() -> None:
-    """A held-out layout of a family with walls, in whose middle only the column fits."""
+    """It succeeds on held-out layouts of gates, through which only the column fits."""
     scenario = make_scenario("gates", composition="set-based", split="test")
     verdict = Judge(scenario, "sorlc", 2)(make_supervisor("marlms-general"), seed=59_000)
     assert verdict.success.all()
@@ -243,7 +243,7 @@ def test_the_shipped_policy_flies_what_it_never_saw() -> None:
 
 
 def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
-    """(steps, B, N) orders of the first mission steps of held-out layouts."""
+    """Orders (steps, B, N) of a random policy in the first mission steps."""
     supervisor, world = General(random_policy()), World(scenario, worlds=worlds)
     observation, memory = world.reset(3), supervisor.start(scenario, worlds)
     taken = []
@@ -255,14 +255,14 @@ def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
 
 
 def test_ideal_communication_is_the_limit_of_a_long_range() -> None:
-    """One decision is the same whether nothing is exchanged because all hear all, or a layer carries it without limits."""
+    """Decisions are the same with ideal communication, which has no layer, and with a layer of very long range."""
     ideal, carried = (field(communication=c) for c in (Communication(), Communication(range=1e6)))
     np.testing.assert_array_equal(decisions(carried), decisions(ideal))
 
 
 @pytest.mark.parametrize("changes", [{"delay": 0.1, "loss": 0.5}, {"silent": (0,)}, {"protocol": "consensus", "range": 9.0}])
 def test_it_flies_over_any_network(changes) -> None:
-    """Every team decides on its own network: alone it takes the same orders as beside another."""
+    """Every team has its own network, so it takes the same orders alone and next to another team."""
     scenario = field(communication=Communication(**changes))
     taken = decisions(scenario)
     assert np.isin(taken, [scenario.orders.index("FM"), scenario.orders.index("FR")]).all()
@@ -270,7 +270,7 @@ def test_it_flies_over_any_network(changes) -> None:
 
 
 def test_validation_missions_are_what_their_names_say() -> None:
-    """Each once, under the set-based composition, on layouts that no training draws."""
+    """Each has the family, team and variation of its name, the set-based composition, and held-out layouts."""
     made = {name: validation.validation_mission(name) for name in validation.VALIDATION_MISSIONS}
     assert len(made) == 27
     for name, scenario in made.items():
@@ -285,7 +285,7 @@ def test_validation_missions_are_what_their_names_say() -> None:
 
 
 def test_validation_flies_the_mean_of_the_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """With the margin, the dwell time and the deadline that are asked for, whatever the files say."""
+    """It uses the margin, dwell time and deadline of the command, not those of the files."""
     files = [str(tmp_path / f"{seed}.safetensors") for seed in range(2)]
     policies = [random_policy(seed) for seed in range(2)]
     for path, policy in zip(files, policies, strict=True):

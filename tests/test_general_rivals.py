@@ -1,4 +1,4 @@
-"""VDN and QMIX for teams of any size, where whole teams are drawn and each has one error; MAPPO; imitation; distillation."""
+"""Learners of the general policy: VDN and QMIX on whole teams of any size, MAPPO, imitation and distillation."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -37,7 +37,7 @@ SMALL = GeneralConfig(
 
 
 def test_a_draw_is_of_whole_teams_at_one_time() -> None:
-    """Every team once or not at all, each agent in its place; here an agent's reward names it and its time."""
+    """Each drawn team is complete, with its agents in order and at one time; rewards here encode agent and time."""
     sizes = np.array([2, 3, 1])
     replay = TeamReplay(5, sizes, 4)
     for k in range(7):
@@ -45,7 +45,7 @@ def test_a_draw_is_of_whole_teams_at_one_time() -> None:
         replay.store(**{**rows, "reward": (100 * k + np.arange(6, dtype=np.float32))[:, None]})
     drawn = replay.sample(8, 1, 0.9, np.random.default_rng(0))
     assert drawn.team is not None
-    assert drawn.team.max() == 3  # four teams have eight agents in the mean
+    assert drawn.team.max() == 3  # four teams have eight agents on average
     for team in range(4):
         reward = drawn.reward[drawn.team == team, 0]
         time, agents = np.unique(reward // 100), (reward % 100).tolist()
@@ -54,7 +54,7 @@ def test_a_draw_is_of_whole_teams_at_one_time() -> None:
 
 
 def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
-    """Teams of two and of one, by hand."""
+    """Computed by hand for a team of two agents and a team of one."""
     learner = TeamVDN(learner_config(SMALL), 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
     state, one = np.zeros((3, INPUTS), dtype=np.float32), np.ones((3, 1), dtype=np.float32)
     reward, discount = np.array([[1.0], [3.0], [-1.0]], dtype=np.float32), np.array([[0.5], [0.5], [0.0]], dtype=np.float32)
@@ -67,7 +67,7 @@ def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
 
 
 def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:
-    """And a team's value depends on no other team."""
+    """It depends neither on the order of a team's agents nor on other teams."""
     mixer, rng = TeamMixer(5, torch.Generator().manual_seed(1)), np.random.default_rng(2)
     inputs, values = (torch.from_numpy(rng.normal(size=shape).astype(np.float32)) for shape in ((5, 5), (1, 5)))
     team = torch.tensor([0, 0, 1, 1, 1])
@@ -86,12 +86,12 @@ def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:
 
 @pytest.mark.parametrize(("learner", "settle"), [("vdn", 0.0), ("vdn", 1.0), ("qmix", 1.0), ("mappo", 1.0), ("imitation", 1.0)])
 def test_it_learns_and_goes_on_bit_for_bit(learner: Literal["vdn", "qmix", "mappo", "imitation"], settle: float) -> None:
-    """All errors count alike before values settle and after; a rollout of three decisions is interrupted."""
+    """All errors count equally with any ``settle``; for MAPPO, the snapshot is taken inside a rollout of three decisions."""
     config = replace(SMALL, learner=learner, settle=settle, ppo=PPO(rollout=3, epochs=2, minibatches=1))
     one, other = make_general_trainer(config), make_general_trainer(replace(config, seed=3))
     for _ in range(4):
         one.advance()
-    drawn = {"imitation": 20, "mappo": 30}.get(learner, 4)  # agents, or teams of five in the mean
+    drawn = {"imitation": 20, "mappo": 30}.get(learner, 4)  # agents, or teams of five agents on average
     assert one.learner.treatment == "plain" and one.learner.errors.shape == (1, drawn)
     arrays, scalars = one.snapshot()
     other.restore({name: array.copy() for name, array in arrays.items()}, scalars)
@@ -111,7 +111,7 @@ def test_the_critic_sees_an_agent_and_the_mean_of_its_team() -> None:
 
 
 def test_a_rollout_is_assessed_with_the_critics_values() -> None:
-    """Advantages of every agent by the estimator of Schulman et al., normalised; the critic learns value and advantage."""
+    """Advantages are those of Schulman et al., normalised; the critic's targets are values plus advantages."""
     trainer = PPOTrainer(replace(SMALL, learner="mappo", ppo=PPO(rollout=6)))
     for _ in range(5):
         trainer.advance()
@@ -131,7 +131,7 @@ def test_a_rollout_is_assessed_with_the_critics_values() -> None:
 
 
 def test_mappo_prefers_what_paid() -> None:
-    """Rollouts in which the second action was worth more than the first: actors choose it more often then."""
+    """After rollouts in which only the second action is rewarded, actors prefer it in over 95 % of the states."""
     trainer = PPOTrainer(replace(SMALL, learner="mappo", learning_rate=5e-3, ppo=PPO(rollout=8, epochs=3, minibatches=2)))
     rng, rows = np.random.default_rng(0), trainer.replay.arrays
     for _ in range(12):
@@ -147,7 +147,7 @@ def test_mappo_prefers_what_paid() -> None:
 
 
 def test_imitation_learns_what_the_guide_would_do() -> None:
-    """The cross entropy by hand; then a batch, learned again and again, is imitated whatever its rewards."""
+    """The loss is the cross entropy; after many updates on one batch its actions are imitated, whatever its rewards."""
     config = learner_config(replace(SMALL, learner="imitation"))
     learner = Imitation(config, 1, 2, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
     rng = np.random.default_rng(1)
@@ -166,7 +166,7 @@ def test_imitation_learns_what_the_guide_would_do() -> None:
 
 
 def test_a_distilled_network_learns_the_values_of_its_teachers(tmp_path: Path) -> None:
-    """The loss by hand; then a batch, learned again and again, has the teachers' leads, whatever its actions and rewards."""
+    """The loss equals its formula; many updates on a batch of random actions and rewards reduce the error to under 5 %."""
     paths = [tmp_path / f"{k}.safetensors" for k in range(2)]
     for k, path in enumerate(paths):
         write_general(path, random_policy(k), {})
@@ -192,7 +192,7 @@ def test_a_distilled_network_learns_the_values_of_its_teachers(tmp_path: Path) -
 
 
 def test_teachers_are_told_in_the_header_and_on_the_card(tmp_path: Path) -> None:
-    """One of them is a mean of two, so three trainings are named."""
+    """One teacher is a mean of two, so three trainings are listed."""
     run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0}, "git_revision": "abc"}
     for name, description in (("one", run), ("both", {"mean_of": [run, run]})):
         write_general(tmp_path / f"{name}.safetensors", random_policy(0), description)
@@ -211,7 +211,7 @@ def test_teachers_are_told_in_the_header_and_on_the_card(tmp_path: Path) -> None
 
 
 def test_what_is_imitated_is_the_guide_and_not_what_was_taken() -> None:
-    """Exploration leaves the guide's actions in the buffer, in every episode."""
+    """The buffer has the guide's actions instead of the explored ones, in every episode."""
     trainer = GeneralTrainer(replace(SMALL, learner="imitation", together=1.0))
     taken = []
     for _ in range(6):
@@ -220,5 +220,5 @@ def test_what_is_imitated_is_the_guide_and_not_what_was_taken() -> None:
     stored = trainer.replay.arrays["action"][:6]
     assert (np.array(taken) != stored).any()
     assert all((squad.bins > 0).all() for squad in trainer.squads)
-    for row in stored:  # a team is told one action
+    for row in stored:  # the guide gives a team one action
         assert len(set(row[:4, 0])) == len(set(row[4:, 0])) == 1

@@ -1,4 +1,4 @@
-"""Training of the general policy: what is learned from, settings, interrupted runs, and the mean that is shipped."""
+"""Training of the general policy: inputs, rewards, settings, interrupted runs, and shipped means."""
 
 import csv
 import itertools
@@ -49,7 +49,7 @@ def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
 
 
 def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of their last networks, under one margin."""
+    """The mean is of their last networks, with one margin, dwell time and deadline."""
     run = {"train": plain_data(SMALL), "evaluation": {"mission_steps": 400.0}, "git_revision": "abc"}
     for k in range(3):
         for kind in ("best", "last"):
@@ -88,7 +88,7 @@ def test_a_team_reads_from_its_text() -> None:
 
 
 def test_an_ablation_hides_inputs_from_the_network() -> None:
-    """Hidden inputs have no weight, before learning and after."""
+    """Hidden inputs still have zero weights after learning."""
     config = replace(SMALL, hide=("pooled", "column-lane"))
     trainer = GeneralTrainer(config)
     for _ in range(4):
@@ -102,7 +102,7 @@ def test_an_ablation_hides_inputs_from_the_network() -> None:
 
 @pytest.mark.slow
 def test_training_is_its_seed(tmp_path: Path) -> None:
-    """Two runs under one seed leave the same network, another seed another one; what they leave flies."""
+    """Two runs with one seed give the same network, and another seed gives another; eval.csv has the scores."""
     runs = {name: replace(SMALL, seed=seed, evaluate_every=200) for name, seed in (("a", 1), ("b", 1), ("c", 2))}
     for name, config in runs.items():
         train_general(config, tmp_path / name)
@@ -117,7 +117,7 @@ def test_training_is_its_seed(tmp_path: Path) -> None:
 
 
 def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
-    """The first policy is the old one; other layers, or another kind of checkpoint, are refused."""
+    """It begins with the network of the checkpoint; other layers, compositions or kinds of checkpoints are refused."""
     policy, path = random_policy(), tmp_path / "general.safetensors"
     write_general(path, policy, {})
     trainer = GeneralTrainer(replace(SMALL, hidden=(16,), start=str(path), first_temperature=0.2))
@@ -135,7 +135,7 @@ def test_learning_goes_on_from_a_checkpoint(tmp_path: Path) -> None:
 
 
 def test_only_where_the_composition_avoids_there_is_a_dwell_time() -> None:
-    """Where agents decide about avoidance, it must come at once."""
+    """Otherwise agents decide about avoidance, which must not be delayed."""
     config = replace(SMALL, dwell=5, deadline=0.75)
     for composition, dwell in (("set-based", 5), ("null-space", 1)):
         policy = GeneralTrainer(replace(config, composition=composition)).policy()
@@ -145,7 +145,7 @@ def test_only_where_the_composition_avoids_there_is_a_dwell_time() -> None:
 def test_a_stopped_run_goes_on_bit_for_bit(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A signal saves the run; resumed by the command, it ends with the networks of a run that nobody stopped."""
+    """A signal saves the run; resumed by the command, it ends in the same state as an uninterrupted run."""
     short = {"field_wedge-4": make_scenario("field", composition="set-based", split="test", duration=2.0)}
     monkeypatch.setattr("marlbc_mj.training.general.run.judging_scenarios", lambda _: short)
     config = replace(SMALL, budget=800, evaluate_every=10_000, lossy=1.0, start_spread=0.1, capacity=2_000)
@@ -171,7 +171,7 @@ def test_a_stopped_run_goes_on_bit_for_bit(
 
 
 def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
-    """The next episode begins in formation, which changes neither the outcome nor the caller's actions."""
+    """The restart resets actions to the formation, but changes neither the outcome nor the caller's array."""
     trainer = GeneralTrainer(SMALL)
     squad, taken = trainer.squads[0], np.full((2, 4), COLUMN_ACTION)
     squad.end[:] = 0
@@ -181,7 +181,7 @@ def test_what_was_taken_last_in_an_episode_is_what_is_learned_from() -> None:
 
 
 def test_the_whole_team_pays_for_an_agent_that_is_late() -> None:
-    """Who is out of its slot's tolerance at the end of the mission; before the end nobody pays."""
+    """An agent is late if it is outside its slot's tolerance at the end of the mission; before, there is no cost."""
     squads = [GeneralTrainer(replace(SMALL, late_cost=cost)).squads[0] for cost in (0.0, 7.0)]
     actions = np.full((2, 4), FORMATION)
     actions[0, 2] = COLUMN_ACTION
@@ -196,7 +196,7 @@ def test_the_whole_team_pays_for_an_agent_that_is_late() -> None:
 
 
 def test_where_agents_decide_about_avoidance_who_comes_too_close_pays() -> None:
-    """At any mission step of a decision; with the cost and without it, the rest of the reward is the same."""
+    """The cost is due if the agent is too close in any mission step of a decision; the rest of the reward is unchanged."""
     config = replace(SMALL, composition="null-space", lossy=0.0, violation_cost=7.0)
     squads = [GeneralTrainer(replace(config, violation_cost=cost)).squads[0] for cost in (0.0, 7.0)]
     scenario, paid = squads[0].scenario, []
@@ -217,7 +217,7 @@ def test_where_agents_decide_about_avoidance_who_comes_too_close_pays() -> None:
 
 
 def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:
-    """Close to an obstacle and with a blocked way to the slot it heads for; under the set-based composition never."""
+    """For agents close to an obstacle and with a blocked way to their slot; never under the set-based composition."""
     seen = np.ones((1, 4, inputs.INPUTS))
     seen[0, :3, inputs.CLEARANCE_ENTRY] = 0.1
     seen[0, 1:, inputs.LANES + FORMATION] = -0.5
@@ -228,7 +228,7 @@ def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:
 
 
 def test_lost_messages_age() -> None:
-    """An agent always hears itself; where all is lost, others' entries stay as they were."""
+    """If all messages are lost, agents hear only themselves, and the messages of others get older."""
     trainer = GeneralTrainer(SMALL)
     squad = trainer.squads[0]
     squad.loss[:] = 1.0
@@ -242,7 +242,7 @@ def test_lost_messages_age() -> None:
 
 
 def test_a_silent_agent_is_heard_by_itself_alone() -> None:
-    """One agent in every episode, not always the same, from the first decision on."""
+    """Every episode has one silent agent, not always the same one, from the first decision on."""
     trainer = GeneralTrainer(replace(SMALL, silent=1.0, lossy=0.0, worlds=12))
     squad = trainer.squads[0]
     squad.step(np.zeros((12, 4), dtype=np.int64))
@@ -263,7 +263,7 @@ def test_the_command_refuses_what_it_cannot_train(capsys: pytest.CaptureFixture[
 
 
 def test_all_errors_count_once_values_settle() -> None:
-    """Before the share ``settle`` of the budget negative errors count half, from then on in full."""
+    """Negative errors count half until the share ``settle`` of the budget is spent, and in full from then on."""
     trainer = GeneralTrainer(replace(SMALL, settle=0.5, learner="hysteretic"))
     trainer.advance()
     trainer.advance()

@@ -1,4 +1,4 @@
-"""The double-integrator setting with goals: rectangles and the discs that cover them, draws, and what counts as success."""
+"""The double-integrator setting with goals: rectangles and discs that cover them, random draws, and shares of success."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from marlbc_mj.studies.goal_reaching import AGENT_RADIUS, LEAST_GAP, Box, draw_g
 
 
 def test_the_distance_from_a_rectangle_is_that_of_its_nearest_point() -> None:
-    """A square of 2 m at (1, 0), turned by 45 degrees: its corners are on the axes."""
+    """Checked on a square of 2 m at (1, 0), rotated by 45 degrees, so that its corners are on the axes."""
     box = Box(np.array([1.0, 0.0]), np.array([1.0, 1.0]), np.pi / 4)
     corner = np.sqrt(2.0)
     places = np.array([[1.0, 0.0], [1.0 + corner + 0.5, 0.0], [1.0, corner + 0.25], [1.0 + corner, corner]])
@@ -20,7 +20,7 @@ def test_the_distance_from_a_rectangle_is_that_of_its_nearest_point() -> None:
 
 @given(st.floats(0.5, 2.5), st.floats(0.5, 2.5), st.floats(0.0, 6.3), st.integers(0, 1000))
 def test_discs_cover_the_edge_and_jut_out_little(width: float, height: float, angle: float, seed: int) -> None:
-    """Whoever touches the rectangle from outside touches a disc, and no disc is more than 0.11 m outside."""
+    """Every point of the edge is in a disc, and no disc extends more than 0.11 m beyond the rectangle."""
     box = Box(np.array([3.0, -2.0]), np.array([width, height]), angle)
     discs = np.array(box.discs())
     rng = np.random.default_rng(seed)
@@ -35,7 +35,7 @@ def test_discs_cover_the_edge_and_jut_out_little(width: float, height: float, an
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_starts_and_goals_have_room(seed: int) -> None:
-    """As far from each other and from rectangles as is asked, so that the scenario can be built; FM leads to the goals."""
+    """They keep LEAST_GAP from each other and from rectangles; the scenario can be built, and its FM slots are the goals."""
     drawn = draw_goals(np.random.default_rng(seed))
     for places in (drawn.starts, drawn.goals):
         between = np.linalg.norm(places[:, None] - places[None], axis=-1) + np.diag(np.full(len(places), np.inf))
@@ -45,7 +45,7 @@ def test_starts_and_goals_have_room(seed: int) -> None:
 
 
 def test_shares_count_agents_and_whole_teams() -> None:
-    """Two teams of two: one agent late, one that touches something after the horizon."""
+    """Two teams of two agents: one agent arrives, and another collides, only after the short horizon."""
     never = np.inf
     ends = [(np.array([10.0, 300.0]), np.array([never, never])), (np.array([5.0, 6.0]), np.array([never, 400.0]))]
     early, late = goal_shares(ends, 256), goal_shares(ends, 1024)
@@ -54,7 +54,7 @@ def test_shares_count_agents_and_whole_teams() -> None:
 
 
 def test_a_short_flight_touches_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Under the shield, whoever is near its goal has reached it."""
+    """In 40 steps under the shield no agent touches anything."""
     monkeypatch.setattr(goal_reaching, "HORIZONS", (40,))
     reached, touched = fly_to_goals(3)
     assert reached.shape == touched.shape == (8,) and np.isinf(touched).all() and AGENT_RADIUS == 0.5

@@ -1,4 +1,4 @@
-"""The program over half-planes against a quadratic solver, a linear solver, and the candidates that an optimum can be."""
+"""The half-plane program against a quadratic solver, a linear solver, and a search over candidates for the optimum."""
 
 from itertools import combinations
 
@@ -13,18 +13,18 @@ from marlbc_mj.core.halfplanes import RELAXATION, closest
 from marlbc_mj.core.laws import plain
 
 seeds = st.integers(0, 2**32 - 1)
-FAR = 1e4  # [m/s], a speed that limits nothing here
+FAR = 1e4  # [m/s], a speed limit that is never active here
 
 
 def half_planes(normals, bounds, levels=0) -> np.ndarray:
-    """(n, 4) from angles' unit normals (n, 2), bounds (n,) and levels."""
+    """Half-planes (n, 4) from unit normals (n, 2), bounds (n,) and levels."""
     planes = np.zeros((len(bounds), 4))
     planes[:, :2], planes[:, 2], planes[:, 3] = normals, bounds, levels
     return planes
 
 
 def solve(wish, planes, speed=FAR) -> tuple[np.ndarray, bool]:
-    """What :func:`closest` says; ``planes`` stay as they are."""
+    """Solution of :func:`closest`, and whether it is feasible; ``planes`` are not changed."""
     v = np.full(2, np.nan)
     feasible = closest(np.asarray(wish, dtype=float), speed, planes.copy(), len(planes), v)
     return v, feasible
@@ -35,7 +35,7 @@ def unit(angles) -> np.ndarray:
 
 
 def draw(rng: np.random.Generator, most: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Normals and bounds; some normals repeated, some opposed, some half-planes redundant."""
+    """Random normals and bounds; some normals are repeated or opposed, and some half-planes are redundant."""
     n = int(rng.integers(1, most))
     normals, bounds = unit(rng.uniform(0, 2 * np.pi, n)), rng.normal(scale=3.0, size=n)
     for k in range(1, n):
@@ -45,13 +45,13 @@ def draw(rng: np.random.Generator, most: int = 12) -> tuple[np.ndarray, np.ndarr
 
 
 def violation(v, planes) -> float:
-    """Greatest violation [m/s], negative inside."""
+    """Greatest violation of the half-planes by ``v`` [m/s], negative if all hold."""
     return float((planes[:, 2] - planes[:, :2] @ v).max())
 
 
 def optimum_of_candidates(wish, planes, speed) -> np.ndarray | None:
-    """The optimum is the desired velocity, its projection on a border or the circle, or a corner; None where none of them is
-    feasible.
+    """The optimum: the feasible candidate nearest to ``wish``, which is ``wish``, its projection on a border or the circle, or
+    a corner; None if no candidate is feasible.
     """
     n, b = planes[:, :2], planes[:, 2]
     tangents = np.stack([-n[:, 1], n[:, 0]], axis=-1)
@@ -69,7 +69,7 @@ def optimum_of_candidates(wish, planes, speed) -> np.ndarray | None:
 
 
 def least_violation(planes, hard=()) -> float:
-    """Least greatest violation [m/s] of ``planes`` by a linear solver, while the half-planes ``hard`` hold."""
+    """Greatest violation of ``planes`` [m/s], minimized by a linear solver while the half-planes ``hard`` hold."""
     rows = [[-x, -y, -1.0] for x, y, *_ in planes] + [[-x, -y, 0.0] for x, y, *_ in hard]
     bounds = [-plane[2] for plane in planes] + [-plane[2] for plane in hard]
     found = linprog([0, 0, 1], rows, bounds, bounds=[(-FAR, FAR), (-FAR, FAR), (0, None)], method="highs")
@@ -92,7 +92,7 @@ def test_feasible_programs_equal_a_quadratic_solver(seed):
 
 @given(seeds)
 def test_within_a_speed_the_optimum_is_the_best_candidate(seed):
-    """With |v| <= speed active too, to 1e-6: a corner of a border that touches the circle is known no better."""
+    """With |v| <= speed as a constraint; to 1e-6, as the corner of a border that touches the circle is ill-conditioned."""
     rng = np.random.default_rng(seed)
     normals, bounds = draw(rng, 7)
     planes, speed, wish = half_planes(normals, 0.4 * bounds), 2.0, rng.normal(scale=2.0, size=2)
@@ -109,7 +109,7 @@ def test_within_a_speed_the_optimum_is_the_best_candidate(seed):
 
 @given(seeds)
 def test_where_half_planes_contradict_the_greatest_violation_is_least(seed):
-    """As a linear solver has it, to 1e-6 (its tolerance); of the velocities that reach it, the one nearest to the desired one."""
+    """It equals that of a linear solver to 1e-6, its tolerance; v is the velocity nearest to ``wish`` that attains it."""
     rng = np.random.default_rng(seed)
     normals, bounds = draw(rng)
     planes, wish = half_planes(normals, bounds + 2.0), rng.normal(scale=4.0, size=2)
@@ -128,7 +128,7 @@ def test_where_half_planes_contradict_the_greatest_violation_is_least(seed):
 
 @given(seeds)
 def test_of_two_levels_the_first_is_violated_least_and_then_the_second(seed):
-    """Lexicographic: z_1 as if there were no second level, then z_2 while the first keeps its z_1."""
+    """Lexicographic: z_1 is the least without the second level, and z_2 is the least that keeps this z_1."""
     rng = np.random.default_rng(seed)
     normals, bounds = draw(rng)
     cut = int(rng.integers(0, len(bounds) + 1))
@@ -146,7 +146,7 @@ def test_of_two_levels_the_first_is_violated_least_and_then_the_second(seed):
 
 
 def test_two_walls_that_close_in():
-    """n = (1, 0) asks for 3 and n = (-1, 0) for 1: both are missed by 2. On different levels the first has its way."""
+    """n = (1, 0) requires 3 and n = (-1, 0) requires 1: both are violated by 2. On different levels the first one holds."""
     normals = [(1.0, 0.0), (-1.0, 0.0)]
     v, feasible = solve((0.0, 0.5), half_planes(normals, [3.0, 1.0]), 6.0)
     assert not feasible
@@ -158,7 +158,7 @@ def test_two_walls_that_close_in():
 
 
 def test_without_half_planes_the_wish_is_shortened():
-    """(3, 4) at most 2.5 long is (1.5, 2)."""
+    """(3, 4), shortened to a length of 2.5, is (1.5, 2)."""
     v, feasible = solve((3.0, 4.0), np.zeros((0, 4)), 2.5)
     assert feasible
     np.testing.assert_allclose(v, (1.5, 2.0), rtol=1e-15)

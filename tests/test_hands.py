@@ -287,12 +287,17 @@ def test_switched_off_rendering_says_so(tmp_path):
     assert list(Path(tmp_path).iterdir()) == []
 
 
-def played(env: PaperFormation, steps: int) -> np.ndarray:
-    """States of an environment that joblib has sent to a worker."""
-    return np.array([env.step(JOINT)[0] for _ in range(steps)])
+@pytest.fixture
+def played():
+    """``played(env, steps)``: states of an environment. It goes to workers by value, who so need not import this module."""
+
+    def play(env: PaperFormation, steps: int) -> np.ndarray:
+        return np.array([env.step(JOINT)[0] for _ in range(steps)])
+
+    return play
 
 
-def test_joblib_plays_copies_in_its_workers():
+def test_joblib_plays_copies_in_its_workers(played):
     joblib = pytest.importorskip("joblib")
     env = PaperFormation(duration=2.0)
     env.reset(seed=0)
@@ -302,7 +307,7 @@ def test_joblib_plays_copies_in_its_workers():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
-def test_ray_plays_copies_in_its_workers(monkeypatch):
+def test_ray_plays_copies_in_its_workers(monkeypatch, played):
     """An environment goes to a task and to an actor, which keeps it; both play on where the original stands."""
     ray = pytest.importorskip("ray")
     monkeypatch.delenv("RAY_ADDRESS", raising=False)

@@ -1,4 +1,4 @@
-"""Noise, delay and loss of the plant, and limits of references: what they do, and that they are the same everywhere."""
+"""Sensor noise, delay, actuator loss and limits of references: their effects, and agreement of all paths."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,7 @@ def orders_of(scenario, worlds=1):
 
 
 def test_noise_is_standard_normal_and_independent():
-    """Mean, variance, kurtosis of 40 000 numbers; no correlation between neighbours, streams or seeds."""
+    """Checked by mean, spread and kurtosis of 40 000 numbers, and by correlations between neighbours and streams."""
     draws = np.array([[normal(7 + s, k, s) for k in range(20_000)] for s in range(2)])
     assert abs(draws.mean()) < 0.02 and draws.std() == pytest.approx(1.0, abs=0.02)
     assert (draws**4).mean() == pytest.approx(3.0, abs=0.15)
@@ -38,7 +38,7 @@ def test_noise_is_standard_normal_and_independent():
 
 
 def test_a_delay_shows_what_was_and_nothing_else():
-    """The measured p, v at the end of a mission step are the true ones of 4 substeps before, to the bit."""
+    """The measured p, v at the end of a mission step are the true ones 4 substeps earlier, to the last bit."""
     scenario = paper(imperfections=Imperfections(delay=0.02))
     world = World(scenario, PD(), record=True)
     start = world.observe()
@@ -51,7 +51,7 @@ def test_a_delay_shows_what_was_and_nothing_else():
 
 
 def test_noise_has_the_stated_size_and_another_seed_is_other_noise():
-    """Measured minus true over 200 mission steps; nothing but the controller's reaction changes the truth."""
+    """Differences of measured and true values over 200 mission steps have the stated standard deviation."""
     scenario = paper(imperfections=Imperfections(position_noise=0.02, velocity_noise=0.05))
     world = World(scenario, PD())
     errors = []
@@ -65,7 +65,7 @@ def test_noise_has_the_stated_size_and_another_seed_is_other_noise():
 
 
 def test_where_robots_end_is_not_what_they_measure(tmp_path):
-    """Trajectories, logs, metrics and batches end at the true position, whatever the sensors say of it."""
+    """Trajectories, logs, metrics and batches end at the true position, whatever the sensors measure."""
     scenario = paper(duration=1.0, imperfections=Imperfections(position_noise=0.5, velocity_noise=0.1))
     world = World(scenario, PD(), record=True)
     with LogWriter(tmp_path / "log.mcap", scenario, PD(), names=("fixed", "pd"), seed=1, config={}) as log:
@@ -80,7 +80,7 @@ def test_where_robots_end_is_not_what_they_measure(tmp_path):
 
 
 def test_a_lost_actuator_gives_its_share_from_its_time_on():
-    """Agent 2's recorded force is 0.7 of the law's limit from 0.5 s on; the others' stays."""
+    """At 0.5 s the recorded force of agent 2 drops to 0.7 of the law's; the forces of the other agents do not change."""
     scenario = paper(duration=1.0, imperfections=Imperfections(loss=0.3, loss_agent=1, loss_start=0.5))
     trajectory = run_episode(World(scenario, PD(), record=True), Scripted())
     early, late = trajectory.time < 0.5 - 1e-9, trajectory.time >= 0.5 - 1e-9
@@ -93,7 +93,7 @@ def test_a_lost_actuator_gives_its_share_from_its_time_on():
 
 
 def test_imperfections_are_the_same_on_every_path_and_in_any_batch():
-    """Compiled = Python path to the bit; world 2 of three on two threads = world 2 of three on one; dm_control within 1e-9."""
+    """Compiled loop and Python path, threads and batches agree to the last bit; dm_control agrees within 1e-9."""
     scenario = paper(duration=2.0, imperfections=NOISY, perturbation=Perturbation(start_spread=0.2))
     compiled, python = (run_episode(World(scenario, record=True, native=n), Scripted(), seed=2) for n in (None, False))
     assert compiled.position.tobytes() == python.position.tobytes()
@@ -115,7 +115,7 @@ def test_imperfections_are_the_same_on_every_path_and_in_any_batch():
 
 
 def test_a_snapshot_takes_noise_and_delay_along():
-    """A world that goes back goes on with the same numbers."""
+    """A restored world continues with the same random numbers."""
     scenario = paper(imperfections=NOISY)
     world = World(scenario)
     for _ in range(5):
@@ -136,13 +136,13 @@ def test_a_snapshot_takes_noise_and_delay_along():
     ],
 )
 def test_impossible_imperfections_are_named(fields, message):
-    """The field, the value and what is valid."""
+    """The message names the field, the value and the valid range."""
     with pytest.raises(ConfigurationError, match=message):
         Imperfections(**fields)
 
 
 def test_imperfections_must_fit_the_scenario():
-    """A delay that is no whole number of substeps, an agent that is not there, a limit that is no limit."""
+    """Refused: a delay that is not a whole number of substeps, an agent that does not exist, a speed limit of 0."""
     with pytest.raises(ConfigurationError, match="delay 0.007 s must be a whole multiple of the substep 0.005 s"):
         paper(imperfections=Imperfections(delay=0.007))
     with pytest.raises(ConfigurationError, match=r"loss_agent must be -1 \(all\) or 0 to 3, got 4"):
@@ -156,7 +156,7 @@ vectors = st.lists(st.tuples(st.floats(-50, 50), st.floats(-50, 50)), min_size=3
 
 @given(vectors, vectors, st.floats(0.1, 100), st.floats(0.1, 100))
 def test_limited_references_keep_speed_and_acceleration(before, wanted, speed, acceleration):
-    """|v_r| and |dv_r| / dt are within the limits wherever the last v_r was; what is within them already stays as it is."""
+    """|v_r| and |dv_r| / dt are within the limits for any previous v_r; a v_r that is within them already is unchanged."""
     limits = make_behaviors(paper(speed_limit=speed, acceleration_limit=acceleration))
     old, new, kept = np.array(before), np.array(wanted), np.zeros((3, 2))
     old *= np.minimum(1.0, speed / np.maximum(np.linalg.norm(old, axis=1), 1e-12))[:, None]

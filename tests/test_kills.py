@@ -1,4 +1,4 @@
-"""One SIGKILL, as ``make kills`` gives hundreds, and that its checks see what is wrong."""
+"""One SIGKILL of the hundreds in ``make kills``, and planted faults that its checks must find."""
 
 import random
 from pathlib import Path
@@ -9,7 +9,7 @@ import pytest
 
 
 def test_a_killed_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two workers; what is left in the end is that of a run without a kill."""
+    """With two workers, a killed study that is run again has the same output as an undisturbed one."""
     monkeypatch.setattr(kills, "_strike", lambda process, whom, rng: process.kill())
     killer = kills.Killer(tmp_path, "local", 2)
     (tmp_path / "digests-whole.json").write_text("3.0")
@@ -19,7 +19,7 @@ def test_a_killed_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 class FirstResult(random.Random):
-    """One kill, soon after the first result."""
+    """Choices that give one kill, soon after the first result."""
 
     def choice(self, choices):
         return 1 if 1 in choices else choices[0]
@@ -29,7 +29,7 @@ class FirstResult(random.Random):
 
 
 def test_what_is_wrong_is_seen(tmp_path: Path) -> None:
-    """Half a file, another number, and one file more; times may differ."""
+    """Faults are a torn file, an empty file, a different number and an extra file; times may differ."""
     whole, other = tmp_path / "whole", tmp_path / "other"
     for folder, text in ((whole, '{"a": 1, "wall_s": 2}'), (other, '{"a": 1, "wall_s": 3}')):
         folder.mkdir()
@@ -43,6 +43,6 @@ def test_what_is_wrong_is_seen(tmp_path: Path) -> None:
 
 
 def test_logs_differ_where_an_array_does(tmp_path: Path) -> None:
-    """Arrays that stand in tuples, as those of substeps do, are compared like the others."""
+    """Arrays within tuples, such as those of substeps, are compared, too."""
     one, other = (kills._plain((np.arange(3.0), (np.array([value]), "name"))) for value in (1.0, 2.0))
     assert one == kills._plain((np.arange(3.0), (np.array([1.0]), "name"))) and one != other

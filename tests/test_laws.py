@@ -1,4 +1,4 @@
-"""Names of gains and state: one law reads the same on every path, and a wrong name is refused with the names there are."""
+"""Names of gains and state: a law gives the same results on every path, and wrong names are refused with the valid ones."""
 
 import json
 import pickle
@@ -27,7 +27,7 @@ compiled_only = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="laws 
 
 @laws.controller(gains={"limit": (), "pull": 2}, state={"count": (), "memory": (2, 3)})
 def named(gains, state, p, v, p_r, v_r, drag, h, force_out):
-    """Reads and writes numbers and arrays by name, a row of an array too."""
+    """Reads and writes numbers, arrays and rows of arrays by name."""
     state.count += 1.0
     for axis in range(2):
         row = state.memory[axis]
@@ -86,7 +86,7 @@ GAINS = {"limit": 100.0, "pull": (2.0, -3.0)}
 
 
 def run(law, rows=4):
-    """Three calls of a controller's team form on rows that are longer than the law needs; state and force."""
+    """Call a controller's team form three times, on rows that are longer than needed; return state and force."""
     gains = np.tile(np.append(laws.pack_gains(named, GAINS), 9.0), (rows, 1))
     state, force = np.full((rows, 8), 0.5), np.full((rows, 2), np.nan)
     places = np.arange(2.0 * rows).reshape(rows, 2)
@@ -96,7 +96,7 @@ def run(law, rows=4):
 
 
 def test_a_named_law_writes_to_its_row_and_is_the_same_compiled_and_in_python():
-    """Numbers, arrays and rows of arrays, written through; what is beyond the law's row stays."""
+    """Numbers, arrays and rows of arrays are written in place; entries beyond the law's own are not changed."""
     results = [run(laws.for_team(law, laws.CONTROLLER)) for law in (named, laws.plain(named))]
     if laws.is_compiled(named):
         results.append(run(named.entry))
@@ -119,7 +119,7 @@ def test_names_cost_no_reference_counting_and_leave_the_loops_signature_as_it_is
 
 
 def test_a_record_is_its_row_and_its_names_travel():
-    """A number and an array are written through; nothing else can be; and names in a pickle are names again."""
+    """Numbers and arrays are written in place, other names are refused, and names can be pickled."""
     names, row = laws.Names.of({"limit": (), "memory": (2, 2)}), np.arange(7.0)
     record = names.view(row)
     record.limit = 8.0
@@ -133,7 +133,7 @@ def test_a_record_is_its_row_and_its_names_travel():
 
 
 def test_gains_are_packed_in_the_order_of_their_names():
-    """From a mapping, a NamedTuple, or the fields of an object; a single number fills an array."""
+    """Gains come from a mapping, a NamedTuple, or the fields of an object; a single number fills an array."""
 
     class Given(NamedTuple):
         pull: tuple[float, float]
@@ -151,25 +151,25 @@ def test_gains_are_packed_in_the_order_of_their_names():
     ("pack", "numbers", "message"),
     [
         (laws.pack_gains, {"limit": 1.0, "pul": 2.0}, "law 'named' has no gain named 'pul'; its names: limit, pull"),
-        (laws.pack_gains, {"limit": 1.0}, "law 'named' is not given its gain 'pull'; its names: limit, pull"),
+        (laws.pack_gains, {"limit": 1.0}, "law 'named' lacks the gain 'pull'; its names: limit, pull"),
         (laws.pack_gains, (1.0, 2.0, 3.0), r"law 'named' takes its gains by name, got \(1.0, 2.0, 3.0\); its names: limit, pull"),
         (laws.pack_gains, {"limit": 1.0, "pull": (1, 2, 3)}, r"gain 'pull' of law 'named' has shape \(2,\), got \(3,\)"),
         (laws.pack_state, {"cuont": 1.0}, "law 'named' has no state named 'cuont'; its names: count, memory"),
     ],
 )
 def test_numbers_that_do_not_fit_the_names_are_refused(pack, numbers, message):
-    """Missing, unknown, without names, of the wrong shape: the law, the name, and the names there are."""
+    """Missing, unknown, unnamed, or of the wrong shape; the message has the law, the name and the valid names."""
     with pytest.raises(ConfigurationError, match=message):
         pack(named, numbers)
 
 
 def test_wrong_names_are_refused_where_a_world_is_made():
-    """For each kind of law."""
+    """This holds for each kind of law."""
     with pytest.raises(ConfigurationError, match="law 'named' has no gain named 'gain'; its names: limit, pull"):
         World(paper(), Own(named, {"gain": 1.0}))
-    with pytest.raises(ConfigurationError, match="law 'formation' is not given its gain 'slot'; its names: gain, slot"):
+    with pytest.raises(ConfigurationError, match="law 'formation' lacks the gain 'slot'; its names: gain, slot"):
         World(paper(behaviors=(Own(Formation.law, {"gain": 1.0}), *paper().behaviors)))
-    with pytest.raises(ConfigurationError, match="law 'wind_gusts' is not given its gain 'steady'"):
+    with pytest.raises(ConfigurationError, match="law 'wind_gusts' lacks the gain 'steady'"):
         World(paper(disturbance=Own(DISTURBANCES["gusts"][0].law, {"scale": 1.0})))
     with pytest.raises(ConfigurationError, match="law 'omni_drive' has no gain named 'weel'; its names: wheel, arm"):
         replace(make_robot("omni"), params={"weel": 1.0}).params_row()
@@ -180,14 +180,14 @@ def test_wrong_names_are_refused_where_a_world_is_made():
 )
 @pytest.mark.parametrize("native", [None, False])
 def test_a_law_that_uses_a_name_it_does_not_declare_is_refused(law, wrong, native):
-    """By the compiler and in plain Python, reading and writing: one message, with the names there are."""
+    """Reading and writing, compiled and in plain Python, give the same message, which lists the declared names."""
     message = f"law '{law.__name__}' uses '{wrong}', which it does not declare; gains: position_gain, limit; state: count"
     with pytest.raises(ConfigurationError, match=message):
         World(paper(), Own(law, {"position_gain": 1.0, "limit": 5.0}), native=native).step(np.zeros((1, 4), dtype=int))
 
 
 def test_behaviors_and_disturbances_that_use_undeclared_names_are_refused():
-    """The same message without a state."""
+    """The message is the same, but lists no state."""
     own = Own(misspelled_behavior, {"gain": 1.0})
     with pytest.raises(ConfigurationError, match="law 'misspelled_behavior' uses 'gian', which it does not declare; gains: gain"):
         World(paper(behaviors=(own, *paper().behaviors))).step(np.zeros((1, 4), dtype=int))
@@ -199,7 +199,7 @@ def test_behaviors_and_disturbances_that_use_undeclared_names_are_refused():
 
 
 def test_an_object_without_a_field_for_a_gain_is_refused():
-    """What ``gains_of`` cannot find."""
+    """``gains_of`` names the missing field."""
     with pytest.raises(
         ConfigurationError, match="law 'named' has a gain 'pull', which Own has no field for; its names: limit, pull"
     ):
@@ -208,19 +208,19 @@ def test_an_object_without_a_field_for_a_gain_is_refused():
 
 @pytest.mark.parametrize("names", [("twice", "twice"), "two words", ("limit", "size"), {"T": 2}])
 def test_names_that_cannot_be_attributes_are_refused(names):
-    """Doubled, no identifier, or an attribute that NumPy's records have already."""
+    """Names must be different, valid identifiers, and not attributes of NumPy's records."""
     with pytest.raises(ConfigurationError, match="law"):
         laws.Names.of(names)
 
 
 def test_a_disturbance_begins_with_its_scale():
-    """Which a perturbation draw multiplies."""
+    """The first gain must be the scale, which random draws multiply."""
     with pytest.raises(ConfigurationError, match="first gain of a disturbance must be the number 'scale', got strength, scale"):
         laws.disturbance(gains=("strength", "scale"))
 
 
 def test_a_law_without_names_gets_the_rows():
-    """Numbers by name for it are refused, with the way out."""
+    """Such a law refuses gains by name, with advice to declare them."""
 
     @laws.controller
     def bare(params, state, p, v, p_r, v_r, drag, h, force_out):
@@ -236,7 +236,7 @@ def test_a_law_without_names_gets_the_rows():
 
 
 def test_laws_made_in_one_place_are_kept_apart():
-    """By what they close over and by their names, although file, line and name are the same."""
+    """Laws with the same file, line and function name differ by the values in their closures and the names of their gains."""
 
     def make(value, names):
         @laws.disturbance(gains=names)
@@ -258,7 +258,7 @@ def test_laws_made_in_one_place_are_kept_apart():
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_shipped_controllers_give_exactly_the_names_of_their_laws(name):
-    """Packing refuses anything else, so it is enough to pack."""
+    """It suffices to pack them, as packing refuses anything else."""
     controller = make_controller(name)
     row = laws.pack_gains(controller.law, controller.params(0, 200.0), laws.CONTROLLER)
     assert row.shape == (laws.interface(controller.law).gains.size,)
@@ -267,13 +267,13 @@ def test_shipped_controllers_give_exactly_the_names_of_their_laws(name):
 
 @pytest.mark.parametrize("name", DISTURBANCES)
 def test_shipped_disturbances_give_exactly_the_names_of_their_laws(name):
-    """And the scale is the first number."""
+    """Their first number is the scale."""
     disturbance = make_disturbance(name, 0.5)
     assert laws.pack_gains(disturbance.law, disturbance.params(), laws.DISTURBANCE)[0] == 0.5
 
 
 def test_drive_and_reading_of_a_robot_share_their_names():
-    """Gains and state are one row for both."""
+    """Both use the same rows of gains and state."""
     omni, other = make_robot("omni"), make_robot("diff_drive")
     with pytest.raises(ConfigurationError, match="must declare the same names"):
         replace(omni, reading=other.reading)
@@ -307,7 +307,7 @@ def law(gains, state, p, v, p_r, v_r, drag, h, force_out):
 
 @compiled_only
 def test_a_second_process_compiles_no_law(tmp_path):
-    """Laws and what the loop calls come from the cache on disk: shipped ones, a behavior's, a user's."""
+    """A shipped controller, a behavior and a user's law come from the cache on disk, as do their entries for the loop."""
     (tmp_path / "own_law.py").write_text(OWN_LAW)
     environment = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": ":".join(p for p in sys.path if p)}
     misses = []
@@ -321,7 +321,7 @@ def test_a_second_process_compiles_no_law(tmp_path):
 
 
 def test_a_signature_of_a_type_that_is_gone_hides_no_other(tmp_path, monkeypatch):
-    """A script's NamedTuple among the signatures of a shared function: other processes find theirs, and the script its own."""
+    """If a signature has a type of a script, other processes still find their entries, and the script finds its own."""
     index, module = Index(str(tmp_path), "law", 1), ModuleType("a_script")
     monkeypatch.setitem(sys.modules, "a_script", module)
     module.Pair = type("Pair", (), {"__module__": "a_script"})
@@ -336,7 +336,7 @@ def test_a_signature_of_a_type_that_is_gone_hides_no_other(tmp_path, monkeypatch
 
 
 def test_a_torn_index_begins_anew(tmp_path):
-    """What is compiled then is kept again."""
+    """A truncated index counts as empty, and new entries are stored."""
     index = Index(str(tmp_path), "law", 1)
     index.save((int,), "of int")
     (tmp_path / "law.nbi").write_bytes((tmp_path / "law.nbi").read_bytes()[:-5])

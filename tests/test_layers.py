@@ -1,4 +1,4 @@
-"""The order of packages: each imports only those before it, so that a reader can start at the front and never look back."""
+"""The order of packages: each imports only those before it, so that they can be read in this order."""
 
 import ast
 from collections.abc import Iterator
@@ -11,17 +11,17 @@ ORDER = (
     *("util", "core", "controllers", "robots", "scenarios", "engine", "policies", "supervisors", "episode"),
     *("recording", "results", "report", "tasks", "training", "studies", "cli"),
 )
-"""Front to back. The package itself, ``marlbc_mj``, only passes names on, and ``__main__`` starts ``cli``."""
+"""Packages, first to last. ``marlbc_mj`` itself only re-exports names, and ``__main__`` starts ``cli``."""
 
 
 def sources(root: Path) -> Iterator[Path]:
-    """Every source file of the library, each once: what links point to is found where it is."""
+    """Every source file of the library, once: files below a symbolic link are skipped."""
     for top in ("marlbc_mj", "tasks", "training"):
         yield from (path for path in sorted((root / top).rglob("*.py")) if not any(p.is_symlink() for p in path.parents))
 
 
 def layer(module: str) -> str:
-    """``"engine"`` for ``marlbc_mj.engine.world``; empty for the package itself."""
+    """Package of a module: ``"engine"`` for ``marlbc_mj.engine.world``; empty for ``marlbc_mj`` itself."""
     return module.split(".")[1] if "." in module else ""
 
 
@@ -36,7 +36,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def back_imports(root: Path) -> list[str]:
-    """``file imports module`` for every import of a package that comes later, or of a name of the package itself."""
+    """``file imports module`` for every import of a later package, or of a name from ``marlbc_mj`` itself."""
     found = []
     for path in sources(root):
         own = path.relative_to(root).parts

@@ -1,4 +1,4 @@
-"""The rivals in learning against hand arithmetic, closed forms and plain loops; every one learns and goes on bit for bit."""
+"""The learning baselines against hand computation, closed forms and plain loops; all resume to the last bit."""
 
 import json
 import os
@@ -48,7 +48,7 @@ def batch_of(size=6, seed=0):
 
 
 def learner_of(kind, **changes):
-    """A learner whose past networks differ from the present one."""
+    """A learner after a few updates, so that its past networks differ from the current one."""
     config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", push_every=2, risk_gamma=0.0, **changes)
     learner = kind(config, N, A, np.arange(1.0, S + 1), generator())
     for seed in range(3):
@@ -76,7 +76,7 @@ def test_vdn_by_hand():
 
 
 def mixed(mixer, values, state):
-    """The mixer written out for one state."""
+    """Output of the mixer for one state, written out in NumPy."""
     x = state / np.arange(1.0, S + 1)
 
     def linear(layer, y):
@@ -152,7 +152,7 @@ def test_joint_actions_are_read_as_they_are_written(action):
 
 @pytest.mark.parametrize("kind", [VDN, QMIX, Central])
 def test_a_team_that_must_agree_learns_to(kind):
-    """One decision, reward 1 only for one joint order, shared out over the agents; the greedy team finds it."""
+    """One decision, with a reward for one joint action only, shared by all agents; the greedy team learns this action."""
     config = replace(TrainConfig(), hidden=(16,), copies=2, push_every=10, learner="plain", risk_gamma=0.0)
     learner = kind(config, N, A, np.ones(S), generator())
     rng, state, none = np.random.default_rng(0), np.zeros((64, S), np.float32), np.zeros((64, N), np.float32)
@@ -194,7 +194,7 @@ def test_new_transitions_have_the_largest_priority():
 @pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_prioritised_sampling_is_the_closed_form(steps, share):
-    """P(j) = p_j / sum p over the transitions that are whole, weights (n P)^-beta over the largest of them, per agent."""
+    """Per agent, P(j) = p_j / sum p over complete transitions; weights are (n P)^-beta divided by the largest of them."""
     replay, rng = filled(), np.random.default_rng(1)
     errors = rng.exponential(size=(2, 30))
     every = np.repeat(np.arange(30)[:, None], 2, axis=1)
@@ -244,7 +244,7 @@ def test_importance_weights_and_errors_go_through_an_update():
 
 @pytest.mark.parametrize("name", STATES)
 def test_the_own_entries_of_a_state_are_the_agents_own(name):
-    """An agent's velocity, command and its age change its own entries and nobody else's."""
+    """An agent's velocity, command and age of command change only its own entries."""
     scenario = paper()
     state, rng = make_state(name, scenario), np.random.default_rng(0)
     mask = own_entries(state, 4).astype(bool)
@@ -312,7 +312,7 @@ def test_avoidance_keeps_to_its_commands_in_every_start():
 @given(st.integers(0, 2**32 - 1), st.floats(0, 0.99), st.floats(0, 1))
 @settings(max_examples=30)
 def test_advantages_against_a_plain_loop(seed, gamma, trace):
-    """Sum of (gamma lambda)^k d, forwards, until the agent's return or the episode ends."""
+    """An advantage is the sum of (gamma lambda)^k d_k until the agent is done or the episode ends."""
     rng = np.random.default_rng(seed)
     rows, worlds = 7, 2
     reward, value, ahead = (rng.normal(size=(rows, worlds, N)) for _ in range(3))
@@ -332,7 +332,7 @@ def test_advantages_against_a_plain_loop(seed, gamma, trace):
 
 
 def test_the_clip_by_hand():
-    """Ratios 2, 0.5, 1.1 and 1 with advantages of both signs: only a step back is paid in full."""
+    """Ratios 2, 0.5 and 1.1 with advantages of both signs: outside the clip range, only a way back has a gradient."""
     ratio = torch.tensor([[2.0, 2.0, 0.5, 0.5, 1.1]], dtype=torch.float64, requires_grad=True)
     gain = torch.tensor([[1.0, -1.0, 1.0, -1.0, 3.0]], dtype=torch.float64)
     loss = clipped_loss(ratio.log(), torch.zeros(1, 5, dtype=torch.float64), gain, 0.2)
@@ -361,7 +361,7 @@ def test_returns_are_normalised_and_back():
 
 
 def test_mappo_prefers_what_paid():
-    """A rollout in which order 2 was worth more than the rest: every actor then chooses it more often."""
+    """After rollouts in which only action 2 is rewarded, actors prefer it in over 95 % of the states."""
     trainer = MAPPO(small("mappo", ppo=PPO(rollout=8, epochs=3, minibatches=2)))
     rng = np.random.default_rng(0)
     for _ in range(12):
@@ -413,7 +413,7 @@ def test_every_rival_goes_on_bit_for_bit(method):
 @pytest.mark.slow
 @pytest.mark.parametrize(("method", "state"), [("rlms", "published"), ("central", "extended"), ("mappo", "extended")])
 def test_a_checkpoint_of_a_rival_gives_the_evaluated_episode(method, state, tmp_path):
-    """From train to the supervisor; a run that was interrupted while it learnt ends with the same networks, to the bit."""
+    """The checkpoint loads as a supervisor; an interrupted and resumed run ends with the same networks, to the last bit."""
     config = small(method, state=state, budget=12_800, ppo=PPO(rollout=4, epochs=1))
 
     def interrupt(trainer, row):

@@ -1,4 +1,4 @@
-"""Metrics of trajectories made by hand, whose answers are closed forms."""
+"""Metrics of synthetic trajectories, compared with closed forms."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ T = STEPS * SUBSTEPS
 
 
 def pair(**changes) -> Scenario:
-    """Two agents side by side, a point obstacle ahead of the first."""
+    """A scenario with two agents side by side and a point obstacle ahead of the first."""
     fields = {
         "starts": ((0.0, 1.0), (0.0, -1.0)),
         "behaviors": standard_behaviors(((0.0, 1.0), (0.0, -1.0)), ((1.0, 0.0), (-1.0, 0.0))),
@@ -32,7 +32,7 @@ def pair(**changes) -> Scenario:
 
 
 def straight(scenario: Scenario, speed: float = 8.0) -> Trajectory:
-    """Both agents move along x at ``speed`` on their references, without force, in formation, without a switch."""
+    """Both agents move along x at ``speed``, on their references and in formation, without forces or switches."""
     x = np.arange(T + 1) * H * speed
     position = np.array(scenario.starts) + x[:, None, None] * np.array([1.0, 0.0])
     velocity = np.tile([speed, 0.0], (T + 1, 2, 1))
@@ -68,7 +68,7 @@ def test_a_perfect_run_costs_nothing():
 
 
 def test_clearance_and_violation_are_taken_after_every_substep():
-    """A point is passed at 3 m and 5 m; d <= 3.4 m while |x - 4| <= 1.6, which at 0.04 m a substep is 81 substeps."""
+    """The agents pass a point at 3 m and 5 m; d <= 3.4 m while |x - 4| <= 1.6, which at 0.04 m per substep is 81 substeps."""
     metrics = measure(straight(pair(safe_distance=3.4001)))
     first, second = metrics["agents"]
     assert (first["clearance_min"], second["clearance_min"]) == (pytest.approx(3.0), pytest.approx(5.0))
@@ -77,7 +77,7 @@ def test_clearance_and_violation_are_taken_after_every_substep():
 
 
 def test_the_start_is_not_a_clearance_but_the_end_is():
-    """Clearance is taken after each substep: T values, the last state included, the first not."""
+    """Clearance is taken after each substep: T values, which include the last state but not the first."""
     scenario = pair(obstacles=(Obstacle(9.0, 1.0),), safe_distance=1.0)
     assert measure(straight(scenario))["agents"][0]["clearance_min"] == pytest.approx(1.0)
     assert measure(straight(scenario))["agents"][0]["violation_time"] in (0.0, pytest.approx(H))
@@ -86,7 +86,7 @@ def test_the_start_is_not_a_clearance_but_the_end_is():
 
 
 def test_distance_is_to_surfaces_and_infinite_without_obstacles():
-    """Errata 7; no obstacle, no violation."""
+    """Distances are to surfaces (erratum 7); without obstacles there is no violation."""
     positions = np.array([[[0.0, 0.0], [60.0, 9.0]]])
     np.testing.assert_allclose(clearances(positions, np.array([[60.0, 9.0, 5.0], [3.0, 4.0, 1.0]])), [[4.0, -5.0]])
     assert np.isinf(clearances(positions, np.zeros((0, 3)))).all()
@@ -106,7 +106,7 @@ def test_force_metrics_of_a_constant_force():
 
 
 def test_saturation_duty_counts_substeps_with_an_axis_at_the_limit():
-    """A quarter of the time one axis, a quarter the other, once both: 0.5."""
+    """One axis is at the limit for a quarter of the time, the other for another quarter, in one substep both: 0.5."""
     trajectory = straight(pair())
     trajectory.force[:50, 1, 0] = 200.0
     trajectory.force[50:100, 1, 1] = -200.0
@@ -130,14 +130,14 @@ def test_tracking_errors_and_their_cost():
 
 
 def test_switches_count_changes_of_the_command():
-    """FM OA FM FM FR: three; the first step changes nothing."""
+    """FM, OA, FM, FR are three switches; the first step is none."""
     trajectory = straight(pair())
     trajectory.command[3, 0], trajectory.command[10:, 0] = 0, 3
     assert [a["switches"] for a in measure(trajectory)["agents"]] == [3, 0]
 
 
 def test_formation_error_is_relative_to_the_centroid():
-    """A common displacement is no error; agent 1 off by d puts both off by d / 2."""
+    """A common displacement is no error; if agent 1 is off by d, both are off by d / 2."""
     trajectory = straight(pair())
     shifted = replace(trajectory, position=trajectory.position + np.array([5.0, -2.0]))
     assert measure(shifted)["team"]["formation_error"] == pytest.approx(0.0, abs=1e-12)
@@ -146,7 +146,7 @@ def test_formation_error_is_relative_to_the_centroid():
 
 
 def test_closest_pair_of_three():
-    """The smallest of all distances at all times; agents 1 and 3 meet halfway."""
+    """The smallest distance of any pair at any time is found; agent 1 approaches agent 3 to 0.5 m."""
     slots = ((0.0, 0.0), (0.0, 10.0), (6.0, 0.0))
     scenario = pair(starts=slots, behaviors=standard_behaviors(slots, slots))
     base = straight(pair())
@@ -167,13 +167,13 @@ def test_closest_pair_of_three():
 
 
 def test_decision_times_are_quantiles_over_mission_steps():
-    """1, 2, ..., 20 ms: median 10.5, 99 % at 19.81."""
+    """Of 1, 2, ..., 20 ms, the median is 10.5 ms and the 99 % quantile 19.81 ms."""
     team = measure(straight(pair()))["team"]
     assert team["decision_ms_median"] == 10.5 and team["decision_ms_p99"] == pytest.approx(19.81)
 
 
 def test_metrics_agree_with_the_worlds_own_verdict(episode):
-    """Violations, return and switches of a chattering episode, counted from the recorded arrays and from the rewards."""
+    """Rewards and return of a chattering episode equal those computed from the recorded positions and commands."""
     trajectory = episode("fsams", "sorlc")
     metrics = measure(trajectory)
     ends = trajectory.position[10::10]
@@ -211,7 +211,7 @@ def test_scores_by_hand():
 
 
 def test_what_a_shield_did_by_hand():
-    """Counts are of the whole episode, the last of their rows: 20 of 200 substeps of one agent are 10 %, of two agents 5 %."""
+    """The last row of counts covers the episode: 20 of 200 substeps are 10 % of one agent's time, 5 % of two agents'."""
     counts = ShieldCounts(np.zeros((STEPS, 2)), np.zeros((STEPS, 2)), np.zeros((STEPS, 2, 3)))
     counts.interventions[-1], counts.change[-1], counts.breaches[-1, 1] = (0.1 * T, 0.0), (4.0, 0.0), (1.0, 2.0, 0.0)
     metrics = measure(replace(straight(pair()), shield=counts))
@@ -222,7 +222,7 @@ def test_what_a_shield_did_by_hand():
 
 
 def test_sum_and_worst_differ_where_two_agents_violate():
-    """Both count in the sum, the longer one alone is the worst."""
+    """The sum adds both violation times; the worst is the longer one alone."""
     times = measure(straight(pair(safe_distance=5.2)))["agents"]
     first, second = (agent["violation_time"] for agent in times)
     scores = team_scores(measure(straight(pair(safe_distance=5.2))))
@@ -231,7 +231,7 @@ def test_sum_and_worst_differ_where_two_agents_violate():
 
 
 def test_names_and_headings_of_scores_tell_their_aggregation():
-    """The end of a score's name is its aggregation, which its heading has too; concepts.md lists each under both."""
+    """A score's name ends with its aggregation, which its heading contains too; concepts.md lists both name and heading."""
     words = {"worst": WORST, "sum": SUM, "mean": MEAN, "rms": RMS, "min": PAIR, "return": TEAM}
     for name, score in SCORES.items():
         assert score.aggregation == words[name.rsplit("_", 1)[-1]]
@@ -249,7 +249,7 @@ def test_switches_of_each_agent_as_text():
 
 
 def test_frames_show_the_state_in_which_orders_were_given():
-    """Every mission step gives one frame: its start's state, and the command and reward that followed."""
+    """Every mission step gives one frame: the state at its start, and the command and reward that followed."""
     frames = []
     scenario = paper(duration=1.0)
     trajectory = run_episode(World(scenario, record=True), make_supervisor("scripted"), on_frame=frames.append)
@@ -266,7 +266,7 @@ def test_frames_show_the_state_in_which_orders_were_given():
 
 
 def decaying(rate: float, late: float = 0.0) -> Trajectory:
-    """One second in which the first agent's velocity error decays as exp(-rate t), the second's is ``late`` at the very end."""
+    """One second: the first agent's velocity error is exp(-rate t), the second's 1 at the start and ``late`` at the end."""
     trajectory = straight(pair())
     velocity = trajectory.velocity.copy()
     velocity[:-1, 0, 1] = np.exp(-rate * trajectory.time)
@@ -276,14 +276,14 @@ def decaying(rate: float, late: float = 0.0) -> Trajectory:
 
 @pytest.mark.parametrize("rate", [10.0, 20.0, 40.0])
 def test_convergence_time_of_an_exponential(rate):
-    """ln(50) / rate, up to one substep; an error that is there for one substep only has converged after it."""
+    """The time is ln(50) / rate, up to one substep; an error in the first substep alone has converged after it."""
     times = convergence_time(decaying(rate))
     assert 0.0 <= times[0] - np.log(50) / rate <= H
     assert times[1] == H
 
 
 def test_convergence_time_has_a_window_and_may_not_be_reached():
-    """An error above the share at the window's end is NaN, one beyond the window is not seen, no error is converged at once."""
+    """NaN for an error above the share at the window's end; errors after the window do not count; 0 without any error."""
     assert np.isnan(convergence_time(decaying(10.0, late=0.5))[1])
     assert convergence_time(decaying(10.0, late=0.5), window=0.9)[1] == H
     assert np.isnan(convergence_time(decaying(1.0))[0])

@@ -1,4 +1,4 @@
-"""Outcomes of missions, their evaluation on held-out layouts, and what teams of any size cost."""
+"""Outcomes of missions, their evaluation on held-out layouts, and the cost of teams of any size."""
 
 import json
 from dataclasses import replace
@@ -31,14 +31,14 @@ def flown():
 
 
 def test_a_mission_through_a_gate_succeeds(flown):
-    """The family's own schedule: in formation at the end, no violation, no collision."""
+    """With the family's own schedule, the team ends in formation without violation or collision."""
     scenario, metrics = flown
     assert outcome(metrics, scenario) == (True, False, False, False) and outcome(metrics, scenario).success
     assert metrics["team"]["end_error"] < 0.05
 
 
 def test_every_part_of_an_outcome_can_fail(flown):
-    """One at a time; a run that failed did so in every respect."""
+    """Each part can fail alone; a run that failed, without metrics, fails in every part."""
     scenario, metrics = flown
     agents, team = metrics["agents"], metrics["team"]
     late = outcome({"agents": agents, "team": {**team, "end_error": 0.51}}, scenario)
@@ -52,7 +52,7 @@ def test_every_part_of_an_outcome_can_fail(flown):
 
 
 def test_the_end_is_absolute(flown):
-    """A team that keeps its formation but not its path has not arrived: formation maintenance, the path left behind."""
+    """A team that keeps its formation but does not follow its path has not arrived."""
     scenario = make_scenario("open", duration=2.0)
     world = World(scenario, record=True)
     trajectory = run_episode(world, make_supervisor("scripted"))
@@ -62,7 +62,7 @@ def test_the_end_is_absolute(flown):
 
 
 def test_a_scenario_that_draws_layouts_is_not_perturbed_on_top():
-    """Gaps between obstacles stay what the family promises; and a method's runs are those of the held-out seeds."""
+    """Gaps between obstacles stay as the family guarantees; every method runs on the layouts of the held-out seeds."""
     scenario = held_out(make_scenario("field", duration=0.5))
     assert perturbed(scenario) is scenario
     runs = run_methods(scenario, [("fsams", "sorlc"), ("fms", "sorlc")], (0, 1)).methods
@@ -75,7 +75,7 @@ def test_a_scenario_that_draws_layouts_is_not_perturbed_on_top():
 
 
 def test_evaluate_reports_every_supervisor(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    """All without learning, on two held-out layouts; those whose schedule belongs elsewhere with the reason."""
+    """All supervisors without learning run on two held-out layouts; those without a schedule for them report the reason."""
     out = tmp_path / "evaluation"
     main(["evaluate", "field", "--seeds", "2", "--duration", "1", "--out", str(out)])
     assert "success, rate [%]" in capsys.readouterr().out
@@ -102,7 +102,7 @@ def test_evaluate_reports_every_supervisor(tmp_path: Path, capsys: pytest.Captur
     ],
 )
 def test_wrong_settings_are_one_line(arguments, fragment, tmp_path, monkeypatch, capsys):
-    """Exit status 2, and nothing is left behind."""
+    """The exit status is 2 and no file is left behind."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
@@ -112,7 +112,7 @@ def test_wrong_settings_are_one_line(arguments, fragment, tmp_path, monkeypatch,
 
 
 def test_a_run_of_a_file_leaves_a_log(tmp_path: Path):
-    """A TOML mission with moving obstacles and wind, through the command line."""
+    """The command line runs a TOML mission with moving obstacles and wind."""
     file = tmp_path / "mine.toml"
     file.write_text('family = "traffic"\nagents = 3\n[disturbance]\nkind = "gusts"\n')
     main(["run", str(file), "--supervisor", "fsams-hysteresis", "--duration", "2", "--out", str(tmp_path / "run")])
@@ -123,7 +123,7 @@ def test_a_run_of_a_file_leaves_a_log(tmp_path: Path):
 
 @pytest.mark.slow
 def test_a_small_scale_run_has_every_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """Table, picture and numbers; the figures themselves are the machine's."""
+    """Table, plots and numbers are written; the values themselves depend on the machine."""
     for name, value in {"SIZES": (4, 16), "AGENT_STEPS": 64, "MEMORY_AGENTS": 64, "LEAST_WORLDS": 8}.items():
         monkeypatch.setattr(scale, name, value)
     figures = scale.ScaleStudy(5).gather(scale.run_scale(5, tmp_path / "out").results)
@@ -140,7 +140,7 @@ def test_a_small_scale_run_has_every_figure(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_256_agents_run_under_every_supervisor_that_decides_per_agent():
-    """In one world; and what would not be affordable says so."""
+    """All agents share one world; MPCMS, which would be too expensive, is refused."""
     scenario = replace(scale.mission(256), duration=0.2)
     world = World(scenario, record=True)
     assert world.data[0].narena > 2 * 133_000
@@ -151,7 +151,7 @@ def test_256_agents_run_under_every_supervisor_that_decides_per_agent():
 
 
 def test_the_outcome_in_summary_json(tmp_path: Path):
-    """Runs, and six shares in [0, 1] with their intervals, for every method; a shield that was not there never intervened."""
+    """Every method has its number of runs and six shares in [0, 1] with intervals; without a shield, intervention is 0."""
     out, parts = tmp_path / "evaluation", ("success", "reached", "violation", "struck", "collided", "intervention")
     quick = ["--seeds", "3", "--seed", "7", "--duration", "1", "--agents", "3", "--formation", "line", "--out", str(out)]
     main(["evaluate", "field", "--supervisors", "fixed", "set-based-rule", "scripted", *quick])
@@ -171,7 +171,7 @@ def test_the_outcome_in_summary_json(tmp_path: Path):
 
 
 def test_outcome_rates_by_hand(flown):
-    """One success, one run that came too late, one that failed; in the second a shield acted."""
+    """Rates of one success, one late run in which a shield intervened, and one failed run."""
     scenario, metrics = flown
     late = {
         **metrics,

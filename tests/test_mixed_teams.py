@@ -1,4 +1,4 @@
-"""Teams whose robots differ: the same on all paths, true to MuJoCo agent by agent, and refused in one line where they must be."""
+"""Mixed teams: identical on all paths, true to MuJoCo for every agent, and refused with one line if they cannot be."""
 
 import pickle
 from dataclasses import replace
@@ -30,19 +30,19 @@ from marlbc_mj.tasks.parallel_env import PaperFormationParallel
 from marlbc_mj.util.errors import ConfigurationError
 
 MIXED = ("crazyflie", "disc", "omni", "disc")
-"""Not in groups: agents keep their numbers, and the discs are two groups."""
+"""Equal robots that are not adjacent: agents keep their numbers, and the discs form two groups."""
 SLIDING = ("disc", "point_mass", "disc", "disc")
-"""A point mass on slides, that nothing touches, among discs with a pose."""
+"""A point mass on slides, which touches nothing, among discs with a pose."""
 
 
 def gate(robots: tuple[str, ...] = MIXED, **changes) -> Scenario:
-    """A moment of the gate."""
+    """The gate mission for one second."""
     return robot_gate(robots=robots, **{"duration": 1.0, **changes})
 
 
 @pytest.mark.parametrize("robots", [MIXED, SLIDING, ("diff_drive", "omni", "crazyflie", "diff_drive")])
 def test_compiled_loop_python_path_and_dm_control_agree(robots):
-    """p, v, force and pose are the same to the bit on both paths of World, and the same in a dm_control episode."""
+    """p, v, force and pose are identical to the last bit on both paths of World; p, v and force agree in dm_control too."""
     scenario = gate(robots, duration=0.25, perturbation=Perturbation(start_spread=0.05, obstacle_spread=0.05))
     compiled, python = (
         run_episode(World(scenario, PD(), record=True, native=native), Scripted(), seed=3) for native in (None, False)
@@ -62,7 +62,7 @@ def test_compiled_loop_python_path_and_dm_control_agree(robots):
 
 
 def test_every_agent_is_where_mujoco_has_its_body_and_is_pushed_as_its_own_robot():
-    """p keeps its place on each agent's own body, v is its velocity there, force is what its actuators pass to the base."""
+    """p is a fixed point of each agent's own body, v its velocity, force the force that its actuators apply to the base."""
     world = World(gate(), PD())
     orders = np.full((1, 4), world.scenario.orders.index("FR"))
     truths = []
@@ -72,13 +72,13 @@ def test_every_agent_is_where_mujoco_has_its_body_and_is_pushed_as_its_own_robot
     for truth in truths:
         np.testing.assert_allclose(truth.offset, truths[0].offset, atol=1e-6)
         np.testing.assert_allclose(truth.velocity_error, 0.0, atol=1e-6)
-    pushing = [0, 1, 3]  # all but the wheels
+    pushing = [0, 1, 3]  # all but the omni, which drives on wheels
     gained = world.data[0].qfrc_actuator[world.plan.plant.qvel_index[pushing]]
     np.testing.assert_allclose(world.state.force[0, pushing], gained, atol=2e-3)
 
 
 def test_a_mixed_team_starts_where_it_is_put():
-    """Also a robot that is led by a point ahead of its axle."""
+    """Agents start at the drawn starts, also those led by a point ahead of their axle."""
     scenario = gate(("diff_drive", "omni", "crazyflie", "diff_drive"), perturbation=Perturbation(start_spread=0.1))
     world = World(scenario, PD(), worlds=2)
     observation = world.reset(7)
@@ -90,7 +90,7 @@ def test_a_mixed_team_starts_where_it_is_put():
 
 
 def test_mass_force_limit_and_force_unit_are_each_robots_own():
-    """An error of 1 m makes each agent accelerate alike, until its own limit; masses in MuJoCo are those of the robots."""
+    """Equal errors accelerate all agents alike, up to their own limits; masses in MuJoCo are those of the robots."""
     world = World(gate(), PD())
     plant, fleet = world.plan.plant, make_fleet(MIXED)
     np.testing.assert_array_equal(plant.masses, [make_robot(name).mass for name in MIXED])
@@ -107,7 +107,7 @@ def test_mass_force_limit_and_force_unit_are_each_robots_own():
 
 
 def test_the_largest_robot_sets_lengths_and_the_weakest_speed_and_acceleration():
-    """Safe distance, spacing and formation are those of the disc's gate, limits those of the Crazyflie."""
+    """Safe distance and formations are those of the disc's gate, speed and acceleration limits those of the Crazyflie."""
     scenario, largest, slowest = gate(), robot_gate("disc"), make_robot("crazyflie")
     assert scenario.safe_distance == largest.safe_distance
     np.testing.assert_array_equal(scenario.formations, largest.formations)
@@ -116,13 +116,13 @@ def test_the_largest_robot_sets_lengths_and_the_weakest_speed_and_acceleration()
 
 @pytest.mark.parametrize("robots", [("disc",) * 4, ["disc"] * 4])
 def test_four_times_the_same_robot_is_one_robot_for_all(robots):
-    """The long form of a team of one robot is the same scenario, and so the same digits."""
+    """Naming the same robot for every agent gives the same scenario as naming it once."""
     assert robot_gate(robots=tuple(robots), duration=1.0) == robot_gate("disc", duration=1.0)
     assert replace(robot_gate("disc", duration=1.0), robots=robots) == robot_gate("disc", duration=1.0)
 
 
 def test_a_copy_of_a_mixed_world_goes_on_like_its_source():
-    """Bit for bit, through a pickle."""
+    """A pickled copy continues identically to the last bit."""
     world = World(gate(), PD(), worlds=2)
     orders = np.full((2, 4), world.scenario.orders.index("FM"))
     world.reset(1)
@@ -137,7 +137,7 @@ def test_a_copy_of_a_mixed_world_goes_on_like_its_source():
 
 @pytest.mark.parametrize("robots", [MIXED, SLIDING])
 def test_a_log_knows_each_agents_robot_and_is_drawn_with_it(robots, tmp_path):
-    """Names, poses, metrics and drawn radii come back; without the file they are the same."""
+    """A log read back has the names, poses and metrics of its trajectory, and every robot is drawn with its own radius."""
     scenario, path = gate(robots), tmp_path / "log.mcap"
     with LogWriter(path, scenario, PD(), names=("scripted", "pd"), seed=0, config={}) as log:
         trajectory = run_episode(World(scenario, PD(), record=True), Scripted(), on_frame=log.write)
@@ -153,7 +153,7 @@ def test_a_log_knows_each_agents_robot_and_is_drawn_with_it(robots, tmp_path):
 
 
 def test_saturation_is_measured_by_each_robots_own_limit():
-    """A force at an omni's 12 N counts for the omni, though discs have 24 N."""
+    """A force of 12 N saturates an omni, but not a disc, which has a limit of 24 N."""
     scenario = gate(("disc", "omni", "disc", "omni"), duration=0.2)
     trajectory = run_episode(World(scenario, PD(), record=True), Scripted())
     force = np.full_like(trajectory.force, 12.0)
@@ -162,7 +162,7 @@ def test_saturation_is_measured_by_each_robots_own_limit():
 
 
 def test_a_shield_of_references_keeps_a_mixed_team_clear():
-    """Two robots with tubes of their own: the wider one holds for both; none is needed that does not hold."""
+    """If robots have different tubes, the wider one applies to the whole team, and no agent leaves it."""
     scenario = robot_gate(robots=("diff_drive", "crazyflie", "diff_drive", "crazyflie"))
     unit, first = scenario.fleet.length, scenario.obstacles[0]
     places = ((-6.0, 0.0), (-6.0, 5.0), (6.0, 0.0), (6.0, 5.0))
@@ -175,7 +175,7 @@ def test_a_shield_of_references_keeps_a_mixed_team_clear():
 
 
 def test_files_and_settings_name_each_agents_robot(tmp_path, capsys):
-    """A TOML file, a change from Python and ``--set`` make the same team; its scale is filled in."""
+    """A TOML file, a change from Python and ``--set`` make the same team; the scenario's scale is derived from it."""
     path = tmp_path / "team.toml"
     path.write_text('family = "open"\nagents = 4\nrobots = ["crazyflie", "disc", "omni", "disc"]\n')
     scenario = load_scenario(path)
@@ -206,7 +206,7 @@ def test_robots_that_cannot_be_are_one_line(changes, words):
 
 
 def test_a_shield_that_a_mixed_team_cannot_have_says_why():
-    """Of forces, whose braking is one robot's; and one of references without a tube."""
+    """A shield of forces needs robots that brake alike; a shield of references needs a tube."""
     scenario = gate(("disc", "omni", "disc", "omni"))
     with pytest.raises(ConfigurationError, match="robots 'disc' and 'omni' brake differently"):
         World(scenario, PD(), shield=Shield(level="force"))
@@ -223,7 +223,7 @@ def test_a_shield_that_a_mixed_team_cannot_have_says_why():
     ],
 )
 def test_robots_that_live_in_different_worlds_are_refused(change, words, monkeypatch):
-    """Gravity must agree; of solver and contacts, what only one file says holds for all."""
+    """Gravity must agree; a solver or contact option that only one file sets applies to all."""
     strange = replace(make_robot("omni"), name="strange", prepare=change)
     monkeypatch.setitem(ROBOTS, "strange", (lambda: strange, ""))
     with pytest.raises(ConfigurationError, match=words):
@@ -232,12 +232,12 @@ def test_robots_that_live_in_different_worlds_are_refused(change, words, monkeyp
 
 
 def test_robots_that_stand_on_different_ground_are_refused(monkeypatch):
-    """The arena's ground is solid to all geoms, a robot's own floor to its own alone."""
+    """The arena's ground collides with all geoms, a robot's own floor only with that robot's."""
     standing = replace(make_robot("omni"), name="standing", ground=True)
     monkeypatch.setitem(ROBOTS, "standing", (lambda: standing, ""))
     with pytest.raises(ConfigurationError, match="'standing' and 'disc' cannot be in one world"):
         World(gate(("disc", "standing", "disc", "disc")), PD())
-    make_fleet(("standing", "crazyflie"))  # which never touches it
+    make_fleet(("standing", "crazyflie"))  # a Crazyflie never touches the ground
 
 
 def test_titles_name_the_robots():
@@ -247,13 +247,13 @@ def test_titles_name_the_robots():
 
 
 def test_gymnasium_and_pettingzoo_take_a_mixed_team():
-    """The same decisions, the same rewards and positions as in World."""
+    """The same decisions give the same rewards and positions as in World."""
     scenario, world = gate(duration=0.2), World(gate(duration=0.2), PD())
     single, parallel = PaperFormation(scenario, PD()), PaperFormationParallel(scenario, PD())
     single.reset(seed=0)
     parallel.reset(seed=0)
     orders = world.scenario.orders.representative[[0, 1, 0, 1]][None]
-    for _ in range(scenario.mission_steps - 1):  # with the last one they begin anew
+    for _ in range(scenario.mission_steps - 1):  # the last step would begin a new episode
         step = world.step(orders)
         _, reward, *_ = single.step(np.array([0, 1, 0, 1]))
         _, rewards, *_ = parallel.step({agent: k % 2 for k, agent in enumerate(parallel.agents)})

@@ -1,4 +1,4 @@
-"""Obstacles that move: one law, seen at the right time by behaviors, supervisors, metrics, logs and pictures."""
+"""Moving obstacles: one law of motion, evaluated at the right time by behaviors, supervisors, metrics, logs and pictures."""
 
 from dataclasses import replace
 
@@ -70,7 +70,7 @@ def test_avoidance_keeps_its_rate_relative_to_an_obstacle_that_moves(vx, vy, x, 
 
 
 def test_the_compiled_loop_the_python_path_and_dm_control_are_one():
-    """An episode of 24 s with crossing and swinging obstacles, orders of every kind."""
+    """All three agree over 24 s with crossing and swinging obstacles and random orders."""
     scenario = make_scenario("traffic", duration=24.0)
     orders = np.random.default_rng(5).integers(0, len(scenario.orders), (scenario.mission_steps, scenario.agents))
     compiled, python = World(scenario), World(scenario, native=False)
@@ -89,7 +89,7 @@ def test_the_compiled_loop_the_python_path_and_dm_control_are_one():
 
 
 def test_a_world_shows_obstacles_where_they_are():
-    """After reset, after every mission step, in the middle of a mission, and in a copy."""
+    """Obstacles are right after reset, after every mission step, after ``place`` into the middle of a mission, and in a copy."""
     scenario = traffic()
     world, other = World(scenario, worlds=2), World(scenario)
     world.reset(3)
@@ -111,7 +111,7 @@ def test_a_world_shows_obstacles_where_they_are():
 
 
 def test_motions_that_stand_still_change_nothing():
-    """Obstacles with a motion of zero: the mission of obstacles at rest."""
+    """With motions of zero, the mission is identical to the one with obstacles at rest."""
     still = replace(make_scenario("field", duration=5.0), layout=None)
     zero = replace(still, motions=(Motion(),) * len(still.obstacles))
     rest, moving = World(still), World(zero)
@@ -127,7 +127,7 @@ def episode():
 
 
 def test_metrics_measure_from_where_obstacles_are_at_every_substep(episode):
-    """Clearances after each substep, and the reward's verdicts agree with them."""
+    """Clearances are measured after each substep, to where the obstacles are at that time."""
     scenario = episode.scenario
     for k in (0, 7, 1203, len(episode.time) - 1):
         place = obstacles_at((k + 1) * scenario.substep, episode.obstacles, episode.motions)
@@ -138,7 +138,7 @@ def test_metrics_measure_from_where_obstacles_are_at_every_substep(episode):
 
 
 def test_logs_and_pictures_show_obstacles_at_the_right_time(episode, tmp_path):
-    """Through the file and back: the same motions, and the drawn model has its discs where they are."""
+    """A log read back has the same motions, and the drawn discs are where the obstacles are at each time."""
     scenario, law = replace(episode.scenario, duration=8.0), SORLC()
     path = tmp_path / "traffic.mcap"
     with LogWriter(path, scenario, law, names=("fsams", "sorlc"), seed=2, config={}) as log:
@@ -156,7 +156,7 @@ def test_logs_and_pictures_show_obstacles_at_the_right_time(episode, tmp_path):
 
 @pytest.mark.parametrize("prediction", ["kinematic", "mujoco"])
 def test_predictions_see_obstacles_come(prediction):
-    """A disc far enough now that will run the team over: holding the formation costs more than getting out of its way."""
+    """A disc that is far away now but will hit the team makes holding the formation expensive; one at rest does not."""
     comes, stays = (
         make_scenario("open", obstacles=((9.0, -6.36, 0.5),), motions=(Motion(vx=speed),), duration=2.0) for speed in (-4.0, 0.0)
     )
@@ -182,7 +182,7 @@ def test_motions_that_cannot_be_are_refused(motions, fragment):
 
 
 def test_an_obstacle_that_begins_on_a_start_is_refused():
-    """Where it is at t = 0, not where its motion is anchored."""
+    """The obstacle's position at t = 0 counts, not the anchor of its motion."""
     swing = Motion(ax=30.0, phase=np.pi / 2)
     with pytest.raises(ConfigurationError, match="covers the start of agent 1"):
         make_scenario("paper", obstacles=(Obstacle(-32, 8, 1),), motions=(swing,))
@@ -190,7 +190,7 @@ def test_an_obstacle_that_begins_on_a_start_is_refused():
 
 
 def test_what_knows_only_obstacles_at_rest_says_so():
-    """The oracle's search."""
+    """The oracle's search refuses moving obstacles."""
     from marlbc_mj.supervisors.oracle import search
 
     with pytest.raises(ConfigurationError, match="at rest in known places; scenario 'traffic'"):

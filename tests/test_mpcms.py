@@ -1,4 +1,4 @@
-"""MPCMS: its prediction is the mission's own reference, its cost is hand arithmetic, and it flies the case study."""
+"""MPCMS: its prediction is the mission's own reference, its cost agrees with hand arithmetic, and it solves the case study."""
 
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ FREE = CostWeights(1.0, 0.3, 0.0, 0.0, 0.5)  # weights without a clearance term
 
 
 def at(positions, step: int = 0, obstacles=None) -> Observation:
-    """One team seen at rest at ``positions``; clearance, formation and command are not read by MPCMS."""
+    """The observation of one team at rest at ``positions``; MPCMS does not read clearance, formation and command."""
     positions = np.array(positions, dtype=float)
     obstacles = PAPER.obstacle_array() if obstacles is None else np.array(obstacles, dtype=float).reshape(-1, 3)
     fields = {"step": np.array(step), "time": np.array(step * 0.05), "position": positions, "obstacles": obstacles}
@@ -37,7 +37,7 @@ def in_formation(step: int, which: int = 0) -> np.ndarray:
 
 
 def decided(supervisor: MPCMS, now: Observation, joint: Joint | None = None) -> np.ndarray:
-    """Orders (N,) of the one team, whose joint order in force is ``joint``."""
+    """Orders (N,) chosen for one team with the current joint order ``joint``."""
     memory = supervisor.start(PAPER, 1)
     return supervisor.decide(now, memory._replace(joints=(joint,) if joint else memory.joints))[0][0]
 
@@ -53,7 +53,7 @@ def judge(start, step, orders, obstacles, weights, *, threads=1, trails=None):
 
 
 def test_the_prediction_is_the_worlds_reference():
-    """From the same p_r and orders, the kinematic trail is the ``virtual`` reference of World: FM, OA, FR and the start."""
+    """From the same p_r and orders, the kinematic trail is World's ``virtual`` reference, under FM, FR and OA, from the start."""
     horizon, rng = 40, np.random.default_rng(0)
     orders = np.repeat(rng.choice([FM, FR, OA_FM, OA_FR], (5, 4)), 8, axis=0)
     world = World(PAPER)
@@ -75,10 +75,10 @@ def test_the_prediction_does_not_depend_on_the_number_of_threads():
 
 @pytest.mark.parametrize("scenario", [PAPER, paper(composition="set-based"), robot_gate("disc")], ids=["null", "set", "disc"])
 def test_candidates_that_are_given_up_could_not_have_been_the_cheapest(scenario):
-    """In drawn states, moving, some out of formation or too close: the rest costs what it costs alone, to the bit.
+    """In random states, some out of formation or too close, every candidate that is kept costs exactly what it costs alone.
 
-    Teams are in formation or in column, so the first candidate is often the best, but not always. Limited accelerations make the
-    velocity part of what two candidates have in common.
+    Teams are in formation or in column, so the first candidate is often the best, but not always. With limited accelerations,
+    the state that two candidates share includes the velocity.
     """
     rng, supervisor = np.random.default_rng(3), MPCMS()
     memory = supervisor.start(scenario, 24)
@@ -104,14 +104,14 @@ def test_candidates_that_are_given_up_could_not_have_been_the_cheapest(scenario)
     np.testing.assert_array_equal(threaded_costs, found)
     np.testing.assert_array_equal(threaded_trails[kept], whole[kept])
     np.testing.assert_array_equal(threaded_trails, trails)
-    assert np.isnan(trails[~kept][:, -1]).all()  # not what happened to be in memory
+    assert np.isnan(trails[~kept][:, -1]).all()  # not uninitialized memory
 
 
 @pytest.mark.parametrize("family", ["gates", "exchange"])
 def test_avoidance_on_top_changes_no_motion_under_the_set_based_composition(family):
-    """So no candidate differs in it alone: same trails to the bit in crowded states.
+    """In crowded states, trails with and without it are identical to the last bit, so no candidate differs in it alone.
 
-    Where agent avoidance stands before obstacle avoidance, order matters, and candidates have both.
+    If agent avoidance comes before obstacle avoidance, avoidance on top does matter, so there are candidates that differ in it.
     """
     scenario = make_scenario(family, composition="set-based")
     world, rng = World(scenario, worlds=8), np.random.default_rng(5)
@@ -148,7 +148,7 @@ def test_the_cost_of_two_steps_by_hand():
 
 
 def test_a_free_path_is_held_in_formation_and_a_column_left():
-    """Nothing in the way: FM stays FM, FR becomes FM at once: w_F > w_R, and the gain outweighs one switch."""
+    """Without obstacles FM stays FM, and FR becomes FM at once: w_F > w_R, and the gain outweighs one switch."""
     open_field = at(in_formation(0), obstacles=[])
     assert (decided(MPCMS(), open_field) == FM).all()
     column = at(in_formation(0, 1), obstacles=[])
@@ -157,7 +157,7 @@ def test_a_free_path_is_held_in_formation_and_a_column_left():
 
 
 def test_one_agents_obstacle_is_dodged_and_the_gate_makes_a_column():
-    """Point O1 just ahead of agent 1: OA for it alone; the discs just ahead of agents 1 and 2: FR for all."""
+    """With point O1 just ahead of agent 1, it alone gets OA; with the discs just ahead of agents 1 and 2, all get FR."""
     assert decided(MPCMS(), at(in_formation(362), 362)).tolist() == [OA_FM, FM, FM, FM]
     assert (decided(MPCMS(), at(in_formation(1070), 1070)) == FR).all()
 
@@ -168,7 +168,7 @@ def test_switching_is_put_off_while_the_path_is_clear():
 
 
 def test_candidates_are_holding_and_every_change_at_every_instant():
-    """N = 4 in FM: hold + 8 instants · (FR or one of four agents' avoidance); pairs add six."""
+    """N = 4 in FM: hold + 8 instants · (FR or one of four agents' avoidance); ``together=2`` adds six pairs."""
     free = Joint(0, (False,) * 4)
     assert len(MPCMS()._candidates(PAPER, free).orders) == 1 + 8 * 5
     assert len(MPCMS(together=2)._candidates(PAPER, free).orders) == 1 + 8 * 11
@@ -182,7 +182,7 @@ def test_candidates_are_holding_and_every_change_at_every_instant():
 
 
 def test_the_case_study_without_violation_with_the_fewest_switches():
-    """What the project promises: no violation, switches at most 4/2/2/4, at least the scripted supervisor's 15 017."""
+    """No violation, at most 4/2/2/4 switches, and a return of at least the scripted supervisor's 15 017, as promised."""
     metrics = measure(run_episode(World(PAPER, record=True), MPCMS()))
     assert [agent["violation_time"] for agent in metrics["agents"]] == [0.0] * 4
     assert all(agent["switches"] <= most for agent, most in zip(metrics["agents"], (4, 2, 2, 4), strict=True))
@@ -191,7 +191,7 @@ def test_the_case_study_without_violation_with_the_fewest_switches():
 
 
 def test_under_the_set_based_composition_it_leaves_the_column_again():
-    """It looks 6 s ahead there: within 2 s the way back into the formation would not pay."""
+    """It looks 6 s ahead under this composition: over only 2 s, returning to the formation would not pay."""
     scenario = paper(composition="set-based", duration=21.0)
     for horizon, last in ((None, "FM"), (40, "FR")):
         command = run_episode(World(scenario, record=True), MPCMS(horizon=horizon)).command
@@ -209,21 +209,21 @@ def test_episodes_are_deterministic_and_the_memory_is_not_changed_by_a_decision(
 
 
 def test_a_drawn_case_study_is_safe_too():
-    """Other starts, obstacles and drag, of which the prediction knows the obstacles: past both points and into the gate."""
+    """The prediction knows the drawn obstacles, but not the drag: the team passes both points and enters the gate."""
     scenario = paper(perturbation=Perturbation(1.0, 0.5, (0.0, 2.0)), duration=60.0)
     metrics = measure(run_episode(World(scenario, record=True), MPCMS(), seed=1))
     assert [agent["violation_time"] for agent in metrics["agents"]] == [0.0] * 4
 
 
 def test_without_a_feasible_candidate_the_least_violation_is_chosen():
-    """Agent 1 inside a disc: a decision all the same."""
+    """With agent 1 inside a disc, the supervisor still decides."""
     positions = in_formation(1200)
     positions[0] = 60.0, 9.0
     assert decided(MPCMS(), at(positions, 1200)).shape == (4,)
 
 
 def test_both_starts_agree_while_the_reference_is_tracked():
-    """The first decision of an episode is the same, and its own copy of p_r is the world's."""
+    """The supervisor's own copy of p_r remains equal to the world's."""
     world, supervisor = World(PAPER), MPCMS(start_from="reference")
     memory, observation = supervisor.start(PAPER, 1), world.observe()
     for _ in range(30):
@@ -233,7 +233,7 @@ def test_both_starts_agree_while_the_reference_is_tracked():
 
 
 def test_mujoco_prediction_simulates_what_the_world_does():
-    """With the nominal drag the twin is the world: the chosen candidate's first position is what comes, to rounding."""
+    """With nominal drag, the chosen candidate's first position is the world's next position, up to rounding."""
     world, supervisor = World(PAPER), MPCMS(horizon=3, instants=(0,), prediction="mujoco")
     memory, observation = supervisor.start(PAPER, 1), world.observe()
     for _ in range(20):
@@ -243,7 +243,7 @@ def test_mujoco_prediction_simulates_what_the_world_does():
 
 
 def test_mujoco_prediction_has_a_world_for_every_candidate():
-    """Whoever avoids: with two agents avoiding there is one change more than with one, since none of them is both kinds."""
+    """However many agents avoid: two have one change more than one, since no change is both a team's and an agent's."""
     supervisor = MPCMS(horizon=2, instants=(0,), prediction="mujoco")
     memory = supervisor.start(PAPER, 1)
     for avoiding in range(5):

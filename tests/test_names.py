@@ -34,7 +34,7 @@ def defined(path: Path) -> Iterator[str]:
 
 @cache
 def repeated(root: Path) -> dict[str, list[str]]:
-    """Files by name, of names that more than one file defines."""
+    """The files that define each name, for names that more than one file defines."""
     homes = defaultdict(list)
     for path in sources(root):
         for name in dict.fromkeys(defined(path)):
@@ -47,7 +47,7 @@ def test_every_public_name_stands_once() -> None:
 
 
 def test_nothing_in_studies_or_cli_shares_a_name() -> None:
-    """Whatever the list says of other packages."""
+    """These modules have no exceptions, unlike other packages."""
     own = ("marlbc_mj/studies/", "marlbc_mj/cli/", "marlbc_mj/results/seeds.py")
     assert {name: files for name, files in repeated(ROOT).items() if any(file.startswith(own) for file in files)} == {}
 
@@ -62,7 +62,7 @@ def test_a_planted_twin_is_found(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize("name", [*SUPERVISORS, *CONTROLLERS])
 def test_every_method_has_a_name_for_people_and_a_source(name: str) -> None:
-    """Its own one; what is of a user's file is called by file and name, what is not known by its own name."""
+    """Display names are unique; a class from a user's file is displayed as file and name."""
     shown = source_of(name)
     others = {source_of(other).display for other in (*SUPERVISORS, *CONTROLLERS) if other != name}
     assert shown.citation and shown.display not in {name, *others}

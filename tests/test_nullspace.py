@@ -14,7 +14,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def composed(order, velocities, jacobians, rows) -> np.ndarray:
-    """The sum (12), term by term, as :func:`marlbc_mj.engine.composition.compose` makes it."""
+    """The sum (12), term by term, as :func:`marlbc_mj.engine.composition.compose` computes it."""
     n = velocities.shape[1]
     out, basis, rank = np.zeros(n), np.empty((n, n)), 0
     for j in order:
@@ -64,7 +64,7 @@ def test_compose_is_the_literal_formula_for_rank_deficient_stacks(seed):
 
 @given(seeds)
 def test_compose_is_the_literal_formula_for_general_jacobians(seed):
-    """The same for Gaussian rows, whose stacks are full rank but not orthogonal, followed by a combination of them."""
+    """The same holds for Gaussian rows, with stacks of full rank but not orthogonal, and a combination of two of them."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, 6))
     jacobians = rng.normal(size=(4, 1, n))
@@ -78,7 +78,7 @@ def test_compose_is_the_literal_formula_for_general_jacobians(seed):
 
 @given(seeds)
 def test_lower_priorities_never_disturb_the_first_task(seed):
-    """J_1 v_r = J_1 v^1 whatever the other behaviors ask."""
+    """J_1 v_r = J_1 v^1 whatever velocities the other behaviors request."""
     order, velocities, jacobians, rows = random_behaviors(seed)
     first = jacobians[order[0], : rows[order[0]]]
     difference = first @ (composed(order, velocities, jacobians, rows) - velocities[order[0]])

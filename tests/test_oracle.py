@@ -1,4 +1,4 @@
-"""The oracle: shipped schedules reproduce their entries, never violate, and the search is deterministic."""
+"""The oracle: shipped schedules reproduce their entries without violations, and the search is deterministic."""
 
 import json
 from dataclasses import replace
@@ -30,18 +30,18 @@ from marlbc_mj.util.errors import ConfigurationError
 PAPER = paper()
 SHORT = paper(
     name="short", duration=4.0, obstacles=(), schedule=(Window(1.025, 2.025, -1, "FR"),)
-)  # where FM throughout is better
+)  # FM throughout is better than this schedule
 SHIPPED = sorted(entry["controller"] for entry in read_cache(shipped_schedules()).values())
 
 
 def test_the_case_studys_controller_is_among_the_shipped():
-    """SORLC at least."""
+    """At least SORLC has a shipped schedule."""
     assert "sorlc" in SHIPPED
 
 
 @pytest.mark.parametrize("controller", SHIPPED)
 def test_a_shipped_schedule_is_what_its_entry_says(controller):
-    """Its return exactly, above the scripted schedule's under the same controller, without any violation at any substep."""
+    """Its return is exactly the entry's and above the script's under the same controller, without a violation at any substep."""
     oracle = Oracle(controller)
     entry = oracle.entry(PAPER)
     trajectory = run_episode(World(PAPER, make_controller(controller), record=True), oracle)
@@ -53,7 +53,7 @@ def test_a_shipped_schedule_is_what_its_entry_says(controller):
 
 
 def test_the_oracle_makes_the_switches_of_its_windows():
-    """At least the fewest that the geometry allows, 4/2/2/4, and those of its schedule; it is registered under its name."""
+    """Switches are those of the schedule, at least the fewest that the geometry allows, 4/2/2/4; ``oracle`` is registered."""
     oracle = make_supervisor("oracle")
     trajectory = run_episode(World(PAPER, record=True), oracle)
     table = command_table(PAPER, oracle.schedule(PAPER).windows)
@@ -64,7 +64,7 @@ def test_the_oracle_makes_the_switches_of_its_windows():
 
 
 def test_the_scripted_returns_of_the_entries_are_the_reference_values():
-    """15 017 under SORLC."""
+    """The scripted return under SORLC is 15 017."""
     assert Oracle("sorlc").entry(PAPER)["scripted"] == 15017
 
 
@@ -74,13 +74,13 @@ def test_the_scripted_returns_of_the_entries_are_the_reference_values():
     ids=["substep", "force limit", "perturbation"],
 )
 def test_another_scenario_has_no_schedule_and_says_how_to_get_one(scenario):
-    """The message names scenario, controller and command."""
+    """The message names the scenario, the controller and the command to run."""
     with pytest.raises(ConfigurationError, match="no schedule for scenario 'paper' under 'sorlc' .* marlbc oracle"):
         Oracle().start(scenario, 1)
 
 
 def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
-    """Of its controller; other settings still have none."""
+    """The schedule is the one for the same controller; draws with other settings have none."""
     draws = paper(perturbation=Perturbation(start_spread=1.0, drag_scale=(0.0, 2.0)))
     for controller in ("sorlc", "pd"):
         supervisor = make_supervisor("oracle-schedule", controller)
@@ -90,7 +90,7 @@ def test_on_request_a_draw_gets_the_schedule_of_the_unperturbed_scenario():
 
 
 def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
-    """The cache is keyed by what decides the return."""
+    """The cache is keyed by everything that affects the return."""
     assert Oracle().entry(paper(name="other", description="x", schedule=())) == Oracle().entry(PAPER)
     with pytest.raises(ConfigurationError, match="under 'lqr'"):
         Oracle("lqr", cache=tmp_path / "none.json").entry(PAPER)
@@ -99,7 +99,7 @@ def test_names_and_scripts_do_not_change_the_key_but_gains_do(tmp_path):
 
 
 def test_a_broken_cache_is_refused(tmp_path):
-    """One line, naming the file."""
+    """The error names the file."""
     broken = tmp_path / "broken.json"
     for text in ("{", "[]"):
         broken.write_text(text)
@@ -108,7 +108,7 @@ def test_a_broken_cache_is_refused(tmp_path):
 
 
 def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):
-    """Same seed, same schedule, whatever the threads; another budget only goes further; what is saved is what is played."""
+    """The same seed gives the same schedule; the best return never falls; a saved schedule is replayed with its return."""
     calls: list[tuple[int, float]] = []
     found = search(SHORT, "pd", seed=3, budget=70, population=16, progress=lambda *call: calls.append(call))
     again = search(SHORT, "pd", seed=3, budget=70, population=16)
@@ -126,7 +126,7 @@ def test_the_search_is_deterministic_improves_and_is_remembered(tmp_path):
 
 
 def test_violations_are_seen_between_mission_steps():
-    """The search counts what the metrics count: FM throughout takes agent 1 past O1 at a metre."""
+    """The search counts the violations that the metrics count: FM throughout takes agent 1 past O1 at a distance of 1 m."""
     scenario = paper(duration=25.0)
     fm = (Window(0.0, 0.0, -1, "FM"),)
     result = evaluate(
@@ -169,6 +169,6 @@ def test_tables_and_windows_are_one_thing(seed):
     ids=["perturbed", "no schedule", "seed", "budget", "population", "never safe"],
 )
 def test_what_cannot_be_searched_is_refused(changes, message):
-    """One clear line."""
+    """The error states the reason."""
     with pytest.raises(ConfigurationError, match=message):
         search(**{"scenario": PAPER, **changes})

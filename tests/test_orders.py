@@ -23,7 +23,7 @@ def test_the_paper_has_six_orders_and_four_commands():
 
 @given(teams)
 def test_orders_are_all_permutations_and_commands_their_classes(complete):
-    """M! distinct rows; a command is a prefix that ends with its first complete behavior; its representative commands it."""
+    """M! distinct rows; a command is a prefix up to its first complete behavior; its representative is an order that gives it."""
     names = [f"b{j}" for j in range(len(complete))]
     orders = Orders(names, complete)
     assert len(orders) == factorial(len(complete)) == len({tuple(row) for row in orders.table.tolist()})
@@ -35,7 +35,7 @@ def test_orders_are_all_permutations_and_commands_their_classes(complete):
 
 
 def test_index_takes_an_order_or_a_command():
-    """A command's name gives the first order that commands it, a full name exactly that order."""
+    """A command's name gives the first order with that command, a full name exactly that order."""
     for k, name in enumerate(PAPER.names):
         assert PAPER.index(name) == k
     for k, command in enumerate(PAPER.commands):

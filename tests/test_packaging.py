@@ -31,7 +31,7 @@ in_repository = pytest.mark.skipif(not (ROOT / "pyproject.toml").exists(), reaso
 
 @cache
 def _imports(path: Path) -> set[str]:
-    """Top-level names that a file imports, wherever in it."""
+    """Top-level names that a file imports anywhere."""
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
@@ -56,7 +56,7 @@ def _requirements() -> set[str]:
 @in_repository
 @pytest.mark.parametrize("name", LINKED)
 def test_links_are_relative_and_resolve(name: str) -> None:
-    """marlbc_mj/{models,tasks,training} lead to the folders beside the package, wherever the clone is."""
+    """marlbc_mj/{models,tasks,training} point to the folders beside the package, wherever the clone is."""
     link = ROOT / "marlbc_mj" / name
     if not (ROOT / name).exists():
         pytest.skip("an sdist holds real folders in place of the links")
@@ -87,7 +87,7 @@ def test_data_files_are_there(name: str) -> None:
 
 @in_repository
 def test_wheel_holds_every_file(tmp_path: Path) -> None:
-    """A wheel has all of marlbc_mj, what the links lead to included, and nothing else at its top level."""
+    """A wheel contains all of marlbc_mj, including the linked folders, and nothing else."""
     for name in ("pyproject.toml", "README.md", "LICENSE"):
         shutil.copy(ROOT / name, tmp_path)
     for name in ("marlbc_mj", *LINKED):
@@ -103,7 +103,7 @@ def test_wheel_holds_every_file(tmp_path: Path) -> None:
 
 
 def test_public_names_exist() -> None:
-    """Each name of ``__all__`` can be had, once; and they are about 20 at most."""
+    """Each name of ``__all__`` exists and occurs once, and there are at most 24."""
     names = getattr(marlbc_mj, "__all__", ())
     assert len(names) == len(set(names)) <= 24
     assert [name for name in names if not hasattr(marlbc_mj, name)] == []
@@ -116,29 +116,29 @@ def _loaded_by(code: str) -> set[str]:
 
 
 def test_the_package_itself_loads_nothing_heavy() -> None:
-    """A renderer can still be chosen: its environment variable must be set before MuJoCo is imported."""
+    """So a renderer can still be chosen: its environment variable must be set before MuJoCo is imported."""
     assert not {"mujoco", "numba", "numpy", "torch"} & _loaded_by("import marlbc_mj")
 
 
 @pytest.mark.parametrize("name", ["ConfigurationError", "laws", "paper", "World"])
 def test_a_public_name_needs_no_other(name: str) -> None:
-    """Classes, functions and a module, each the first that a process asks for."""
+    """A class, a function or a module can each be the first import of a process."""
     assert "marlbc_mj" in _loaded_by(f"from marlbc_mj import {name}")
 
 
 def test_what_does_not_learn_loads_no_torch() -> None:
-    """Supervisors with a trained policy, environments, reports and the command line; nor does any file outside training/."""
+    """Supervisors with a trained policy, environments, reports and the command line load no torch; only training/ imports it."""
     names = ("supervisors", "policies.checkpoint", "episode", "tasks.gymnasium_env", "report", "cli", "training.config")
     loaded = _loaded_by("\n".join(f"import marlbc_mj.{name}" for name in names))
     assert "mujoco" in loaded and "torch" not in loaded
     using = [path.relative_to(ROOT).parts for path in SOURCES if "torch" in _imports(path)]
     learning = {"training" if "training" in parts else parts[-2] for parts in using}
-    assert learning == {"training", "policies"}  # policies/greedy.py names its types only
+    assert learning == {"training", "policies"}  # policies/greedy.py imports its types only
 
 
 @pytest.mark.parametrize("name", ["marlbc_mj.controllers", "marlbc_mj.scenarios", "marlbc_mj.supervisors", "marlbc_mj.tasks"])
 def test_public_names_of_subpackages_exist(name: str) -> None:
-    """Each name of a subpackage's ``__all__`` can be had."""
+    """Each name of a subpackage's ``__all__`` exists."""
     module = importlib.import_module(name)
     assert [public for public in getattr(module, "__all__", ()) if not hasattr(module, public)] == []
 
@@ -180,7 +180,7 @@ def test_constraints_pin_every_dependency() -> None:
 
 
 def _identifiers(source: str) -> set[str]:
-    """Every name that a source file defines or takes: variables, arguments, functions, classes, attributes, keys."""
+    """Every name that a source file defines or uses: variables, arguments, functions, classes and string keys."""
     found = set()
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Name):

@@ -1,4 +1,4 @@
-"""What the command line says of arguments that it cannot parse: tyro's hook where there is one, tyro's own words elsewhere."""
+"""Messages for arguments that the command line cannot parse: ours where tyro has its hook, tyro's own elsewhere."""
 
 import json
 import re
@@ -20,7 +20,7 @@ from marlbc_mj.cli.terminal import seldom
 
 
 def said_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What goes to stderr, with exit status 2."""
+    """The text on stderr of a command that exits with status 2."""
     with pytest.raises(SystemExit) as stopped:
         main(arguments)
     assert stopped.value.code == 2
@@ -28,7 +28,7 @@ def said_of(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def leaves(kind, path=()):
-    """Every command with its words."""
+    """Yield every command without subcommands, with the words that select it."""
     inner = parsing.subcommands_of(kind)
     if not inner:
         yield path, kind
@@ -37,7 +37,7 @@ def leaves(kind, path=()):
 
 
 def test_options_and_subcommands_are_those_of_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of every command: what is suggested can be given, and every option can be suggested."""
+    """For every command, the options that can be suggested are exactly those in its help."""
     found = dict(leaves(Command))
     assert ("bench",) in found and ("log", "recover") in found and len(found) > 18
     for path, command in found.items():
@@ -79,7 +79,7 @@ def test_what_is_wrong_is_one_line(arguments: list[str], said: str, capsys: pyte
 def test_without_the_hook_tyro_speaks_for_itself(
     missing: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A later tyro may drop its hook: what is wrong is still said, and the exit status stays 2."""
+    """A later tyro may drop its hook: the error is still reported, and the exit status is still 2."""
     if missing == "module":
         monkeypatch.delattr(tyro, "_errors")
     else:
@@ -149,7 +149,7 @@ def test_a_wrong_word_is_answered_with_the_nearest_right_one(line: str, capsys: 
 
 
 def test_nothing_heavy_is_imported_for_that() -> None:
-    """Nor for the help and for lists: each is answered by a process that has imported neither NumPy nor any law."""
+    """A process reports wrong words and prints help and lists without importing NumPy, Numba, MuJoCo or torch."""
     lines = [*(line.split() for line in WRONG_WORDS), ["--help"], ["bench", "--help"], ["list"], ["list", "robots"]]
     done = subprocess.run([sys.executable, "-c", HEAVY, json.dumps(lines)], capture_output=True, text=True, check=True)
     *_, loaded = done.stdout.splitlines()
@@ -157,12 +157,12 @@ def test_nothing_heavy_is_imported_for_that() -> None:
 
 
 def test_names_are_those_of_the_registries() -> None:
-    """``python -m marlbc_mj.cli.names`` writes the file anew."""
+    """If this fails, ``python -m marlbc_mj.cli.names`` rewrites the file."""
     assert registered() == selectable()
 
 
 def test_every_choice_is_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    """And no title or default that tells nothing."""
+    """The help also has no repeated title and no default of None."""
     for path in (["run"], ["bench"], ["evaluate"], ["suite"], ["train"]):
         with pytest.raises(SystemExit):
             main([*path, "--help"])
@@ -183,12 +183,15 @@ def test_one_kind_can_be_listed(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_line_per_method_where_nobody_watches(capsys: pytest.CaptureFixture[str]) -> None:
-    """By its name for people, once, when it has ended; what takes minutes tells of itself now and then, too."""
+    """A method is reported once, by its display name, when it ends; long stages also report in between."""
     tell = seldom()
     for done in range(201):
         tell("fsams+sorlc", done, 200)
     tell("jobs", 3, 26)
     assert re.fullmatch(r"FSAMS \+ SORLC: 200 of 200 in \d+\.\d s\n", capsys.readouterr().err)
+    for done in (0, 100, 200):  # as of the next job
+        tell("fsams+sorlc", done, 200)
+    assert capsys.readouterr().err.count("FSAMS + SORLC: 200 of 200") == 1
     often = seldom(every=0.0, ends=False)
     for done in (0, 100, 200):
         often("mpcms+pd", done, 200)
@@ -197,7 +200,7 @@ def test_a_line_per_method_where_nobody_watches(capsys: pytest.CaptureFixture[st
 
 
 def test_a_document_holds_numbers_by_name(capsys: pytest.CaptureFixture[str]) -> None:
-    """Of dataclasses, named tuples and arrays; NumPy's numbers are numbers, and what is not finite is null."""
+    """This covers dataclasses, named tuples and arrays; NumPy scalars become numbers, and non-finite values null."""
 
     class Row(NamedTuple):
         passed: Any

@@ -1,4 +1,4 @@
-"""The measuring command measures: a smoke run with small bursts. The figures themselves are the machine's."""
+"""Smoke tests of the performance measurements with short bursts. The measured values depend on the machine."""
 
 from threading import Thread
 
@@ -17,7 +17,7 @@ PARTS = {"simulation", "state", "action_values", "exploration", "replay", "rest"
 
 
 def small(threads: int) -> TrainConfig:
-    """A run of few worlds."""
+    """The configuration of a training run with few worlds."""
     return make_config(
         "fast",
         threads=threads,
@@ -34,7 +34,7 @@ def small(threads: int) -> TrainConfig:
 
 @pytest.mark.slow
 def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All keys of the file's schema, positive and finite, and lines that show them."""
+    """All figures of the file's schema exist, are positive and finite, and are printed."""
     small_numbers = {"BATCH": 2, "BATCHES": (1, 2), "BURST": 40, "PYTHON_STEPS": 1, "SUPERVISED_WORLDS": 2, "SUPERVISED_STEPS": 3}
     for name, value in small_numbers.items():
         monkeypatch.setattr(perf, name, value)
@@ -77,7 +77,7 @@ def test_a_small_run_has_every_figure(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Parts that call each other share out the time without counting any of it twice; the object is itself again after."""
+    """Time in parts that call each other is counted once, and the object gets its own class back."""
 
     class Work:
         def outer(self) -> None:
@@ -87,7 +87,7 @@ def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> No
             pass
 
     now = iter(range(100))
-    monkeypatch.setattr(perf_training, "perf_counter", lambda: float(next(now)))  # a second between any two looks
+    monkeypatch.setattr(perf_training, "perf_counter", lambda: float(next(now)))  # one second between any two calls
     clock, work = perf_training.PartClock(), Work()
     with clock.timing(work, ("outer",), "a"), clock.timing(work, ("__call__",), "b"):
         work.outer()
@@ -100,7 +100,7 @@ def test_only_the_innermost_part_is_timed(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_a_profile_leaves_training_as_it_was(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same numbers with and without the clock."""
+    """Training gives the same numbers with and without the profile's clock."""
     monkeypatch.setattr(trainer, "WARM_UP", 64)
     one, other = trainer.Trainer(small(1)), trainer.Trainer(small(1))
     for run in (one, other):
@@ -114,7 +114,7 @@ def test_a_profile_leaves_training_as_it_was(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_exploring_starts_end_at_different_times() -> None:
-    """All of them after the present and none later than before; whole missions are left alone."""
+    """All ends are in the future and none is later than before; whole missions are unchanged."""
     batch = trainer.Trainer(make_config("fast", threads=1, worlds=32, capacity=1_000)).batch
     before = batch.cut
     perf_training.spread(batch, np.random.default_rng(0))
@@ -126,7 +126,7 @@ def test_exploring_starts_end_at_different_times() -> None:
 
 
 def test_a_fleet_is_spread_over_the_mission() -> None:
-    """Its worlds stand at different times of the same episode: each equals a single world run that far."""
+    """Its worlds are at different times of the same episode; each equals a single world run to that time."""
     scenario = paper(duration=5.0)
     orders = perf.scripted_orders(scenario)
     fleet = perf.Fleet(scenario, 4, 1, orders)
@@ -142,7 +142,7 @@ def test_a_fleet_is_spread_over_the_mission() -> None:
 def test_decision_times_are_of_every_step_and_of_decisions(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A supervisor that takes a millisecond per decision and nothing in between: its mean, median, and what a decision takes."""
+    """Mean, median and time per decision of a supervisor that takes 1 ms per decision and nothing in between."""
     scenario, clock = paper(duration=10.0), [0.0]
     every = decision_steps(scenario, make_sight(scenario))
 
@@ -157,7 +157,7 @@ def test_decision_times_are_of_every_step_and_of_decisions(
     monkeypatch.setattr(decision_times, "perf_counter", lambda: clock[0])
     monkeypatch.setattr(decision_times, "make_supervisor", lambda name: Slow())
     monkeypatch.setattr(decision_times, "TIMED_DECISIONS", 3)
-    for name in ("GROUNDS", "TEAM_SIZES"):
+    for name in ("MISSION_FAMILIES", "TEAM_SIZES"):
         monkeypatch.setattr(decision_times, name, getattr(decision_times, name)[:1])
     monkeypatch.setattr(decision_times, "timed_mission", lambda family, agents: scenario)
     times = decision_times.per_mission_step("field", 1)["lookahead"]

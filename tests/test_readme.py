@@ -1,4 +1,4 @@
-"""What the README shows runs as shown."""
+"""The README's examples run as shown."""
 
 import importlib
 import re
@@ -11,7 +11,7 @@ README = Path(__file__).parent.parent / "README.md"
 
 
 def test_python_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The README's Python blocks, one after the other as one module, run, and run compiled."""
+    """The README's Python blocks, joined into one module, run, and run compiled."""
     blocks = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert blocks
     (tmp_path / "readme_blocks.py").write_text("\n".join(blocks))
@@ -37,7 +37,7 @@ def test_commands_exist() -> None:
 
 
 def test_it_is_short_enough_to_be_read() -> None:
-    """In five minutes, with time left to try it; and what it links to is there."""
+    """It has at most 900 words, read in five minutes, and the files that it links to exist."""
     text = README.read_text()
     assert len(text.split()) <= 900
     for target in re.findall(r"\]\((?!http)([^)#]+)", text):

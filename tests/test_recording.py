@@ -1,4 +1,4 @@
-"""Recording: what is written is what is read back, and a log torn anywhere is a shorter log."""
+"""Recording: logs are read back exactly, and a log truncated anywhere can be recovered as a shorter one."""
 
 import csv
 import json
@@ -43,7 +43,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.provenance import config_hash
 
 CONFIG = {"steps": 3, "nested": {"a": [1.5, None, "µ"]}}
-TOPICS_EACH = 9  # messages of a mission step
+TOPICS_EACH = 9  # messages per mission step
 JSON_TOPICS = [topic.name for topic in schemas.TOPICS]
 
 
@@ -59,13 +59,13 @@ def record(path: Path, scenario: Scenario, controller: str = "sorlc", seed: int 
 
 
 def assert_same(one: EpisodeLog, other: EpisodeLog) -> None:
-    """Equal field by field, bit for bit."""
+    """Assert that two logs are equal in every field, to the last bit."""
     for field in fields(EpisodeLog):
         assert_equal(getattr(one, field.name), getattr(other, field.name), field.name)
 
 
 def assert_equal(a: Any, b: Any, name: str) -> None:
-    """Arrays bit for bit, also those in named tuples."""
+    """Assert that two values are equal; arrays, also those in named tuples, exactly."""
     if hasattr(a, "_fields"):
         for inner in a._fields:
             assert_equal(getattr(a, inner), getattr(b, inner), f"{name}.{inner}")
@@ -85,7 +85,7 @@ def messages(path: Path) -> dict[str, list[bytes]]:
 
 
 def strict_json(data: bytes):
-    """Parse, refusing what JSON does not have but Python accepts."""
+    """Parse JSON and refuse the constants that only Python accepts, such as NaN."""
 
     def refuse(constant: str):
         raise AssertionError(f"{constant} in {data!r}")
@@ -94,7 +94,7 @@ def strict_json(data: bytes):
 
 
 def matches(value, schema: dict) -> bool:
-    """As much of JSON Schema as the topics use."""
+    """Whether a value matches a schema, for the part of JSON Schema that the topics use."""
     kind = schema["type"]
     if kind == "object":
         known = all(name in schema["properties"] and matches(v, schema["properties"][name]) for name, v in value.items())
@@ -113,7 +113,7 @@ def short(tmp_path_factory) -> tuple[Path, Trajectory]:
 
 @pytest.fixture(scope="session")
 def empty_field(tmp_path_factory) -> tuple[Path, Trajectory]:
-    """No obstacles, so that every clearance is infinite; a controller without SORLC's weights and limit."""
+    """A log without obstacles, so that every clearance is infinite, and with a controller that has no network weights."""
     path = tmp_path_factory.mktemp("logs") / "empty.mcap"
     return path, record(path, paper(duration=1.0, obstacles=()), "pd")
 
@@ -125,7 +125,7 @@ def test_round_trip_is_exact(name, controller, request):
 
 
 def test_round_trip_of_a_drawn_episode(tmp_path):
-    """Obstacles in the log are this seed's, not the scenario's."""
+    """The log has the obstacles drawn for this seed, not the scenario's."""
     scenario = paper(duration=1.0, perturbation=Perturbation(start_spread=0.5, obstacle_spread=1.0, drag_scale=(0.5, 2.0)))
     trajectory = record(tmp_path / "a.mcap", scenario, seed=7)
     log = read_log(tmp_path / "a.mcap")
@@ -135,7 +135,7 @@ def test_round_trip_of_a_drawn_episode(tmp_path):
 
 @given(values=st.lists(st.tuples(st.floats(), st.floats(), st.floats(), st.floats()), min_size=1, max_size=4))
 def test_encoded_numbers_are_json_and_exact(values):
-    """Finite floats come back bit for bit, others are left out: no NaN, no Infinity."""
+    """Finite floats are restored to the last bit; NaN and infinity are omitted."""
     rows = strict_json(schemas.encode(schemas.STATE_TOPIC, np.array(values), time=0.1))["agents"]
     for row, expected in zip(rows, values, strict=True):
         finite = {n: x for n, x in zip(schemas.STATE_TOPIC.columns, expected, strict=True) if math.isfinite(x)}
@@ -162,7 +162,7 @@ def test_json_messages_match_their_schemas(name, request):
 
 
 def test_schemas_are_simple_enough_for_viewers():
-    """One plain type a field, and no array of arrays: what Foxglove's schema parser takes."""
+    """Every field has one plain type, and there is no array of arrays, as Foxglove's schema parser requires."""
 
     def check(schema: dict) -> None:
         assert isinstance(schema["type"], str)
@@ -234,7 +234,7 @@ def test_layout_plots_fields_that_exist(short):
 
 
 def test_existing_files_are_kept_unless_told(tmp_path):
-    """A finished log, and a torn one that someone may want to recover."""
+    """Neither a finished log nor a partial one, which may still be recovered, is overwritten."""
     scenario, path = paper(duration=1.0), tmp_path / "a.mcap"
     for taken in (path, partial_name(path)):
         taken.write_bytes(b"precious")
@@ -280,7 +280,7 @@ def test_a_run_that_fails_leaves_a_readable_partial_log(tmp_path, short):
 
 @pytest.fixture(scope="session")
 def chunked(tmp_path_factory) -> Path:
-    """A log with many chunks, as a run in real time leaves it."""
+    """A log with many chunks, as a run in real time writes it."""
     path = tmp_path_factory.mktemp("logs") / "chunked.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("marlbc_mj.recording.writer.CHUNK_SIZE", 20_000)
@@ -290,7 +290,7 @@ def chunked(tmp_path_factory) -> Path:
 
 
 def recovered(path: Path, out: Path) -> int:
-    """Messages that were recovered; 0 where there was nothing to recover."""
+    """Recover a log and return the number of messages; 0 if there is nothing to recover."""
     try:
         return recover_log(path, out)
     except ConfigurationError as error:
@@ -302,7 +302,7 @@ def recovered(path: Path, out: Path) -> int:
 @settings(max_examples=25)
 @given(share=st.floats(0.0, 1.0, exclude_max=True))
 def test_torn_anywhere(chunked, share):
-    """One clear error for the reader; whole mission steps, metadata and attachments from recovery."""
+    """Reading raises one clear error; recovery saves whole mission steps, metadata and attachments."""
     data, whole = chunked.read_bytes(), read_log(chunked)
     with tempfile.TemporaryDirectory() as folder:
         torn, out = Path(folder) / "torn.mcap.partial", Path(folder) / "out.mcap"
@@ -326,7 +326,7 @@ def test_torn_anywhere(chunked, share):
 @settings(max_examples=25)
 @given(share=st.floats(0.0, 1.0, exclude_max=True), flip=st.integers(1, 255))
 def test_damaged_anywhere(chunked, share, flip):
-    """One wrong byte anywhere is one clear error for the reader; recovery still ends, and saves no wrong motion."""
+    """With one wrong byte anywhere, reading raises one clear error; recovery still ends and saves no wrong motion."""
     data, whole = bytearray(chunked.read_bytes()), read_log(chunked)
     place = int(share * len(data))
     data[place] ^= flip
@@ -345,7 +345,7 @@ def test_damaged_anywhere(chunked, share, flip):
 
 
 def test_a_damaged_attachment_is_left_out(chunked, tmp_path):
-    """Its checksum says so; the rest is recovered, and the log is refused because its model is gone."""
+    """Its checksum reveals it; the rest is recovered, and the recovered log is refused because its model is missing."""
     data, damaged, out = chunked.read_bytes(), tmp_path / "damaged.mcap", tmp_path / "out.mcap"
     before = len(log_info(chunked)["attachments"])
     place = data.index(b"<mujoco") + 1
@@ -358,7 +358,7 @@ def test_a_damaged_attachment_is_left_out(chunked, tmp_path):
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_file_with_nothing_to_recover_is_refused(chunked, tmp_path, capsys, overwrite):
-    """An empty file and a log torn before its first whole chunk: one line, and what was there stays as it was."""
+    """An empty file or a log cut before its first whole chunk gives a one-line error; existing files are unchanged."""
     out = tmp_path / "out.mcap"
     for data in (b"", chunked.read_bytes()[:40]):
         torn = tmp_path / "torn.mcap.partial"
@@ -376,7 +376,7 @@ def test_a_file_with_nothing_to_recover_is_refused(chunked, tmp_path, capsys, ov
 
 
 def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
-    """A wrong argument is one line on its own."""
+    """A wrong argument gives a one-line error alone."""
     with pytest.raises(SystemExit):
         main(["video", str(short[0]), "--speed", "0"])
     assert capsys.readouterr().err == "marlbc: speed must be positive, got 0.0\n"
@@ -421,7 +421,7 @@ def test_recovering_a_whole_log_changes_nothing(short, tmp_path):
 
 
 def test_recovery_beside_the_torn_log(short, tmp_path):
-    """``a.mcap.partial`` -> ``a.mcap``, the obvious call, leaves the torn file alone."""
+    """Recovering ``a.mcap.partial`` to ``a.mcap``, the obvious call, leaves the partial file unchanged."""
     torn = tmp_path / "a.mcap.partial"
     data = short[0].read_bytes()[:-100]
     torn.write_bytes(data)
@@ -452,7 +452,7 @@ run_episode(World(scenario, controller, record=True), make_supervisor("scripted"
 
 
 def test_killed_run_loses_at_most_its_last_second(tmp_path):
-    """``kill -9`` in the middle: the monotonic clock, shared by all processes, says which frames are older than a second."""
+    """After ``kill -9``, frames older than a second are saved; the monotonic clock, shared by all processes, dates them."""
     path = tmp_path / "killed.mcap"
     with subprocess.Popen([sys.executable, "-c", SLOW_RUN, str(path)], stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -518,7 +518,7 @@ def test_npz_is_the_log(empty_field, tmp_path):
 
 
 def test_json_lines_and_parquet_hold_the_rows_of_the_csv(empty_field, tmp_path):
-    """Numbers bit for bit; a clearance without obstacles is null in JSON, and infinite in the others."""
+    """Numbers are identical; a clearance without obstacles is null in JSON and infinite in the other formats."""
     for name in ("a.csv", "a.jsonl", "a.parquet"):
         main(["export", str(empty_field[0]), str(tmp_path / name), "--quiet"])
     with open(tmp_path / "a.csv", newline="") as stream:
@@ -541,7 +541,7 @@ def test_parquet_needs_its_package(short, tmp_path, monkeypatch):
 
 
 def test_metrics_of_a_log_are_those_of_its_episode(short, empty_field):
-    """Equal, not about equal: with obstacles and without, limited and unlimited, with a shield, and where obstacles move."""
+    """Metrics are exactly equal, for SORLC among obstacles and for PD without obstacles."""
     for path, trajectory in (short, empty_field):
         assert measure(read_log(path)) == measure(trajectory)
 

@@ -1,4 +1,4 @@
-"""Reference values from an independent NumPy prototype of the same equations: agreement in every digit that is given."""
+"""Reference values from an independent NumPy prototype of the same equations: results agree in every digit given."""
 
 import os
 import subprocess
@@ -36,7 +36,7 @@ def agents(metrics, name: str) -> list[float]:
 @pytest.mark.parametrize("controller", ["sorlc", "sorlc-off"])
 @pytest.mark.parametrize("row", TABLE)
 def test_scripted_sorlc_reproduces_the_reference_table(episode, controller, row):
-    """To the digits published, with the networks and without: with the published basis they make no difference (erratum 13)."""
+    """Results agree with and without the networks, which make no difference with the published basis (erratum 13)."""
     measured = agents(measure(episode("scripted", controller)), row)
     assert measured == pytest.approx(TABLE[row], rel=2e-4)
 
@@ -55,7 +55,7 @@ def test_efforts_as_sums_over_samples(episode):
 
 
 def test_actual_reference_costs_twice_the_effort(episode):
-    """``actual``: return 15 492, effort 234.8/213.4/387.3/392.7, also safe."""
+    """With the ``actual`` reference: return 15 492, effort 234.8/213.4/387.3/392.7, no violation."""
     metrics = measure(episode("scripted", "sorlc", reference="actual"))
     assert metrics["team"]["return"] == 15492
     assert agents(metrics, "effort_integral") == pytest.approx([234.8, 213.4, 387.3, 392.7], abs=0.05)
@@ -78,7 +78,7 @@ def test_the_published_automaton_chatters_into_the_discs(episode):
 
 
 def test_a_finer_substep_changes_little():
-    """1 ms against 5 ms: at most 7 % of the cost, and the same switches and safety (three clocks, section 1)."""
+    """1 ms instead of 5 ms: costs change by at most 7 %, clearances by 2 cm, switches not at all (three clocks, section 1)."""
     coarse, fine = (
         measure(run_episode(World(paper(duration=25.0, substep=h), record=True), make_supervisor("scripted")))
         for h in (0.005, 0.001)
@@ -89,14 +89,14 @@ def test_a_finer_substep_changes_little():
 
 
 def test_the_scripted_team_keeps_its_slots(episode):
-    """At the end everybody is on its target, (100, +-6) and (95, +-12), less the last 5 ms."""
+    """At the end every agent is at its target, (100, +-6) or (95, +-12), up to the last 5 ms of motion."""
     trajectory = episode("scripted", "sorlc")
     np.testing.assert_allclose(trajectory.position[-1], [(100, 6), (100, -6), (95, 12), (95, -12)], atol=0.1)
     assert (clearances(trajectory.position, trajectory.obstacles) > 2.0).all()
 
 
 def test_the_scaled_basis_keeps_learning_and_the_published_one_does_not(episode):
-    """At 30 s on the slots PD alone leaves e_p = f / 100, and so does the published identifier; the scaled one under a tenth."""
+    """At 30 s, on the slots, e_p = f / 100 with PD alone and the published identifier; the scaled one leaves under a tenth."""
     drag_of_agent_1 = np.sin(6.0) ** 2  # v = (1, 0) at y = 6
     published, scaled, off = (
         float(np.abs(t.position[6000] - t.reference[6000])[0, 0])

@@ -1,4 +1,4 @@
-"""What compiled code is handed by address: fields read and written through a reference, functions called where they are."""
+"""Passing by address to compiled code: fields are read and written through a reference, functions called at their address."""
 
 import copy
 from typing import NamedTuple
@@ -44,11 +44,11 @@ def make_pair() -> Reference:
 
 
 def test_a_function_called_by_address_changes_the_very_arrays():
-    """Whole numbers and floats are passed as the entry takes them, whatever they are at the call."""
+    """Integers and floats are converted to the types of the entry, whatever their types at the call."""
     pair = make_pair()
     assert add_at(pair, 1, 3.0) == 2 and add_at(pair, np.uint8(2), 5) == 3
     np.testing.assert_array_equal(pair.rows, [0.0, 6.0, 10.0])
-    assert call(add_scaled, 0, 1.0, pair) == 1 and pair.rows[0] == 2.0  # in Python: the function itself
+    assert call(add_scaled, 0, 1.0, pair) == 1 and pair.rows[0] == 2.0  # in Python, the function itself is called
 
 
 def test_a_reference_reads_as_its_record_and_is_replaced_like_it():
@@ -90,7 +90,7 @@ def count(rows):
     ids=["stride", "dtype", "dimensions", "number", "record"],
 )
 def test_what_an_entry_does_not_take_is_an_error_of_the_compiler(rows, said):
-    """Never of memory: the type of an entry holds what its function takes."""
+    """It is never a memory error: the type of an entry includes its function's argument types."""
     pair = refer(Pair(np.zeros(3), 2.0, True, entry(count, np.zeros(2))))
     assert sum_at(pair, np.zeros(4)) == 4
     with pytest.raises(NumbaError, match=said):

@@ -1,4 +1,4 @@
-"""Return against the best schedule that a search finds: the instance that is searched, the bound, and the table."""
+"""Return relative to the best schedule that a search finds: the searched instance, the bound and the table."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ def short(name: str):
 
 @pytest.mark.parametrize("name", ["gates", "field"])
 def test_the_instance_is_what_the_seed_draws(name: str) -> None:
-    """An episode in it is the seed's episode, to the bit, whatever its own seed is."""
+    """An episode in the instance equals the seed's episode to the last bit, whatever its own seed."""
     drawn = run_episode(World(short(name), record=True), make_supervisor("fixed"), seed=90_003)
     instance = run_episode(World(frozen(short(name), 90_003), record=True), make_supervisor("fixed"), seed=5)
     np.testing.assert_array_equal(instance.obstacles, drawn.obstacles)
@@ -28,7 +28,7 @@ def test_the_instance_is_what_the_seed_draws(name: str) -> None:
 
 
 def test_the_best_is_no_worse_than_what_was_flown(tmp_path, monkeypatch, capsys) -> None:
-    """From the command line: a line per layout; the search begins with the best that was flown."""
+    """The command writes a line per layout; the search begins with the best schedule flown."""
     monkeypatch.setattr(regret, "_mission", short)
     out = tmp_path / "out"
     main(["regret", "field", "--supervisors", "fixed", "--layouts", "2", "--budget", "64", "--out", str(out)])

@@ -1,4 +1,4 @@
-"""The report package: files in their schema, tables that hold the metrics, figures of their size, a page that stands alone."""
+"""The report package: files follow their schema, tables hold the metrics, figures have their size, the page is self-contained."""
 
 import csv
 import json
@@ -36,7 +36,7 @@ from marlbc_mj.results.metrics import AgentMetrics, TeamMetrics
 from marlbc_mj.results.scores import SCORES
 from marlbc_mj.results.summary import Result, summary, write_csv
 from marlbc_mj.scenarios import paper
-from marlbc_mj.studies.so_far import SoFar
+from marlbc_mj.studies.so_far import PartialPage
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.method_names import display_name
@@ -61,13 +61,13 @@ def results() -> list[Result]:
 
 @pytest.fixture(scope="module")
 def drawn(results: list[Result], tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
-    """Figures of one method that ran, of one that failed and of all together."""
+    """Figures of a method that ran and one that failed."""
     folder = tmp_path_factory.mktemp("report") / "figures"
     return folder, figures.write_figures([results[0], results[3]], folder)
 
 
 def test_summary_has_the_schema_and_no_nan(results: list[Result]) -> None:
-    """Keys are those of the metrics and scores, a failed method is its reason, and JSON takes it strictly."""
+    """Keys are those of the metrics and scores, a failed method has its reason, and strict JSON can express it all."""
     content = summary(results, "paper", {"mujoco": "3.17"})
     assert set(content) == {"schema", "scenario", "versions", "methods"} and content["schema"] == 1
     assert list(content["methods"]) == ["scripted+sorlc", "scripted+pd", "fsams+sorlc", "mpcms+sorlc"]
@@ -82,7 +82,7 @@ def test_summary_has_the_schema_and_no_nan(results: list[Result]) -> None:
 
 
 def test_summary_turns_what_is_not_finite_into_null(results: list[Result]) -> None:
-    """Without obstacles the clearance is infinite, which JSON has no number for."""
+    """Without obstacles the clearance is infinite, which JSON cannot express."""
     metrics = json.loads(json.dumps(results[0].metrics))
     metrics["agents"][0]["clearance_min"] = np.float64("inf")
     content = summary([Result("a", "b", None, metrics)], "paper", {})
@@ -143,14 +143,14 @@ def test_table_cells_are_the_metrics(results: list[Result]) -> None:
 
 
 def test_published_values_belong_to_the_paper_scenario_only(results: list[Result]) -> None:
-    """Elsewhere there is one row a method and no mark."""
+    """Other scenarios have one row per method and no mention of published values."""
     switches = next(table for table in make_tables(results, "other") if table.name == "switches")
     assert [row[0] for row in switches.rows] == ["Schedule", "FSAMS", "MPCMS"]
     assert not any("ublished" in note for note in switches.notes)
 
 
 def test_one_word_means_one_aggregation(results: list[Result]) -> None:
-    """A heading that two tables share has the same cell for the same method, and says how agents are aggregated."""
+    """Tables with the same heading show the same cell for the same method; a heading names the aggregation over agents."""
     run = [*results, scaled("oracle+sorlc", results[0], 1.0), scaled("oracle+pd", results[1], 1.0)]
     said: dict[tuple[str, str], str] = {}
     for table in make_tables(run, "paper"):
@@ -165,7 +165,7 @@ def test_one_word_means_one_aggregation(results: list[Result]) -> None:
 
 
 def test_latex_units_have_a_line_of_their_own() -> None:
-    """Below the labels, so that a column is as wide as its words."""
+    """They are below the labels, so that they do not widen the column."""
     table = Table("t", "c", (Column("", "x"), Column("g", "a", "m"), Column("g", "b")), (("r", "1", "2"),))
     lines = to_latex(table).splitlines()
     assert lines[lines.index(r"x & a & b \\") + 1] == r" & [m] &  \\"
@@ -184,12 +184,12 @@ def test_latex_units_have_a_line_of_their_own() -> None:
     ],
 )
 def test_order_mark(ours: dict[str, float], mark: str) -> None:
-    """Pairs among the methods that both have; a tie of ours where the published differ is a mismatch."""
+    """Methods that both sides have are compared in pairs; a tie of ours between different published values is a mismatch."""
     assert order_mark(ours, {"a": 10.0, "b": 20.0, "c": 30.0}) == mark
 
 
 def test_order_mark_ignores_published_ties() -> None:
-    """A published tie orders nothing."""
+    """Pairs with a published tie are not compared."""
     assert order_mark({"a": 2.0, "b": 1.0}, {"a": 4.0, "b": 4.0}) == "–"
     assert order_mark({"a": 2.0, "b": 1.0, "c": 3.0}, {"a": 4.0, "b": 4.0, "c": 6.0}) == "yes"
 
@@ -206,7 +206,7 @@ def test_published_values_cover_four_agents() -> None:
 
 
 def test_latex_is_balanced_and_rectangular(results: list[Result]) -> None:
-    """Braces balance, every row has the table's number of columns, and only ASCII is left."""
+    """Braces balance, every row has the table's number of columns, and the text is ASCII."""
     text = latex_document(make_tables(results, "paper"))
     assert text.isascii()
     bare = re.sub(r"\\[{}]", "", text)
@@ -231,12 +231,12 @@ def test_latex_is_balanced_and_rectangular(results: list[Result]) -> None:
     ],
 )
 def test_latex_escaping(plain: str, escaped: str) -> None:
-    """Specials are escaped, symbols set in math mode, the rest made ASCII."""
+    """Special characters are escaped, symbols set in math mode, and all others replaced by ASCII."""
     assert latex(plain) == escaped
 
 
 def test_html_escapes_and_spans() -> None:
-    """Cells are text, groups span their columns."""
+    """Cell text is escaped, and groups span their columns."""
     table = Table("t", "c<d", (Column("", "x"), Column("g", "a"), Column("g", "b")), (("<i>", "1", "2"),))
     text = render("table.html", table=table)
     assert "<i>" not in text and "&lt;i&gt;" in text and "c&lt;d" in text
@@ -246,7 +246,7 @@ def test_html_escapes_and_spans() -> None:
 
 
 def test_templates_escape_everything_and_know_every_name() -> None:
-    """None marks text as safe; a value that is not given stops the page."""
+    """No template marks text as safe; a missing value raises an error."""
     folder = Path(str(resources.files("marlbc_mj.report")))
     assert {path.name for path in folder.glob("*.html")} >= {"base.html", "page.html", "seed_page.html", "table.html"}
     assert not [path.name for path in folder.glob("*.html") if re.search(r"\|\s*safe|autoescape", path.read_text())]
@@ -255,7 +255,7 @@ def test_templates_escape_everything_and_know_every_name() -> None:
 
 
 def test_the_terminal_says_what_the_tables_say(results: list[Result], capsys: pytest.CaptureFixture[str]) -> None:
-    """Heading, aggregation and digits of the table of all metrics; a failure with its reason."""
+    """Headings, aggregations and digits are those of the table of all metrics; a failure has its reason."""
     print_results(results)
     out = capsys.readouterr().out
     assert "worst agent [s]" in out and "worst agent [m]" in out and "sum [N s]" in out
@@ -276,9 +276,9 @@ def test_a_line_per_method_says_what_came_of_it(results: list[Result]) -> None:
 
 
 def test_the_page_grows_as_methods_end(results: list[Result], tmp_path: Path) -> None:
-    """Whole at any time, with how many there will be; the page that is written last does not load itself again."""
+    """It is complete at any time and states the total number of methods; the last version does not reload itself."""
     facts = {"scenario": paper(), "versions": {"numpy": "2"}, "git_revision": "abc", "seed": 0, "command": "marlbc bench"}
-    page = SoFar(tmp_path, [result.key for result in results], partial(write_so_far, config=facts))
+    page = PartialPage(tmp_path, [result.key for result in results], partial(write_so_far, config=facts))
     folder = tmp_path / ".jobs" / "so_far"
     shown = []
     for result in (results[1], results[0], results[3], results[2]):
@@ -300,7 +300,7 @@ def test_failures_appear_in_every_form(results: list[Result]) -> None:
 
 
 def scaled(name: str, result: Result, cost: float, violation: float = 0.0) -> Result:
-    """The result under another controller's name, its numbers multiplied by ``cost`` and with this violation."""
+    """The result under another method's name, with costs multiplied by ``cost`` and this violation time."""
     metrics = json.loads(json.dumps(result.metrics))
     for agent in metrics["agents"]:
         for key in ("cost_max", "cost_sum", "cost_integral", "effort_sum", "force_max_inf"):
@@ -311,7 +311,7 @@ def scaled(name: str, result: Result, cost: float, violation: float = 0.0) -> Re
 
 
 def test_orders_hold_and_differ_by_the_numbers(results: list[Result]) -> None:
-    """A rival made costlier keeps all published orders of Tables 5 and 6, one made cheaper none; ties of the paper make none."""
+    """A costlier baseline keeps all published orders of Tables 5 and 6, a cheaper one none; published ties give no order."""
     sorlc = results[0]
     for factor, holds in ((2.0, True), (0.5, False)):
         found = claims([sorlc, scaled("scripted+finite-time", sorlc, factor)])
@@ -332,7 +332,7 @@ def test_orders_hold_and_differ_by_the_numbers(results: list[Result]) -> None:
 
 
 def test_no_count_of_reproduced_orders_depends_on_the_time_that_decisions_take(results: list[Result]) -> None:
-    """Table 4 stands beside the published one, and neither counts nor says whether its order is the same."""
+    """Table 4 shows published times too, but its order is neither counted nor compared."""
     run = [scaled(f"{name}+sorlc", results[0], 1.0) for name in ("marlms", "fsams", "mpcms")]
 
     def said(slowest: int) -> tuple[object, ...]:
@@ -347,7 +347,7 @@ def test_no_count_of_reproduced_orders_depends_on_the_time_that_decisions_take(r
 
 
 def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
-    """With the same actuator a rival is cheaper or it is not, and LQR is safe or it is not."""
+    """It says whether baselines with the same actuator are cheaper, and whether LQR is safe."""
     sorlc = results[0]
     run = [sorlc, scaled("scripted+finite-time", sorlc, 2.0)]
     cheap = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 0.25), scaled("scripted+lqr", sorlc, 0.125, 1.7)])
@@ -361,7 +361,7 @@ def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
 
 
 def test_limited_rivals_and_lqr_are_a_block_of_their_own(results: list[Result]) -> None:
-    """Below the mark, in the order of the run, with their total over SORLC's."""
+    """They follow the mark, in the order of the run, with the ratio of their total to SORLC's."""
     names = ("lqr", "finite-time", "finite-time-limited")
     table = make_tables([results[0], *(scaled(f"scripted+{name}", results[0], 0.5) for name in names)], "paper")[3]
     labels = [row[0] for row in table.rows]
@@ -378,7 +378,7 @@ def test_limited_rivals_and_lqr_are_a_block_of_their_own(results: list[Result]) 
 
 
 def test_gap_to_the_oracle(results: list[Result]) -> None:
-    """Per controller, a failure as a row, nothing without an oracle."""
+    """The gap is per controller, a failure has a row, and without an oracle there is no table."""
     assert oracle_gap(results) is None
     best = scaled("oracle+sorlc", results[0], 1.0)
     assert best.metrics is not None and results[2].metrics is not None
@@ -390,7 +390,7 @@ def test_gap_to_the_oracle(results: list[Result]) -> None:
 
 
 def test_no_mark_covers_another(results: list[Result]) -> None:
-    """Of methods with the same numbers one stands aside, and a line leads to its place; others stand where they belong."""
+    """Of two methods with equal numbers, one mark is moved aside, with a line to its true place; the others stay in place."""
     sorlc = results[0]
     twin, other = scaled("scripted+sorlc-off", sorlc, 1.0), scaled("scripted+lqr", sorlc, 0.1)
     figure = pareto([sorlc, other, twin])
@@ -406,7 +406,7 @@ def test_no_mark_covers_another(results: list[Result]) -> None:
 
 
 def test_other_missions_do_not_speak_of_the_paper() -> None:
-    """Neither captions of figures nor those of tables have its numbers."""
+    """Captions and notes mention neither the paper, nor its figures, nor published values."""
     made = []
     for names in (("scripted", "sorlc"), ("scripted", "rlc"), ("fsams", "sorlc")):
         world = World(replace(paper(duration=1.0), name="mine"), make_controller(names[1]), record=True)
@@ -418,12 +418,12 @@ def test_other_missions_do_not_speak_of_the_paper() -> None:
 
 
 def test_spans_of_numbers() -> None:
-    """Three and more make a span."""
+    """Three or more consecutive numbers make a span."""
     assert spans([7, 0, 2, 3, 4, 6]) == "0, 2 to 4, 6, 7"
 
 
 def test_predictions_and_solver_share(results: list[Result]) -> None:
-    """Two kinds of MPCMS are compared; a supervisor that tells its solver's time has a share in Table 4 and the summary."""
+    """Two kinds of MPCMS are compared; a supervisor that reports its solver's time has a share in Table 4 and the summary."""
     kinds = [scaled(f"{name}+sorlc", results[0], 1.0) for name in ("mpcms", "mpcms-mujoco")]
     table = predictions(kinds)
     assert table is not None and [row[0] for row in table.rows] == ["MPCMS + SORLC", "MPCMS, simulated + SORLC"]
@@ -436,7 +436,7 @@ def test_predictions_and_solver_share(results: list[Result]) -> None:
 
 
 def test_bands_hold_every_sample() -> None:
-    """Extremes and means of bins, the last one shorter."""
+    """Bands are the extremes and means of bins; the last bin may be shorter."""
     time, values = np.arange(10.0), np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 100.0])
     starts, low, mean, high = plotting.bands(time, values, bins=3)
     assert (starts.tolist(), low.tolist()) == ([0, 4, 8], [0, 4, 8])
@@ -445,7 +445,7 @@ def test_bands_hold_every_sample() -> None:
 
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="no pdflatex")
 def test_latex_compiles(results: list[Result], tmp_path: Path) -> None:
-    """tables.tex as it is, in a document that loads what it says; no table is wider than the text, whatever its names are."""
+    """tables.tex compiles unchanged in a document with the packages that it names, and no table is wider than the text."""
     wide = Table("wide", "c", tuple(Column("g", f"column {k}", "m/s") for k in range(24)), (("123 456.78",) * 24,))
     (tmp_path / "tables.tex").write_text(latex_document([*make_tables(results, "paper"), wide], "100 % of x_y."))
     (tmp_path / "all.tex").write_text(
@@ -470,7 +470,7 @@ def test_envelope_keeps_peaks_and_ends() -> None:
 
 
 def test_figures_are_written_at_their_size(drawn: tuple[Path, list[Path]]) -> None:
-    """One column or two wide at 300 dpi; PDFs are small and embed TrueType (Type 42) fonts only."""
+    """Figures are one or two columns wide at 300 dpi; PDFs are small and embed TrueType (Type 42) fonts only."""
     folder, paths = drawn
     own = {f"{kind}_scripted_sorlc" for kind in ("trajectories", "priorities", "forces", "errors", "weights")}
     papers = {"figure4_weights_sorlc", "figure5_weight_errors_sorlc", "figure6_tracking_sorlc"}
@@ -503,7 +503,7 @@ def test_comparison_figures(results: list[Result]) -> None:
 
 
 def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]], tmp_path: Path) -> None:
-    """No address but the citation's, figures and video embedded, failures and files named, command escaped."""
+    """The only address is the citation's; figures and video are embedded, failures and files named, the command escaped."""
     video = tmp_path / "paper.mp4"
     video.write_bytes(b"not really a video")
     config = {"scenario": paper(), "versions": {"mujoco": "3.17"}, "seed": 7, "git_revision": "abc1234"}
@@ -533,7 +533,7 @@ def test_page_stands_alone(results: list[Result], drawn: tuple[Path, list[Path]]
 
 
 def test_report_folder(results: list[Result], tmp_path: Path) -> None:
-    """One call writes every file of the report; without figures the page still stands."""
+    """One call writes every file of the report; the page also works without figures."""
     config = {"scenario": paper(), "versions": {"numpy": "2"}, "git_revision": "abc", "seed": 0, "command": "marlbc bench"}
     page = write_report(results, tmp_path, config=config, figures=False)
     assert page == tmp_path / "index.html"

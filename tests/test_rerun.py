@@ -1,4 +1,4 @@
-"""A log in Rerun: what its own reader finds in an exported recording, bit for bit."""
+"""Export of a log to Rerun: Rerun's own reader finds the log's values in the recording."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from marlbc_mj.util.errors import ConfigurationError
 
 @pytest.fixture(scope="module", autouse=True)
 def rerun() -> None:
-    """Loaded where these tests run, instead of in every process that collects them."""
+    """Load Rerun only where these tests run, not in every process that collects them."""
     pytest.importorskip("rerun.chunk")
 
 
@@ -30,7 +30,7 @@ def logged(path: Path, scenario: Scenario) -> Path:
 
 
 def entities(path: Path) -> dict[str, dict[str, Any]]:
-    """Columns by entity: of what changes in time and of what does not."""
+    """Temporal and static columns by entity and name."""
     found: dict[str, dict[str, Any]] = {}
     chunk: Any = pytest.importorskip("rerun.chunk")
     for each in chunk.RrdReader(str(path)).stream():

@@ -1,4 +1,4 @@
-"""Rival controllers: laws against literal formulas, Riccati gains, the reference table, the force limit, convergence."""
+"""Baseline controllers: laws against literal formulas, Riccati gains, the reference table, the force limit, convergence."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,7 @@ def predefined_time(e_p: float, e_v: float) -> float:
 
 
 FORMULAS = {
-    "sorlc": lambda e_p, e_v: -100 * e_p - 100 * e_v,  # its published basis is silent where this is tried
+    "sorlc": lambda e_p, e_v: -100 * e_p - 100 * e_v,  # its published basis is zero at the tested errors
     "sorlc-off": lambda e_p, e_v: -100 * e_p - 100 * e_v,
     "pd": lambda e_p, e_v: -100 * e_p - 100 * e_v,
     "rlc": lambda e_p, e_v: -100 * e_p - 2.35 * e_v,
@@ -66,16 +66,16 @@ FORMULAS = {
     "terminal-sliding": terminal_sliding,
     "predefined-time": predefined_time,
 }
-"""u + f^ before the limit."""
+"""Formulas for u + f^ before the limit, by controller."""
 
 errors = st.tuples(st.floats(-15, 15), st.floats(-15, 15))
 small = st.tuples(st.floats(-0.02, 0.02), st.floats(-0.02, 0.02))
 
 
-@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name != "sorlc-scaled"])  # its basis sees the errors
+@pytest.mark.parametrize("name", [name for name in CONTROLLERS if name != "sorlc-scaled"])  # its basis is not zero here
 @given(errors | small, st.tuples(st.floats(-100, 100), st.floats(-100, 100)) | small, st.floats(-2, 2))
 def test_every_law_is_its_formula(name, e_p, e_v, drag):
-    """Far from the published basis' centres, fresh state; -f^ where the law knows the drag; clipped where it is limited."""
+    """Far from the published basis' centres, in the initial state: -f^ if the law knows the drag, clipped if it is limited."""
     controller, bare = make_controller(name), name.removesuffix("-limited")
     limit = LIMIT if controller.limited else np.inf
     p, v = np.array([60.0, 70.0]), np.array([3.0, -4.0])
@@ -89,7 +89,7 @@ def test_every_law_is_its_formula(name, e_p, e_v, drag):
 
 
 def test_formulas_and_names_are_complete():
-    """No controller escapes, and every unlimited law has its limited twin; tests/test_controllers.py has the scaled basis."""
+    """Every controller has a formula, every unlimited law a limited variant; test_controllers.py covers the scaled basis."""
     assert {name.removesuffix("-limited") for name in CONTROLLERS} == {*FORMULAS, "sorlc-scaled"}
     assert {name for name in CONTROLLERS if not make_controller(name).limited} == set(UNLIMITED)
     assert all(make_controller(f"{name}-limited").limited for name in UNLIMITED)
@@ -97,7 +97,7 @@ def test_formulas_and_names_are_complete():
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
 def test_sliding_and_predefined_time_laws_are_odd_and_finite(e_p, e_v):
-    """u(-e) = -u(e), far beyond the 96 m/s of the largest jump of v_r."""
+    """u(-e) = -u(e), even far beyond the largest jump of v_r, 96 m/s."""
     zero = np.zeros(2)
     for controller in (TerminalSliding(), PredefinedTime()):
         gains, state = laws.as_gains(controller.law, controller.params(0, np.inf)), np.zeros(0)
@@ -111,7 +111,7 @@ def test_sliding_and_predefined_time_laws_are_odd_and_finite(e_p, e_v):
 
 @given(st.floats(1e-3, 1.0), st.floats(0.2, 1.0), st.floats(0.5, 3.0))
 def test_linear_gains_bound_the_predefined_time_law(layer, power, exponent_limit):
-    """Phi(x) <= slope x everywhere: the step-size check is on the safe side."""
+    """Phi(x) <= slope x everywhere, so the step-size check is conservative."""
     controller = PredefinedTime(layer=layer, power=power, exponent_limit=exponent_limit)
     gains, zero, force = laws.as_gains(controller.law, controller.params(0, np.inf)), np.zeros(2), np.empty(2)
     for e_v in np.geomspace(1e-4, 1e3, 60):
@@ -156,7 +156,7 @@ TABLE = {  # return, force_max_inf, effort_integral, cost_max [1e4], cost_integr
 
 @pytest.mark.parametrize("name", TABLE)
 def test_rivals_reproduce_the_reference_table(episode, name):
-    """Within 1 %, or within the rounding of the published digit where that is coarser."""
+    """Values agree within 1 %, or within the rounding of the published digit if that is coarser."""
     total, force, effort, cost_max, cost = TABLE[name]
     assert measure(episode("scripted", name))["team"]["return"] == pytest.approx(total, rel=0.01)
     assert agents(episode("scripted", name), "force_max_inf") == pytest.approx(force, rel=0.01)
@@ -167,7 +167,7 @@ def test_rivals_reproduce_the_reference_table(episode, name):
 
 @pytest.mark.parametrize(("name", "published"), [("finite-time", (384, 384, 768, 768)), ("fixed-time", (960, 960, 1920, 1920))])
 def test_maximum_inputs_are_table_6s(episode, name, published):
-    """8 and 20 times the jumps of v_r, 48 and 96 m/s, within 1 % (agent 2's published 1061 excepted)."""
+    """They are 8 and 20 times the jumps of v_r, 48 and 96 m/s, within 1 % (except agent 2's published 1061)."""
     assert agents(episode("scripted", name), "force_max_inf") == pytest.approx(published, rel=0.01)
 
 
@@ -179,8 +179,9 @@ def test_extra_rivals_track_the_case_study(episode, name):
 
 
 def test_rlc_converges_several_times_slower_than_sorlc(episode):
-    """Figs. 6c and 7c: 0.7 s against 3.4 s. Here, to 2 %: 0.51 to 0.56 s against 2.8 to 3.8 s; RLC's is the decay of its
-    envelope, exp(-2.35 t / 2), to 2 %: 3.33 s.
+    """Figs. 6c and 7c give 0.7 s and 3.4 s.
+
+    Here, convergence to 2 % takes 0.51 to 0.56 s and 2.8 to 3.8 s. RLC's envelope, exp(-2.35 t / 2), decays to 2 % in 3.33 s.
     """
     sorlc, rlc = (convergence_time(episode("scripted", name)) for name in ("sorlc", "rlc"))
     assert sorlc.max() < 0.7
@@ -190,7 +191,7 @@ def test_rlc_converges_several_times_slower_than_sorlc(episode):
 
 @pytest.mark.parametrize("name", [f"{name}-limited" for name in UNLIMITED])
 def test_limited_rivals_keep_the_actuators_limit(name):
-    """200 N an axis, reached, as the reference jumps to the column and back; the same law without limit goes beyond."""
+    """Jumps of the reference to the column and back reach 200 N per axis but no more; the unlimited law exceeds it."""
     supervisor = Scripted((Window(1.0, 2.0, -1, "FR"),))
     peaks = {}
     for which in (name, name.removesuffix("-limited")):
@@ -231,6 +232,6 @@ def test_bad_gains_are_refused_by_name(law, changes):
 
 @pytest.mark.parametrize("law", [TerminalSliding, PredefinedTime])
 def test_an_unknown_model_is_refused(law):
-    """The valid ones are listed."""
+    """The error lists the valid models."""
     with pytest.raises(ConfigurationError, match="choose from: exact, none"):
         law(model="guess")

@@ -1,4 +1,4 @@
-"""Robots: theory against physics, one law on three paths, their gate, a user's own, and what is refused."""
+"""Robots: physics compared with theory, one law on three paths, the gate mission, users' robots, and refused input."""
 
 import ast
 from dataclasses import replace
@@ -95,7 +95,7 @@ def hover(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("direction", DIRECTIONS)
 def test_a_disc_slides_and_stops_as_coulomb_says(direction):
-    """a = F/m - mu g under force and -mu g without, the same in every direction, and it stops after v^2 / (2 mu g); to 3 %."""
+    """a = F/m - mu g with force and -mu g without, in every direction, and it stops after v^2 / (2 mu g); all within 3 %."""
     friction, wish = 0.15 * GRAVITY, 3.0
     _, p, v, force = push("disc", (wish * direction[0], wish * direction[1]), 0.6, 2.0)
     speed, along = np.linalg.norm(v, axis=1), np.array(direction)
@@ -110,7 +110,7 @@ def test_a_disc_slides_and_stops_as_coulomb_says(direction):
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0), (0.0, 1.0), (0.8, 0.6)])
 def test_omni_wheels_drive_without_slip_and_rollers_brake_as_stated(direction):
-    """Force acts on m + 3/2 I/r^2 to 1 %; rollers brake with 0.01 g times the mean |axle . v|, +-35 % of that; slip below 1 %."""
+    """The force accelerates m + 3/2 I/r^2, to 1.5 %; rollers brake with 0.01 g times the mean |axle . v|, to 35 %; slip < 1 %."""
     robot, wish = make_robot("omni"), 1.5
     world, _, v, _ = push("omni", (wish * direction[0], wish * direction[1]), 0.6, 1.5)
     speed, end = np.linalg.norm(v, axis=1), round(0.6 / 0.0025)
@@ -125,7 +125,7 @@ def test_omni_wheels_drive_without_slip_and_rollers_brake_as_stated(direction):
 
 
 def test_a_differential_drive_accelerates_and_rolls_on_as_its_equations_say():
-    """m p'' = F for the point ahead to 4 % while it turns; its energy is the work done; without torque its speed stays."""
+    """m p'' = F for the point ahead, to 4 %, in a turn; its energy equals the work done; without torque its speed is constant."""
     robot, wish = make_robot("diff_drive"), np.array([0.96, 0.72])
     world, _, v, force = push("diff_drive", tuple(wish), 0.6, 2.0)
     end = round(0.6 / 0.0025)
@@ -140,7 +140,7 @@ def test_a_differential_drive_accelerates_and_rolls_on_as_its_equations_say():
 
 
 def test_a_crazyflie_follows_newton_and_coasts_to_a_stop_in_its_own_drag():
-    """Its momentum is the impulse of rotors and drag to 1 %; then v decays as exp(-c t / m) to 3 %, at constant height."""
+    """Its momentum equals the impulse of rotors and drag to 1 %; then v decays as exp(-c t / m) to 3 %, at constant height."""
     robot, drag, h = make_robot("crazyflie"), 0.0147, 0.0025
     world, _, v, force = push("crazyflie", (1.6, 1.2), 0.6, 3.0, drag=drag)
     impulse = h * (force - drag * v)[:-1].sum(axis=0)
@@ -153,7 +153,7 @@ def test_a_crazyflie_follows_newton_and_coasts_to_a_stop_in_its_own_drag():
 
 
 def test_crazyflie_has_the_measured_numbers_and_keeps_its_thrust_limits():
-    """Mass, inertia and thrust limits are the package's; a command beyond them is cut, and counted."""
+    """Mass, inertia and thrust limits are those of the installed package; commands beyond the limits are clipped and counted."""
     drone = crazyflie._measured("data")
     world, *_ = push("crazyflie", (50.0, 0.0), 0.2, 0.2)
     model, data = world.plan.model, world.data[0]
@@ -179,7 +179,7 @@ def short_gate(name: str, **changes):
 
 @pytest.mark.parametrize("name", REAL)
 def test_compiled_loop_python_path_and_dm_control_agree(name):
-    """p, v and force are the same to the bit on both paths of World, and within 1e-9 in a dm_control episode."""
+    """p, v, force and pose are identical to the last bit on both paths of World; dm_control's p agrees to 1e-9, v to 1e-8."""
     robot = make_robot(name)
     scenario = short_gate(name, perturbation=Perturbation(start_spread=0.05, obstacle_spread=0.05))
     compiled, python = (
@@ -202,7 +202,7 @@ def test_compiled_loop_python_path_and_dm_control_agree(name):
 
 @pytest.mark.parametrize("name", ["omni", "crazyflie"])
 def test_a_robot_depends_on_neither_batch_nor_threads_and_repeats_itself(name):
-    """World 1 of two on two threads equals its twin stepped on one, and a reset world repeats the episode."""
+    """Two worlds on two threads equal the same worlds on one, and a reset world repeats its episode."""
     scenario, controller = short_gate(name, perturbation=Perturbation(start_spread=0.05)), PD(*make_robot(name).gains)
     orders = np.full((2, 4), scenario.orders.index("FM"))
     results = []
@@ -217,7 +217,7 @@ def test_a_robot_depends_on_neither_batch_nor_threads_and_repeats_itself(name):
 
 
 def test_solid_obstacles_go_where_an_episode_has_them_and_stop_a_robot():
-    """Obstacles of a draw are those that are hit; a disc that is pushed against one stays outside it."""
+    """Solid obstacles are at their drawn positions; a disc pushed against one stays outside it."""
     scenario = short_gate("disc", perturbation=Perturbation(obstacle_spread=0.2))
     world = World(scenario, PD(64.0, 16.0), worlds=2)
     world.reset(4)
@@ -232,7 +232,7 @@ def test_solid_obstacles_go_where_an_episode_has_them_and_stop_a_robot():
 
 @pytest.mark.parametrize("name", REAL)
 def test_every_robot_flies_its_gate_under_the_script(name):
-    """No violation, no touch, tracking within 0.25 length units; a Crazyflie keeps height and tilt."""
+    """No violation, no contact, tracking within 0.25 length units; a Crazyflie stays within its bounds on height and tilt."""
     row, trajectory = fly_gate(name, "scripted")
     robot = make_robot(name)
     assert row.violation == 0.0 and row.collisions == 0 and row.clearance > row.safe_distance
@@ -246,7 +246,7 @@ def test_every_robot_flies_its_gate_under_the_script(name):
 
 
 def test_poses_travel_through_a_log_into_the_picture(tmp_path):
-    """x, y, z and quaternion of every body come back bit for bit, and pose the model that is drawn."""
+    """Position and quaternion of every body are read back to the last bit, and the drawn model takes these poses."""
     scenario, controller = short_gate("crazyflie"), PD(9.0, 6.0)
     path = tmp_path / "log.mcap"
     names = {"names": ("scripted", "pd"), "seed": 0, "config": {}}
@@ -264,10 +264,10 @@ def test_poses_travel_through_a_log_into_the_picture(tmp_path):
 
 
 def test_a_users_robot_takes_one_mjcf_and_fewer_than_60_lines(hover):
-    """It passes the checklist, and drives the same mission on the compiled and on the Python path."""
+    """It passes the checklist, and the compiled and the Python path give the same mission."""
     assert len(HOVER_PY.splitlines()) < 60
     items = list(checklist(str(hover)))
-    assert [item.said for item in items if not item.passed] == []
+    assert [item.detail for item in items if not item.passed] == []
     scenario = robot_gate(str(hover), duration=3.0)
     runs = [run_episode(World(scenario, PD(36.0, 12.0), record=True, native=native), Scripted()) for native in (None, False)]
     assert runs[0].position.tobytes() == runs[1].position.tobytes()
@@ -275,7 +275,7 @@ def test_a_users_robot_takes_one_mjcf_and_fewer_than_60_lines(hover):
 
 
 def test_a_robot_whose_laws_are_plain_python_takes_the_python_path(hover):
-    """The same numbers, from laws that were never compiled."""
+    """Laws that are not compiled give the same numbers."""
     robot = make_robot(str(hover))
     plain = replace(robot, name="plain_hover", drive=laws.plain(robot.drive), reading=laws.plain(robot.reading))
     try:
@@ -290,7 +290,7 @@ def test_a_robot_whose_laws_are_plain_python_takes_the_python_path(hover):
 
 
 def test_a_users_mjcf_alone_is_driven_by_what_its_actuators_do(tmp_path):
-    """Slides with motors and rotors are recognised; meshes become part of the text without a change of inertia."""
+    """Slides with motors, and rotors, are recognized, with the mass of the file."""
     robot = make_robot(str(make_robot("disc").mjcf))
     assert robot.direct and robot.motors == ("x", "y") and robot.mass == pytest.approx(4.0)
     rotors = tmp_path / "quad.xml"
@@ -303,7 +303,7 @@ def test_a_users_mjcf_alone_is_driven_by_what_its_actuators_do(tmp_path):
 
 
 def test_meshes_are_carried_in_the_text(tmp_path):
-    """A tetrahedron in an OBJ file: the assembled model has its vertices and the inertia of the original."""
+    """With a mesh from an OBJ file, the assembled text names no file and the model has the original's mass and inertia."""
     (tmp_path / "hull.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     xml = HOVER.replace("<worldbody>", '<asset><mesh name="hull" file="hull.obj" scale="0.5 0.5 0.5"/></asset><worldbody>', 1)
     xml = xml.replace('type="box" size="0.3 0.2 0.1"', 'type="mesh" mesh="hull"').replace(
@@ -330,7 +330,7 @@ BROKEN = {
     "no mass": (HOVER.replace('mass="2"', 'mass="0"'), "mass"),
     "unknown site": (HOVER.replace('name="turn" site="nozzle"', 'name="turn" site="nowhere"'), "nowhere"),
     "name clash": (HOVER.replace('name="left"', 'name="ahead"'), "repeated name 'ahead'"),
-    "not xml": ("<mujoco", "is no MJCF that MuJoCo reads"),
+    "not xml": ("<mujoco", "is not a valid MJCF file"),
     "outside": (
         HOVER.replace("<worldbody>", '<asset><mesh name="m" file="../secret.obj"/></asset><worldbody>', 1),
         "uses a file outside its folder: ../secret.obj",
@@ -345,7 +345,7 @@ BROKEN = {
 
 @pytest.mark.parametrize("case", BROKEN)
 def test_a_broken_mjcf_is_refused_in_one_line(case, tmp_path, capsys):
-    """The file and what is wrong with it are named; the command's exit status is 1."""
+    """The error names the file and its fault; the command's exit status is 1."""
     text, message = BROKEN[case]
     path = tmp_path / "broken.xml"
     path.write_text(text)
@@ -358,10 +358,10 @@ def test_a_broken_mjcf_is_refused_in_one_line(case, tmp_path, capsys):
 
 
 def test_a_robot_that_diverges_fails_its_check_and_stops_a_world(hover):
-    """A drive that asks for NaN is reported with world, agent and time, before MuJoCo sees it."""
+    """A drive that outputs NaN is reported with world, agent and time, before MuJoCo receives it."""
     hover.write_text(HOVER_PY.replace("params[0] * (0.5 - qvel[2])", "np.sqrt(-1.0 - qvel[2] ** 2)"))
     failed = [item for item in checklist(str(hover)) if not item.passed]
-    assert [item.name for item in failed] == ["step"] and "world 0, agent 1, t = 0.000 s" in failed[0].said
+    assert [item.name for item in failed] == ["step"] and "world 0, agent 1, t = 0.000 s" in failed[0].detail
     world = World(robot_gate(str(hover), duration=0.5), PD(36.0, 12.0))
     with pytest.raises(SimulationError, match="world 0, agent 1"):
         world.step(np.full((1, 4), world.scenario.orders.index("FM")))
@@ -369,7 +369,7 @@ def test_a_robot_that_diverges_fails_its_check_and_stops_a_world(hover):
 
 
 def test_names_files_and_scales_that_cannot_be_are_named(monkeypatch, tmp_path):
-    """Unknown robots, a missing package or checkout, another robot's mass, a limit or substep beyond the robot's."""
+    """Unknown robots, a missing package or checkout, another robot's mass, and limits or substeps beyond the robot's."""
     with pytest.raises(ConfigurationError, match="unknown robot 'rover'; choose from: point_mass, disc"):
         make_robot("rover")
     with pytest.raises(ConfigurationError, match="no robot file"):
@@ -393,7 +393,7 @@ def test_names_files_and_scales_that_cannot_be_are_named(monkeypatch, tmp_path):
 
 
 def test_a_python_file_that_makes_no_robot_is_refused(tmp_path):
-    """Its own exception, or what it lacks, in one line."""
+    """The error gives the file's exception, or what the file lacks."""
     path = tmp_path / "mine.py"
     for text, message in (("1 / 0", "fails: ZeroDivisionError"), ("ROBOT = 3", "defines neither ROBOT")):
         path = path.with_stem(path.stem + "x")
@@ -404,7 +404,7 @@ def test_a_python_file_that_makes_no_robot_is_refused(tmp_path):
 
 @pytest.mark.parametrize("name", REAL)
 def test_shipped_robots_pass_their_checklist(name):
-    """Every item, and a robot's Python file stays below 100 lines."""
+    """Every item passes, and a robot's Python file has fewer than 100 lines."""
     assert [item for item in checklist(name) if not item.passed] == []
     robot = make_robot(name)
     assert isinstance(robot, Robot)

@@ -1,4 +1,4 @@
-"""Files of strangers as robots: what plain MuJoCo means by an MJCF is what is driven, and the rest is refused by its cause."""
+"""Third-party MJCF files as robots: they behave as in plain MuJoCo, or are refused with the cause."""
 
 import os
 from pathlib import Path
@@ -36,7 +36,7 @@ FREE_MOTORS = (
 
 
 def cart(joints=SLIDES, motors=MOTORS, *, shape=SHAPE, head="", body='name="cart" pos="0 0 0.1"', tail="") -> str:
-    """An MJCF of a cart, part by part."""
+    """The MJCF of a cart, made of the given parts."""
     return (
         f'<mujoco model="cart"><compiler autolimits="true"/>{head}<worldbody><body {body}>{joints}{shape}</body></worldbody>'
         f"<actuator>{motors}</actuator>{tail}</mujoco>"
@@ -45,7 +45,7 @@ def cart(joints=SLIDES, motors=MOTORS, *, shape=SHAPE, head="", body='name="cart
 
 @pytest.fixture
 def write(tmp_path: Path):
-    """Writes a text beside others and returns the path."""
+    """A function that writes a text into the test's folder and returns its path."""
 
     def to(text: str, name: str = "cart.xml") -> str:
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
@@ -60,7 +60,7 @@ def both(pattern: str) -> str:
     return pattern.format(name="push_e", joint="east") + pattern.format(name="push_n", joint="north")
 
 
-# What is driven: the force that is recorded moves the body, and p is where it is ------------------------------------------------
+# What is driven: the recorded force moves the body, and p is the body's position ------------------------------------------------
 
 TENDONS = (
     '<tendon><fixed name="te"{0}><joint joint="east" coef="-2"/></fixed>'
@@ -123,7 +123,7 @@ DRIVEN = {
 
 @pytest.mark.parametrize("case", DRIVEN)
 def test_the_recorded_force_is_what_moves_the_body(case, write):
-    """m dv = F h in both directions, p is MuJoCo's xpos, and a force beyond the file's limits gives the limit."""
+    """m dv = F h in both directions, p is MuJoCo's xpos, and a force beyond the file's limits is clipped to them."""
     text, limit = DRIVEN[case]
     name = write(text)
     robot = make_robot(name)
@@ -141,7 +141,7 @@ def test_the_recorded_force_is_what_moves_the_body(case, write):
 
 
 def test_a_law_without_a_limit_does_not_make_motors_stronger(write):
-    """The file's limit is the robot's, whatever the law asks for."""
+    """The file's limit applies even if the law has none."""
     name = write(DRIVEN["forcerange"][0])
     model = World(robot_gate(name), PD(64.0, 16.0, limited=False)).plan.model
     np.testing.assert_array_equal(model.actuator_forcerange, np.tile([-2.0, 2.0], (8, 1)))
@@ -154,13 +154,13 @@ def test_a_law_without_a_limit_does_not_make_motors_stronger(write):
     "case", ["gear", "y before x", "yaw first", "reversed axes", "one slide on the other", "turned body", "no names", "buoyant"]
 )
 def test_the_checklist_passes_what_is_driven(case, write):
-    """All of it, the comparison with MuJoCo included."""
+    """Every item passes, including the comparison with MuJoCo."""
     items = list(checklist(write(DRIVEN[case][0])))
     assert [item for item in items if not item.passed] == [] and "measured" in [item.name for item in items]
 
 
 def test_drag_pushes_a_reversed_robot_back(write):
-    """Unknown dynamics act in the world, whatever way a slide points."""
+    """Unknown dynamics act in the world's frame, whichever way a slide points."""
     slow = [
         push(write(DRIVEN[case][0], f"{k}.xml"), (1.0, 1.0), 0.5, 1.0, drag=2.0)[2]
         for k, case in enumerate(("plain", "reversed axes"))
@@ -171,12 +171,12 @@ def test_drag_pushes_a_reversed_robot_back(write):
 # What is refused -------------------------------------------------------------------------------------------------------------
 
 REFUSED = {
-    "velocity servo": ('<velocity name="{name}" joint="{joint}" ctrlrange="-9 9"/>', "'push_e' is no motor: it is a velocity"),
-    "position servo": ('<position name="{name}" joint="{joint}" ctrlrange="-9 9"/>', "'push_e' is no motor: it is a position"),
+    "velocity servo": ('<velocity name="{name}" joint="{joint}" ctrlrange="-9 9"/>', "'push_e' is not a motor: it is a velocity"),
+    "position servo": ('<position name="{name}" joint="{joint}" ctrlrange="-9 9"/>', "'push_e' is not a motor: it is a position"),
     "filter": (
         '<general name="{name}" joint="{joint}" dyntype="filter" dynprm="0.5" gainprm="1" ctrlrange="-9 9"/>', "type 'filter'"),
     "integrator": (
-        '<intvelocity name="{name}" joint="{joint}" kp="1" actrange="-1 1" ctrlrange="-1 1"/>', "no motor: .*'integrator'"),
+        '<intvelocity name="{name}" joint="{joint}" kp="1" actrange="-1 1" ctrlrange="-1 1"/>', "not a motor: .*'integrator'"),
     "cylinder": ('<cylinder name="{name}" joint="{joint}" timeconst="0.1" ctrlrange="-1 1"/>', "type 'filter"),
     "damper": ('<damper name="{name}" joint="{joint}" kv="1" ctrlrange="0 1"/>', "its gain depends on"),
     "constant push": (
@@ -184,7 +184,7 @@ REFUSED = {
     "delay": ('<motor name="{name}" joint="{joint}" ctrlrange="-9 9" nsample="4" delay="0.01"/>', "acts after a delay"),
     "a brake beside the motor": (
         '<motor name="{name}" joint="{joint}" ctrlrange="-9 9"/><damper name="{name}b" joint="{joint}" kv="2" ctrlrange="0 1"/>'
-        '<velocity name="{name}_brake" joint="{joint}" kv="2"/>', "'push_e_brake' is no motor: it is a velocity servo"),
+        '<velocity name="{name}_brake" joint="{joint}" kv="2"/>', "'push_e_brake' is not a motor: it is a velocity servo"),
     "one side only": ('<motor name="{name}" joint="{joint}" ctrlrange="0 12"/>', "'push_e' pushes from 0 to 12 N only"),
     "no limit": ('<motor name="{name}" joint="{joint}"/>', "'push_e' has no limit"),
 }  # fmt: off
@@ -192,7 +192,7 @@ REFUSED = {
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_an_actuator_that_is_no_motor_is_refused_by_its_name(case, write):
-    """With the reason, instead of being driven as something that it is not."""
+    """The error states the reason; the actuator is never driven as if it were a motor."""
     motors, message = REFUSED[case]
     with pytest.raises(ConfigurationError, match=f"cart.xml.*{message}"):
         make_robot(write(cart(motors=both(motors))))
@@ -207,23 +207,23 @@ def test_an_actuator_that_is_no_motor_is_refused_by_its_name(case, write):
     ],
 )
 def test_a_base_that_does_not_move_along_x_and_y_is_refused(joints, message, write):
-    """By the joint that is in the way."""
+    """The error names the joint at fault, or the joints that are needed."""
     with pytest.raises(ConfigurationError, match=message):
         make_robot(write(cart(joints=joints, motors='<motor joint="east" ctrlrange="-1 1"/>')))
 
 
 def test_a_tendon_on_a_reversed_slide_is_refused(write):
-    """Its length would count the other way."""
+    """Its length would change with the opposite sign."""
     name = write(cart(joints=SLIDES.replace("1 0 0", "-1 0 0"), motors=ON_TENDONS, tail=TENDONS.format("")))
     with pytest.raises(ConfigurationError, match="'east' is in a tendon or an equality and is reversed"):
         World(robot_gate(name), PD(64.0, 16.0))
 
 
 def test_a_body_that_falls_fails_its_check_and_its_gate(write):
-    """Nothing holds it: the height says so, and the mission's row is a failure with exit status 3."""
+    """Nothing holds it up: the height check fails, and the mission's row is a failure with exit status 3."""
     name = write(cart(FREE, FREE_MOTORS))
     failed = [item for item in checklist(name) if not item.passed]
-    assert [item.name for item in failed] == ["height"] and "nothing holds it up" in failed[0].said
+    assert [item.name for item in failed] == ["height"] and "nothing supports it" in failed[0].detail
     out = Path(name).with_name("out")
     with pytest.raises(SystemExit) as stopped:
         main(["robot", "gate", "--robots", name, "--supervisors", "scripted", "--no-clips", "--out", str(out)])
@@ -231,30 +231,30 @@ def test_a_body_that_falls_fails_its_check_and_its_gate(write):
 
 
 def test_a_robot_that_does_not_follow_is_a_failed_row(write):
-    """A motor too weak against a brake that the file has: the tracking error says that nothing else counts."""
+    """If a motor is too weak for the damping in the file, the row is a failure because of the tracking error."""
     name = write(cart(joints=SLIDES.replace("axis", 'damping="500" axis')))
     row, _ = fly_gate(name, "scripted")
     assert row.failure is not None and "from its reference" in row.failure
     step = next(item for item in checklist(name) if item.name == "step")
-    assert not step.passed and "its force is at the limit of 12 N" in step.said
+    assert not step.passed and "its force is at the limit of 12 N" in step.detail
 
 
 def test_a_carriage_on_a_rail_is_driven_but_fails_its_check(write):
-    """A force along the rail moves less than one across it; a robot has one mass, and that is said."""
+    """A force along the rail moves less mass than one across it, and the check reports that a robot has one mass."""
     rail = NESTED.format(SHAPE).replace('mass="1e-6"', 'mass="1"')
     items = {item.name: item for item in checklist(write(cart(joints="", shape=rail)))}
-    assert not items["mass"].passed and items["mass"].said == "3 kg move along x, 4 kg along y; a robot has one mass"
+    assert not items["mass"].passed and items["mass"].detail == "3 kg move along x, 4 kg along y; a robot has one mass"
 
 
 # Options ---------------------------------------------------------------------------------------------------------------------
 
 
 def test_options_are_taken_over_or_named(write, recwarn, monkeypatch, tmp_path):
-    """Gravity and air are the file's in the team's world; the time step is the scenario's; nobody warns, no log file is left."""
+    """The team's world takes gravity and air from the file, the time step from the scenario, without warnings or a log file."""
     monkeypatch.chdir(tmp_path)
     head = '<option timestep="0.01" density="1.2" viscosity="1.8e-5" gravity="0 0 -1.62" wind="1 0 0" integrator="implicitfast"/>'
     name = write(cart(head=head))
-    said = {item.name: item.said for item in checklist(name)}["options"]
+    said = {item.name: item.detail for item in checklist(name)}["options"]
     assert "density 1.2" in said and "gravity 0 0 -1.62" in said and "not kept: timestep 0.01 s" in said
     assert "integrator implicitfast" in said
     model = World(robot_gate(name), PD(64.0, 16.0)).plan.model
@@ -265,7 +265,7 @@ def test_options_are_taken_over_or_named(write, recwarn, monkeypatch, tmp_path):
 
 
 def test_no_section_of_a_file_makes_mujoco_warn(write, capfd, recwarn, monkeypatch, tmp_path):
-    """Sizes, pictures and statistics of the file conflict with the arena's; nobody has to read about it."""
+    """Sizes, visual settings and statistics of the file conflict with the arena's, but cause no warning."""
     monkeypatch.chdir(tmp_path)
     head = (
         '<size nuser_geom="3" memory="9M"/><statistic extent="9" meansize="0.5"/><visual><map znear="0.3"/>'
@@ -314,7 +314,7 @@ PARTS = {
 
 @pytest.mark.parametrize("case", PARTS)
 def test_what_plain_mujoco_loads_is_loaded_with_the_same_physics(case, write):
-    """Inertia at every pose, gravity and places of all bodies are those of the file; two of it make a team, in dm_control too."""
+    """Inertia, bias forces and positions of all bodies are those of the file; a team of it also starts in dm_control."""
     text, others = PARTS[case]
     for file, content in others.items():
         write(content, file)
@@ -335,13 +335,13 @@ def test_what_plain_mujoco_loads_is_loaded_with_the_same_physics(case, write):
 
 
 def test_names_with_slashes_reach_dm_control(write):
-    """Which keeps the slash for itself."""
+    """dm_control reserves the slash for its own names."""
     name = write(DRIVEN["names with slashes"][0])
     make_environment(robot_gate(name, duration=0.5), PD(64.0, 16.0)).reset()
 
 
 def test_a_height_field_and_textures_travel_or_are_left_out(write):
-    """The ground's heights are in the text; what is only seen is not."""
+    """The heights of a height field become part of the text."""
     heights = np.array([[2, 2]], dtype=np.int32).tobytes() + np.array([0, 1, 0.5, 0.25], dtype=np.float32).tobytes()
     name = write(cart(head='<asset><hfield name="hill" file="hill.bin" size="1 1 1 0.1"/></asset>'))
     Path(name).with_name("hill.bin").write_bytes(heights)
@@ -366,7 +366,7 @@ OUTSIDE = {
 @pytest.mark.parametrize("kind", OUTSIDE)
 @pytest.mark.parametrize("way", ["above", "absolute", "link", "pipe"])
 def test_files_outside_the_folder_are_not_opened(kind, way, tmp_path):
-    """Not by a path, not by a link, and a pipe does not hang the reader."""
+    """Neither a path nor a link reaches them, and a pipe does not block the reader."""
     secret, folder = tmp_path / "secret.xml", tmp_path / "robot"
     folder.mkdir()
     secret.write_text("<mujoco/>")
@@ -386,12 +386,12 @@ HIDDEN = (
 
 
 def test_an_include_cannot_be_hidden_from_the_check(write):
-    """Not between what looks like a comment, and not in what only MuJoCo would read."""
+    """Neither between texts that look like a comment, nor in parts that only MuJoCo's parser would read."""
     with pytest.raises(ConfigurationError, match="outside its folder: ../secret.xml"):
         make_robot(write(cart(head=HIDDEN)))
     with pytest.raises(ConfigurationError, match="outside its folder: ../secret.xml"):
         make_robot(write(cart(head='<![CDATA[<!--]]><include file="../secret.xml"/><!-- -->')))
-    with pytest.raises(ConfigurationError, match="is no MJCF that MuJoCo reads"):
+    with pytest.raises(ConfigurationError, match="is not a valid MJCF file"):
         make_robot(write('<!DOCTYPE mujoco [<!ENTITY a "../secret.xml">]>' + cart(head='<include file="&a;"/>')))
 
 
@@ -409,7 +409,7 @@ BOMBS = {
 
 @pytest.mark.parametrize("kind", BOMBS)
 def test_bombs_are_refused_in_one_line(kind, write):
-    """Before MuJoCo takes the memory or the process."""
+    """They are refused before MuJoCo exhausts the memory or ends the process."""
     head, message = BOMBS[kind]
     with pytest.raises(ConfigurationError, match=f"cart.xml.*{message}") as caught:
         make_robot(write(cart(head=head)))
@@ -420,7 +420,7 @@ def test_bombs_are_refused_in_one_line(kind, write):
 
 
 def test_a_scenario_file_finds_its_robot_and_takes_its_scale(write, monkeypatch, tmp_path):
-    """Beside itself, from any folder; a shipped robot by its name alone. What the file sets stays."""
+    """It finds a robot's file beside itself, from any folder, and a shipped robot by name; its own settings have precedence."""
     write(cart(), "cell/cart.xml")
     cell = write('family = "open"\nagents = 4\nrobot = "cart.xml"\nspeed_limit = 0.5\n', "cell/cell.toml")
     monkeypatch.chdir("/")
@@ -436,7 +436,7 @@ def test_a_scenario_file_finds_its_robot_and_takes_its_scale(write, monkeypatch,
 
 
 def direct(path: str, **changes) -> Robot:
-    """A direct robot in Python."""
+    """A robot defined in Python, with motors that act directly on its slides."""
     fields = {
         "joints": ("east", "north"),
         "motors": ("push_e", "push_n"),
@@ -459,7 +459,7 @@ def direct(path: str, **changes) -> Robot:
     ],
 )
 def test_slips_in_a_robot_are_named(changes, message, write):
-    """The field, its value and what there is."""
+    """The error names the field and its value."""
     with pytest.raises(ConfigurationError, match=message):
         direct(write(cart()), **changes).spec()
 
@@ -484,13 +484,13 @@ def test_a_robot_in_python_must_not_turn_its_slides(laws_of, write):
     ],
 )
 def test_fields_of_the_wrong_kind_are_named(changes, message):
-    """As soon as the robot is made."""
+    """The error is raised when the robot is created."""
     with pytest.raises(ConfigurationError, match=message):
         direct("cart.xml", **changes)
 
 
 def test_a_direct_robot_in_python_has_the_files_gear_and_limits(write):
-    """Its motors give the planar force, and its limit may not be more than they can give."""
+    """Its motors give the planar force, and its force limit may not exceed theirs."""
     text = cart(motors=both('<motor name="{name}" joint="{joint}" gear="-30" ctrlrange="-1 1" forcerange="-0.4 1"/>'))
     source = (
         "from pathlib import Path\nfrom marlbc_mj.robots import Robot\n"
@@ -507,7 +507,7 @@ def test_a_direct_robot_in_python_has_the_files_gear_and_limits(write):
 
 
 def test_laws_need_slides_along_the_axes(write):
-    """Disturbances are pushed into these joints."""
+    """Disturbances act on these joints."""
     omni = make_robot("omni")
     robot = direct(
         write(cart(joints=SLIDES.replace("1 0 0", "-1 0 0"))),
@@ -519,7 +519,7 @@ def test_laws_need_slides_along_the_axes(write):
 
 
 def test_the_command_line_takes_a_robot_and_its_scale(write, tmp_path):
-    """For any scenario."""
+    """The case study runs with a robot from a file."""
     name = write(cart())
     main(["run", "paper", "--robot", name, "--controller", "pd", "--duration", "0.5", "--out", str(tmp_path / "out")])
     assert (tmp_path / "out" / "metrics.json").exists()

@@ -1,4 +1,4 @@
-"""Rollout: its plans, what is predicted of an agent behind its reference, and when the column is formed and left."""
+"""Rollout: its plans, the predicted lag of agents behind their references, and when the column is formed and left."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from marlbc_mj.util.errors import ConfigurationError, SimulationError
 
 
 def test_there_are_33_plans():
-    """Hold; change at 8 instants from 0 to 8 s, for good or back 3, 6 or 10 s later; the price counts changes in the horizon."""
+    """Hold, or change at 8 instants from 0 to 8 s, for good or back after 3, 6 or 10 s; switches in the horizon are counted."""
     plans = Rollout().plans(0.05)
     assert plans.changed.shape == (33, 280) and not plans.changed[0].any() and plans.switches[0] == 0.0
     starts = sorted({int(row.argmax()) for row in plans.changed[1:]})
@@ -24,7 +24,7 @@ def test_there_are_33_plans():
 
 @pytest.mark.parametrize("family", ["gates", "traffic"])
 def test_plans_that_are_given_up_could_not_have_been_the_cheapest(family: str) -> None:
-    """The rest costs what every plan costs that is followed to its end, to the bit; in drawn states of held-out layouts."""
+    """In random states of held-out layouts, each plan kept has exactly the cost of following it to its end."""
     scenario = make_scenario(family, composition="set-based", split="test")
     supervisor, world = Rollout(), World(scenario, worlds=6)
     for step in (0, 500, 1100):
@@ -48,7 +48,7 @@ NOW_OR_NEVER = Rollout(change_after=(0.0,), back_after=())
 
 
 def test_rollout_forms_the_column_for_a_wall_and_not_without():
-    """Nothing in the way, or a disc beside the way: formation. A wall that stops the formation: column, for the whole team."""
+    """With an empty path, or a disc beside it, the formation is kept; a wall in its way makes the whole team form the column."""
     x = SLOTS[0, 0]
     for supervisor in (Rollout(), NOW_OR_NEVER):
         assert orders_of(supervisor, seen(OPEN, ())) == [FM] * 4
@@ -57,12 +57,12 @@ def test_rollout_forms_the_column_for_a_wall_and_not_without():
 
 
 def test_rollout_changes_no_earlier_than_it_must():
-    """The same wall, with plans that may wait: as long as waiting is safe it is cheaper."""
+    """Before a wall farther ahead, with plans that may wait: while waiting is safe, it is cheaper."""
     assert orders_of(Rollout(), seen(OPEN, wall(SLOTS[0, 0] + 7.0))) == [FM] * 4
 
 
 def test_rollout_keeps_its_motion_between_decisions():
-    """Decided at once and then every 0.5 s: 10 mission steps under the same motion, whatever is seen in between."""
+    """It decides at once and then every 0.5 s: 10 mission steps have the same motion, whatever is observed in between."""
     orders, memory = NOW_OR_NEVER.decide(seen(OPEN, wall(SLOTS[0, 0] + 4.0)), NOW_OR_NEVER.start(OPEN, 1))
     assert (orders == FR).all() and memory.due.tolist() == [10]
     column = OPEN.formations[1]
@@ -73,7 +73,7 @@ def test_rollout_keeps_its_motion_between_decisions():
 
 
 def test_a_lag_that_never_saturates_is_that_of_the_linear_loop():
-    """A reference that moves at constant speed is followed without error; a jump decays as the damped oscillator does."""
+    """A reference at constant speed is followed without error; the error of a jump decays like a damped oscillator's."""
     p_r, p, v, v_r = np.zeros((1, 2)), np.zeros((1, 2)), np.full((1, 2), 3.0), np.full((1, 2), 3.0)
     for _ in range(40):
         follow_reference(0.05, Lag(10, 0.005, 200.0), p_r, p, v, v_r)
@@ -87,7 +87,7 @@ def test_a_lag_that_never_saturates_is_that_of_the_linear_loop():
 
 
 def test_a_saturated_agent_is_no_faster_than_its_force_allows():
-    """A jump of 10 m takes at least 2 sqrt(10 / a) there and to rest; after half a second at 20 m/s^2 it is 2.5 m at most."""
+    """A jump of 10 m takes at least 2 sqrt(10 / a) from rest to rest; half a second at 20 m/s^2 covers at most 2.5 m."""
     p_r, p, v, v_r = np.full((1, 2), 10.0), np.zeros((1, 2)), np.zeros((1, 2)), np.zeros((1, 2))
     for _ in range(10):
         follow_reference(0.05, Lag(10, 0.005, 20.0), p_r, p, v, v_r)

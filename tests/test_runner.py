@@ -33,14 +33,14 @@ WORKERS = pytest.mark.parametrize("workers", [1, 2])
 
 @dataclass
 class Request:
-    """A stop that may be asked for."""
+    """A request to stop; ``signal`` is 0 until there is one."""
 
     signal: int = 0
 
 
 @WORKERS
 def test_results_are_in_the_order_of_the_jobs(workers: int) -> None:
-    """Whoever ends first, each is told as it ends, with its own job; every job's progress arrives in its order."""
+    """Whichever job ends first, each end is reported with its own job, and a job's progress arrives in order."""
     ended, told = [], []
     results = run_jobs(
         Squares(),
@@ -55,7 +55,7 @@ def test_results_are_in_the_order_of_the_jobs(workers: int) -> None:
 
 @WORKERS
 def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
-    """Large files of the jobs beside the report, or nothing but what has ended, for the same study to go on with."""
+    """It holds the report and the jobs' files; after a failure only finished jobs, from which the study can resume."""
     done = run_study(Squares(), tmp_path / "out", workers=workers)
     assert done.results == [0, 1, 4, 9] and done.report == Report("sum 14", ("no picture",))
     assert {path.name for path in (tmp_path / "out").iterdir()} == {MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4))}
@@ -71,18 +71,18 @@ def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
 
 
 def test_a_dead_worker_is_an_error(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """After another try; and whoever saves as he goes is told that he may go on."""
+    """It is raised after another try; for a study that can resume, it says that the same command does so."""
     monkeypatch.setattr("marlbc_mj.studies.engines.local.MOST_TRIES", 2)
     with pytest.raises(SimulationError, match=r"a worker process died \(out of memory\?\)$"):
         run_jobs(Squares(trouble="death"), workers=2)
-    assert "what it did is done again (1 so far)" in capsys.readouterr().err
-    with pytest.raises(SimulationError, match="the same command goes on"):
+    assert "its work is repeated (1 so far)" in capsys.readouterr().err
+    with pytest.raises(SimulationError, match="repeat the command to resume"):
         run_jobs(Squares(trouble="death"), workers=2, stop=Request())
 
 
 @WORKERS
 def test_a_stop_reaches_the_jobs(workers: int) -> None:
-    """Asked for while they run: what has ended is kept, the runner says which signal it was."""
+    """After a stop while jobs run, finished results are kept, and the runner reports the signal."""
     request, ended = Request(), []
 
     def note(job: int, result: int) -> None:
@@ -95,7 +95,7 @@ def test_a_stop_reaches_the_jobs(workers: int) -> None:
 
 
 def test_a_job_that_stops_by_itself_stops_the_study() -> None:
-    """In this process, where the signal reaches the job first; without anybody to tell it is passed on."""
+    """In a single process the signal reaches the job first; the stop is raised with and without a ``stop`` argument."""
 
     @dataclass(frozen=True)
     class Interrupted(Squares):
@@ -139,7 +139,7 @@ STUDIES = {
 
 @pytest.mark.parametrize("name", STUDIES)
 def test_every_study_can_be_sent_elsewhere(name: str) -> None:
-    """It and its jobs are data: they survive pickling, and no two jobs of a study are alike."""
+    """A study and its jobs are data: they survive pickling, and no two jobs of a study are equal."""
     study = pickle.loads(pickle.dumps(STUDIES[name]))
     jobs = pickle.loads(pickle.dumps(STUDIES[name].jobs()))
     assert [repr(job) for job in jobs] == [repr(job) for job in study.jobs()] and len(jobs) > 1
@@ -148,7 +148,7 @@ def test_every_study_can_be_sent_elsewhere(name: str) -> None:
 
 @pytest.mark.slow
 def test_workers_change_no_number_of_an_ablation() -> None:
-    """The command runs it in one process; its cases are jobs like any others."""
+    """The command runs an ablation in one process, but its cases are jobs like any others."""
     question = select_questions(("avoidance",))
     assert run_jobs(AblationStudy(question), workers=2) == run_jobs(AblationStudy(question))
 
@@ -185,7 +185,7 @@ class Patient:
 
 @pytest.fixture
 def patient(tmp_path: Path, request: pytest.FixtureRequest):
-    """A study of jobs that never end by themselves, in a process group of its own, once two workers have begun."""
+    """The process of a study of jobs that do not end by themselves, in its own process group, once two have begun."""
     (tmp_path / "orphans.py").write_text(ORPHANS)
     command = [sys.executable, "-c", PARENT, str(tmp_path), str(tmp_path), request.param]
     parent = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
@@ -200,7 +200,7 @@ def patient(tmp_path: Path, request: pytest.FixtureRequest):
 
 @pytest.mark.parametrize("patient", ["heeds"], indirect=True)
 def test_workers_do_not_outlive_their_study(patient: subprocess.Popen, tmp_path: Path) -> None:
-    """Killed without a chance to say so: its workers are asked to stop, save themselves and end."""
+    """If the study is killed, its workers are still told to stop, save their state and end."""
     workers = [int(path.read_text()) for path in tmp_path.glob("*.begun")]
     patient.kill()
     patient.wait()
@@ -210,14 +210,14 @@ def test_workers_do_not_outlive_their_study(patient: subprocess.Popen, tmp_path:
 
 @pytest.mark.parametrize("patient", ["hurries"], indirect=True)
 def test_after_ctrl_c_no_job_begins(patient: subprocess.Popen, tmp_path: Path) -> None:
-    """Also none that waits in a worker's queue: the study ends at once."""
+    """Not even a job in a worker's queue begins: the study ends at once."""
     os.killpg(patient.pid, signal.SIGINT)
     assert patient.wait(60) != 0
     assert len(list(tmp_path.glob("*.begun"))) == 2 and not list(tmp_path.glob("*.saved"))
 
 
 def wait_for(condition, seconds: float = 60.0) -> None:
-    """Until it holds."""
+    """Wait until the condition holds."""
     until = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < until
@@ -225,7 +225,7 @@ def wait_for(condition, seconds: float = 60.0) -> None:
 
 
 def alive(process: int) -> bool:
-    """Whether it runs; one that has ended may wait for whoever adopted it."""
+    """Whether the process runs; an ended one may remain as a zombie until its new parent collects it."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
     except FileNotFoundError:

@@ -1,4 +1,4 @@
-"""Engines: the same results to the last bit, failures and retries, on Ray's and submitit's processes of this machine."""
+"""Engines: results identical to the last bit, failures and retries, with local processes of Ray and submitit."""
 
 import os
 import secrets
@@ -17,7 +17,7 @@ from small_studies import Roots, Squares
 
 from marlbc_mj.studies import runner
 from marlbc_mj.studies.engines import guard, make_engine
-from marlbc_mj.studies.engines.base import Ears, Engine, Task, Work
+from marlbc_mj.studies.engines.base import Engine, EngineCallbacks, Task, Work
 from marlbc_mj.studies.engines.slurm_arrays import SlurmArray
 from marlbc_mj.studies.runner import run_jobs, run_study
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -29,19 +29,19 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def whole(tmp_path: Path) -> dict[str, bytes]:
-    """What a study in this process leaves."""
+    """The files written by a study that runs in this process."""
     run_study(Roots(), tmp_path / "whole")
     return files(tmp_path / "whole")
 
 
 @pytest.fixture
 def use(monkeypatch: pytest.MonkeyPatch) -> Callable[[Engine], None]:
-    """Has studies use an engine, whatever they ask for."""
+    """A function that makes studies use an engine, whichever they request."""
     return lambda engine: monkeypatch.setattr(runner, "make_engine", lambda name, workers: engine)
 
 
 def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> None:
-    """What had ended when a job failed is kept, and the rest follows."""
+    """Check that jobs finished before a failure are kept, and that the next run does the rest."""
     with pytest.raises(SimulationError, match="it fell"):
         run_study(Roots(trouble="it fell", once=once), out, engine="ray")
     said, of_ray, marked = [], set(), set()
@@ -53,7 +53,7 @@ def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> No
             marked.update(guard.marked(os.environ[guard.TOKEN]))
 
     done = run_study(Roots(once=once), out, engine="ray", progress=look)
-    assert len(of_ray) >= 4 and of_ray <= marked and guard.TOKEN not in os.environ  # raylet, its store of states, agents
+    assert len(of_ray) >= 4 and of_ray <= marked and guard.TOKEN not in os.environ  # raylet, its state store, agents
     assert files(out) == whole and all(each.flags.writeable for each in done.results)
     assert said[0][0] == "jobs" and 0 < said[0][1] < 5 and said[-1] == ("jobs", 5, 5)
     assert once.exists() and [path.name for path in out.parent.glob("out*")] == ["out"]
@@ -61,7 +61,7 @@ def goes_on_after_an_error(out: Path, whole: dict[str, bytes], once: Path) -> No
 
 @pytest.mark.filterwarnings("ignore")
 def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
-    """Two local workers, of which one is killed in mid-job: the job is done again, and another fails after that."""
+    """One of two local workers is killed during a job: the job is run again, and another job fails after that."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     handler = signal.getsignal(signal.SIGTERM)
     use(make_engine("ray", 2))
@@ -71,7 +71,7 @@ def test_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, b
 
 @pytest.mark.slow
 def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[str, bytes], use) -> None:
-    """Its processes on this machine stand for an array of two tasks; one is killed, and what it has left is submitted again."""
+    """Local processes stand in for an array of two tasks; one is killed, and its unfinished jobs are submitted again."""
     monkeypatch.setattr("marlbc_mj.studies.engines.slurm_arrays.ALIVE_EVERY", 0.2)
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(sys.path))
     use(SlurmArray(2, "local"))
@@ -81,7 +81,7 @@ def test_submitit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, whole: dict[s
 
 
 def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Results that came after the end of the study are found by the next run; only what failed is submitted again, once."""
+    """The next run finds results that arrived after the study had ended; only the failed job is submitted again, once."""
     from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
 
     tasks = [Task(k, f"{k:064x}", k) for k in range(5)]
@@ -97,7 +97,7 @@ def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypat
         return []
 
     monkeypatch.setattr(engine, "_submit", submit)
-    found = dict(engine.map(work, tasks, Ears(retried=retried.append)))
+    found = dict(engine.map(work, tasks, EngineCallbacks(retried=retried.append)))
     assert (
         [task.place for task in submitted] == [3]
         and not retried
@@ -107,7 +107,7 @@ def test_an_array_whose_study_was_killed_is_taken_over(tmp_path: Path, monkeypat
 
 
 def test_a_share_goes_on_where_it_was_killed(tmp_path: Path) -> None:
-    """As SLURM requeues it: a torn result is made again, the others are not."""
+    """When SLURM requeues it, a truncated result is computed again, the others are not."""
     from marlbc_mj.studies.engines.slurm_arrays import ArrayShare
     from marlbc_mj.studies.packs import entries
 
@@ -120,7 +120,7 @@ def test_a_share_goes_on_where_it_was_killed(tmp_path: Path) -> None:
 
 
 def test_an_error_that_is_not_ours_is_one_line(tmp_path: Path) -> None:
-    """From where it cannot be raised through."""
+    """It comes from another process, through which it cannot be raised."""
     from marlbc_mj.studies.engines.base import attempt
 
     outcome = attempt(Work(Roots(trouble="error")), Task(3, "", 3))
@@ -142,7 +142,7 @@ def test_an_engine_that_is_not_installed(monkeypatch: pytest.MonkeyPatch, name: 
 
 
 def test_an_engine_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No such name, no SLURM, no worker."""
+    """Missing SLURM, an unknown engine and a run without workers are refused."""
     monkeypatch.setattr("shutil.which", lambda _: None)
     with pytest.raises(ConfigurationError, match="no SLURM here: there is no command sbatch"):
         run_jobs(Squares(), engine="slurm")
@@ -153,7 +153,7 @@ def test_an_engine_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_the_guard_ends_processes_that_keep_starting_others():
-    """As a raylet does with its workers: one look alone would leave those that were started meanwhile."""
+    """A raylet does so with its workers: a single scan would miss those started meanwhile."""
     token = secrets.token_hex(8)
     code = "import subprocess, sys\nwhile True: subprocess.Popen(['sleep', '30'])"
     with subprocess.Popen([sys.executable, "-S", "-c", code], env={**os.environ, guard.TOKEN: token}) as breeding:

@@ -1,4 +1,4 @@
-"""What a run keeps: results that come back bit for bit, packs that survive anything, and the same command that goes on."""
+"""The store of a run: results are restored to the last bit, packs survive damage, and the same command resumes."""
 
 import errno
 import json
@@ -34,7 +34,7 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True)
 class Checked:
-    """A dataclass whose constructor computes and refuses; what is stored needs neither."""
+    """A dataclass with a constructor that computes a field and refuses values; restoring needs neither."""
 
     size: int
     twice: int = field(init=False)
@@ -59,7 +59,7 @@ PLAIN = st.recursive(
 
 @given(PLAIN)
 def test_what_is_stored_comes_back(value: object) -> None:
-    """Of the same types, to the last bit, also infinities, negative zero, and texts that are no text."""
+    """Values are restored with their types, to the last bit, including infinities and negative zero."""
     data = codec.to_bytes(value)
     again = codec.from_bytes(data)
     assert repr(again) == repr(value) and codec.to_bytes(again) == data
@@ -83,7 +83,7 @@ def test_numbers_of_numpy_dataclasses_and_paths_come_back() -> None:
 
 @pytest.mark.parametrize("value", [print, object(), {1, 2}, np.array([None]), lambda: 0, type])
 def test_what_is_no_data_is_refused(value: object) -> None:
-    with pytest.raises(ConfigurationError, match="is no data that can be kept"):
+    with pytest.raises(ConfigurationError, match="cannot be stored"):
         codec.to_bytes([value])
 
 
@@ -99,13 +99,13 @@ def test_what_is_no_data_is_refused(value: object) -> None:
     ],
 )
 def test_bytes_of_something_else_make_nothing(text: str) -> None:
-    """Neither an object that is no data, nor a call."""
+    """Reading them creates no object that is not data, and calls nothing."""
     with pytest.raises(ConfigurationError, match="cannot be read"):
         codec.from_bytes(len(text).to_bytes(4, "little") + text.encode())
 
 
 def test_a_whole_result_comes_back(episode) -> None:
-    """An episode with scenario and arrays, and the tables made from it."""
+    """An episode is restored with its scenario, arrays and metrics."""
     result = Result.of(episode("scripted", "sorlc", duration=5.0))
     again = codec.from_bytes(codec.to_bytes(result))
     assert again.metrics == result.metrics and again.trajectory.scenario == result.trajectory.scenario
@@ -118,7 +118,7 @@ def test_a_whole_result_comes_back(episode) -> None:
 
 @pytest.mark.parametrize("name", sorted(set(STUDIES) - {"study"}))
 def test_every_study_has_addresses(name: str) -> None:
-    """One per job, the same for an equal study."""
+    """Every job has its own address, which is reproducible."""
     keys = [Addresses(STUDIES[name]).key(job) for job in STUDIES[name].jobs()]
     assert len(set(keys)) == len(keys) and all(len(key) == 64 for key in keys)
     assert keys == [Addresses(STUDIES[name]).key(job) for job in STUDIES[name].jobs()]
@@ -130,7 +130,7 @@ PAYLOADS = [b"", b"a", b"MJr1" * 20, os.urandom(300), b"x" * 2000]
 
 @pytest.fixture
 def pack(tmp_path: Path) -> Path:
-    """Five records."""
+    """The path of a pack with five records."""
     with PackWriter(tmp_path / "results-000000.pack") as writer:
         for key, payload in zip(KEYS, PAYLOADS, strict=True):
             assert writer.add(key, payload).payload() == payload
@@ -142,7 +142,7 @@ def stored(pack: Path) -> dict[str, bytes]:
 
 
 def test_a_pack_that_is_cut_anywhere_keeps_all_whole_records(pack: Path) -> None:
-    """And is written on behind them."""
+    """New records are appended after them."""
     whole, everything = pack.read_bytes(), dict(zip(KEYS, PAYLOADS, strict=True))
     ends = [entry.start + entry.length for entry in entries(pack)]
     assert stored(pack) == everything
@@ -164,7 +164,7 @@ def test_a_flipped_bit_costs_one_record(pack: Path) -> None:
 
 
 def test_a_full_disk_leaves_the_pack_as_it_was(pack: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half a record is written, then no more; with room again, the same writer goes on."""
+    """The disk is full after half a record; once there is room again, the same writer continues."""
     before, write = pack.read_bytes(), os.write
 
     def full(file: int, data: bytes) -> int:
@@ -187,7 +187,7 @@ RUN: list[int] = []
 
 @dataclass(frozen=True)
 class Halves:
-    """Halves of numbers, each with a file; ``stop_at`` is where it is interrupted, after that it is not part of a job."""
+    """A study of halves of numbers, each with a file; job ``stop_at`` raises ``error``. Neither is part of a job."""
 
     count: int = 6
     scale: float = 0.5
@@ -213,7 +213,7 @@ class Halves:
 
 @pytest.fixture
 def ran() -> list[int]:
-    """Which jobs ran in this process."""
+    """The list of jobs that ran in this process, initially empty."""
     RUN.clear()
     return RUN
 
@@ -224,7 +224,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, MemoryError, SimulationError])
 def test_the_same_call_goes_on(tmp_path: Path, ran: list[int], capsys: pytest.CaptureFixture[str], error: type) -> None:
-    """Whatever stopped it: nothing that ended runs again, and what is left is as if nothing had happened."""
+    """Whatever stopped it, no finished job runs again, and the final files are those of an uninterrupted run."""
     run_study(Halves(), tmp_path / "whole")
     assert ran == list(range(6))
     for stop_at in (2, 4):
@@ -263,7 +263,7 @@ def test_nothing_is_left_of_a_run_in_which_nothing_ended(tmp_path: Path) -> None
 
 
 def test_a_finished_folder_stays_until_it_is_replaced(tmp_path: Path, ran: list[int]) -> None:
-    """Refused without --overwrite; with it, what was there stays until all of the new is there."""
+    """A new run is refused without --overwrite; with it, the old files stay until the new run is complete."""
     out = tmp_path / "out"
     run_study(Halves(), out)
     with pytest.raises(ConfigurationError, match="is not empty; choose another or add --overwrite"):
@@ -297,7 +297,7 @@ def stopped(out: Path, **changes: object) -> None:
 
 
 def test_a_longer_study_takes_over_what_there_is(tmp_path: Path, ran: list[int], capsys: pytest.CaptureFixture[str]) -> None:
-    """A shorter one says what it does not use."""
+    """A shorter study reports the results that it does not use."""
     stopped(tmp_path / "out")
     run_study(Halves(count=8), tmp_path / "out")
     assert ran == list(range(8)) and "3 of 8 jobs are done" in capsys.readouterr().err
@@ -312,7 +312,7 @@ def test_a_longer_study_takes_over_what_there_is(tmp_path: Path, ran: list[int],
 def test_what_is_of_no_use_is_said_and_kept(
     tmp_path: Path, ran: list[int], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
-    """It goes only with --overwrite."""
+    """It is removed only with --overwrite."""
     stopped(tmp_path / "out")
     scale = 4.0 if what == "another configuration" else 0.5
     if what == "other code":
@@ -328,7 +328,7 @@ def test_what_is_of_no_use_is_said_and_kept(
 
 
 def test_two_runs_on_one_folder(tmp_path: Path) -> None:
-    """The second is refused, and costs the first nothing."""
+    """The second is refused and does not disturb the first."""
     with store.open_store(tmp_path / "out", overwrite=False) as first:
         first.begin({})
         for overwrite in (False, True):
@@ -357,7 +357,7 @@ def test_what_killed_workers_left_is_removed(tmp_path: Path) -> None:
 
 
 def test_an_edited_file_of_the_user_is_another_job(tmp_path: Path) -> None:
-    """Itself, one that it imports, and the file of a type that is not the package's."""
+    """Editing the file, or adding a file beside it, changes the job's address."""
     mine = tmp_path / "mine.py"
     mine.write_text("a = 1")
 

@@ -1,4 +1,4 @@
-"""The test that makes a clearance a violation, and stretches of equal values."""
+"""The condition for a violation of the safe distance, and stretches of equal values."""
 
 from itertools import pairwise
 
@@ -20,7 +20,7 @@ def how_many(clearance, safe_distance):
 
 @pytest.mark.parametrize("size", [0, 1, 7])
 def test_scalars_arrays_and_compiled_loops_agree(size):
-    """At the safe distance and below it; above it, or without an obstacle, not; NaN is no violation."""
+    """Clearances at or below the safe distance violate it; those above it, infinity without obstacles, and NaN do not."""
     clearance = np.array([2.0, np.nextafter(2.0, 3.0), -1.0, np.inf, np.nan, 2.0, 1.9])[:size]
     expected = np.array([True, False, True, False, False, True, True])[:size]
     assert violates(clearance, 2.0).tolist() == expected.tolist()
@@ -29,7 +29,7 @@ def test_scalars_arrays_and_compiled_loops_agree(size):
 
 
 def test_stretches_tile_the_sequence():
-    """Each is as long as it can be, and together they give the values back; nothing has none."""
+    """Each is as long as possible, and together they reproduce the values; an empty sequence has none."""
     assert list(stretches(np.array([1, 1, 0, 2, 2]))) == [(0, 2, 1), (2, 3, 0), (3, 5, 2)]
     assert list(stretches(np.array([], dtype=int))) == []
     values = np.random.default_rng(0).integers(0, 3, 200)

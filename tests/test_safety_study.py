@@ -1,4 +1,4 @@
-"""The study of safety: which cells there are, what its tables say of them, and the command."""
+"""The safety study: its cells, their scores in its tables, and the command."""
 
 import csv
 import pickle
@@ -22,7 +22,7 @@ from marlbc_mj.studies.safety import (
     SafetyStudy,
     ground,
 )
-from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS
+from marlbc_mj.supervisors import OWN, VELOCITY_SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -32,7 +32,7 @@ CELL = MissionCell("field", "set-based", False, "fixed")
 
 
 def test_every_layout_of_every_cell_is_in_one_job() -> None:
-    """Those who give velocities have one composition; searches fly fewer layouts."""
+    """Supervisors that output velocities have one composition; searches fly fewer layouts."""
     study = SafetyStudy(layouts=250, searched=20)
     jobs = pickle.loads(pickle.dumps(study)).jobs()
     cells = study.cells()
@@ -41,7 +41,7 @@ def test_every_layout_of_every_cell_is_in_one_job() -> None:
     for cell in cells:
         seeds = [seed for job in jobs if cell in job.cells for seed in job.seeds]
         assert seeds == list(range(80_000, 80_000 + (20 if cell.supervisor in SEARCHES else 250)))
-        assert (cell.composition == OWN) == (cell.supervisor in VELOCITY_GIVERS)
+        assert (cell.composition == OWN) == (cell.supervisor in VELOCITY_SUPERVISORS)
     assert {cell.composition for cell in cells} == {*COMPOSITIONS, OWN}
 
 
@@ -49,7 +49,7 @@ def test_every_layout_of_every_cell_is_in_one_job() -> None:
 def test_a_layout_that_the_shield_leaves_alone_is_flown_once(
     supervisor: str, composition: str, touched: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is said of it without a shield is what flying it without one says, to the bit."""
+    """Its reported results without a shield are identical to those of flying it without one."""
     short = make_scenario("paper", duration=20.0) if touched else held_out(make_scenario("field", duration=2.0))
     monkeypatch.setattr(safety, "ground", lambda name: short)
     flown: list[tuple[bool, int]] = []
@@ -72,7 +72,7 @@ def test_a_layout_that_the_shield_leaves_alone_is_flown_once(
 
 
 def test_draws_around_the_case_study_are_the_published_ones() -> None:
-    """67 seeds for each drag, one after the other."""
+    """There are 67 consecutive seeds for each drag."""
     jobs = SafetyStudy(missions=tuple(DRAG_DRAWS), supervisors=("fsams",), shields=(False,), compositions=("null-space",)).jobs()
     assert [seed for job in jobs for seed in job.seeds] == list(range(3 * DRAWS_EACH))
     for name, (drag, _) in DRAG_DRAWS.items():
@@ -99,7 +99,7 @@ def test_scores_of_a_cell_are_those_of_its_layouts() -> None:
 
 
 def test_the_command_writes_tables_and_all_numbers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A supervisor that composes, one that refuses and one that gives velocities; shield on and off."""
+    """One supervisor outputs orders, one refuses and one outputs velocities, each with and without a shield."""
     out = tmp_path / "safety"
     names = ["fixed", "scripted", "orca"]
     main(["safety", "field", "--supervisors", *names, "--compositions", "set-based", "--layouts", "1", "--out", str(out)])

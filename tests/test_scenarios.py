@@ -1,4 +1,4 @@
-"""Scenarios: the case study's numbers, its geometry, and every setting that cannot be run, refused with its value."""
+"""Scenarios: the case study's numbers and geometry, and settings that cannot be run, each refused with its value."""
 
 import re
 
@@ -20,7 +20,7 @@ PRINTED_COLUMN = ((4.5, 0.0), (1.5, 0.0), (1.5, 0.0), (4.5, 0.0))  # Gamma_3 and
 
 
 def test_the_case_study_is_the_published_one():
-    """Section 4.1 and Tables 1 and 2, with Gamma positive (erratum 4)."""
+    """Its numbers are those of section 4.1 and Tables 1 and 2, with Gamma positive (erratum 4)."""
     scenario = paper()
     gamma = np.array([9, 3, 3, 9]) / 5.0
     slots = np.array([(2.5, 6), (2.5, -6), (-2.5, 12), (-2.5, -12)])
@@ -59,7 +59,7 @@ def test_what_the_geometry_asks_for():
 
 
 def refusal(*fragments: str):
-    """ConfigurationError whose message contains all ``fragments`` in this order."""
+    """Expect a ConfigurationError with a message that contains all ``fragments`` in this order."""
     return pytest.raises(ConfigurationError, match=".*".join(map(re.escape, fragments)))
 
 
@@ -77,7 +77,7 @@ def refusal(*fragments: str):
     ],
 )
 def test_unknown_names_are_refused_with_the_valid_ones(make, fragments):
-    """Scenario, supervisor, disturbance, robot, reference mode, formation, order."""
+    """This holds for scenario, supervisor, disturbance, robot, reference mode, formation and order."""
     with refusal(*fragments):
         make()
 
@@ -113,7 +113,7 @@ def test_numbers_must_be_positive_and_finite(name, value):
     ids=str,
 )
 def test_what_cannot_be_run_is_refused_when_the_scenario_is_built(changes, fragments):
-    """Clocks, numbers, teams, obstacles on starts, and slots that overlap as the published Gamma's do (erratum 4)."""
+    """Wrong clocks, numbers and teams, obstacles on starts, and overlapping slots, as with the published Gamma (erratum 4)."""
     with refusal(*fragments):
         paper(**changes)
 
@@ -130,7 +130,7 @@ def test_what_cannot_be_run_is_refused_when_the_scenario_is_built(changes, fragm
     ],
 )
 def test_gains_must_be_positive_and_finite(make, value):
-    """Of behaviors and controllers; the message shows the value."""
+    """This holds for behaviors and controllers; the message shows the value."""
     with refusal(value):
         make()
 
@@ -146,7 +146,7 @@ def test_gains_must_be_positive_and_finite(make, value):
     ],
 )
 def test_perturbations_must_be_ordered_ranges(numbers, value):
-    """Negative, unordered or infinite ranges; the message shows them."""
+    """Negative, unordered or infinite ranges are refused, and the message shows them."""
     with refusal("perturbation", value):
         Perturbation(**numbers)
 
@@ -189,7 +189,7 @@ def test_threads_are_those_of_the_machine(number):
     ids=str,
 )
 def test_orders_must_be_indices_in_the_right_shape(orders, value):
-    """(worlds, agents), each from 0 to 5; and nothing is stepped."""
+    """Orders are (worlds, agents), each from 0 to 5; with others, no world is stepped."""
     world = World(paper(), worlds=2)
     with refusal("orders must", value):
         world.step(orders.astype(np.int64))
@@ -197,6 +197,6 @@ def test_orders_must_be_indices_in_the_right_shape(orders, value):
 
 
 def test_errors_have_one_root_and_an_exit_status():
-    """A setting is a ValueError too, and the command line exits with 2."""
+    """A ConfigurationError is a ValueError too, and makes the command line exit with 2."""
     assert issubclass(ConfigurationError, MarlbcError) and issubclass(ConfigurationError, ValueError)
     assert ConfigurationError.exit_status == 2

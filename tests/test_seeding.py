@@ -13,7 +13,7 @@ numbers = st.integers(0, 2**31 - 1)
 
 @given(numbers, numbers, numbers)
 def test_a_stream_is_its_seeds_and_its_worlds_own(seed, world, other):
-    """Equal pairs give equal numbers; a world's stream depends on no other and is not the one of the next seed."""
+    """Equal pairs of seed and world give equal numbers, other pairs different ones."""
     first = stream(seed, world).random(4)
     assert (first == stream(seed, world).random(4)).all()
     assert (seed, world) == (other, world) or (first != stream(other, world).random(4)).all()
@@ -21,7 +21,7 @@ def test_a_stream_is_its_seeds_and_its_worlds_own(seed, world, other):
 
 
 def test_worlds_draw_their_episodes_from_it():
-    """World b of a simulation of any number of worlds."""
+    """World b of a simulation draws from the stream of its seed and b."""
     scenario = paper(perturbation=Perturbation(start_spread=1.0, drag_scale=(0.5, 2.0)))
     expected = np.stack([scenario.draw(stream(7, b)).starts for b in range(3)])
     world = World(scenario, worlds=3)

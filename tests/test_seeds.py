@@ -1,4 +1,4 @@
-"""Methods on common draws: pairing, independence of order, failures as outcomes, and the files that a report leaves."""
+"""Methods on common draws: pairing, independence of order, failures as outcomes, and the files that a report writes."""
 
 import csv
 import json
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 
 def run_seeds(scenario, supervisors, controllers, seeds, progress=None, **options) -> SeedResults:
-    """Every supervisor with every controller."""
+    """Run every supervisor with every controller."""
     return run_methods(scenario, list(product(supervisors, controllers)), seeds, progress, **options)
 
 
@@ -44,13 +44,13 @@ CONFIG = {"versions": {"mujoco": "3.17"}, "git_revision": "abc", "command": "mar
 
 @pytest.fixture(scope="module")
 def results() -> SeedResults:
-    """Two supervisors, two controllers, four draws of two seconds."""
+    """Results of two supervisors and two controllers on four draws of two seconds."""
     return run_seeds(paper(duration=2.0), ("scripted", "fsams"), ("sorlc", "pd"), seed_range(4))
 
 
 @pytest.fixture(scope="module")
 def failing() -> SeedResults:
-    """One method that never fails beside one that fails on the first and third of four seeds, made by hand."""
+    """One method without failures, and one with failures inserted on the first and third of four seeds."""
     whole = run_seeds(paper(duration=1.0), ("scripted",), ("pd", "sorlc"), seed_range(4, first=3))
     runs = tuple(
         SeedRun(r.seed, r.instance, failure=f"seed {r.seed}: | 100% of <limit>\nsecond line") if k in (0, 2) else r
@@ -60,7 +60,7 @@ def failing() -> SeedResults:
 
 
 def without_clock(run: SeedRun) -> object:
-    """A run's scalars but for the time decisions took."""
+    """A run's scalars without its decision times."""
     assert run.metrics is not None
     return run.metrics["agents"], {key: value for key, value in run.metrics["team"].items() if key not in CLOCK}
 
@@ -103,7 +103,7 @@ def test_results_depend_on_neither_order_nor_company_nor_a_reused_world(results:
 
 @pytest.mark.slow
 def test_workers_change_nothing(results: SeedResults) -> None:
-    """Neither results nor what progress is told, only the order in which methods take turns."""
+    """They change neither results nor the progress of a method, only the order in which methods alternate."""
     told = []
     shared = run_seeds(
         paper(duration=2.0),
@@ -114,7 +114,7 @@ def test_workers_change_nothing(results: SeedResults) -> None:
         workers=2,
     )
     assert [m.key for m in shared.methods] == ["scripted+pd", "fsams+pd"] and len(told) == 4
-    for key in ("scripted+pd", "fsams+pd"):  # what the workers tell arrives here, each method's in its order
+    for key in ("scripted+pd", "fsams+pd"):  # the workers' progress arrives here, in order for each method
         assert [step for step in told if step[0] == key] == [(key, 1), (key, 2)]
     for method, here in zip(shared.methods, results.methods[1::2], strict=True):
         assert [without_clock(r) for r in method.runs] == [without_clock(r) for r in here.runs[:2]]
@@ -132,7 +132,7 @@ def test_progress_and_rows_grow_with_methods_times_seeds(results: SeedResults, t
 
 
 def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
-    """A drag a million times the published one throws every episode out of the physical range; the rest is reported."""
+    """A drag a million times the published one drives every episode out of the physical range; each is reported as failed."""
     wild: Scenario = paper(duration=2.0, disturbance=PaperDrag(1e6))
     results = run_seeds(wild, ("scripted",), ("pd", "sorlc"), seed_range(3))
     for method in results.methods:
@@ -149,7 +149,7 @@ def test_divergence_is_an_outcome_on_every_seed_it_happens() -> None:
 
 
 def test_a_limited_law_that_never_leaves_its_limit_has_failed() -> None:
-    """A wind of 300 N against 200 N; an unlimited law stands it and finishes."""
+    """A wind of 300 N exceeds the limit of 200 N; an unlimited law withstands it and finishes."""
     windy = paper(duration=5.0, disturbance=ConstantWind(force=(300.0, 0.0)), perturbation=Perturbation(start_spread=0.1))
     limited, unlimited = run_seeds(windy, ("scripted",), ("pd", "finite-time"), (0, 1)).methods
     assert all("saturated forever: agent 1, 2, 3, 4 at the force limit of 200 N" in str(run.failure) for run in limited.runs)
@@ -178,7 +178,7 @@ def test_tables_name_who_failed_and_why(failing: SeedResults) -> None:
 
 
 def test_summary_has_medians_with_intervals_beside_them(results: SeedResults) -> None:
-    """Keys are those of one episode, each with ``_ci``; the value of every median is NumPy's own."""
+    """Keys are those of one episode, each also with ``_ci``; every median equals NumPy's."""
     content = seed_summary(results, analyse(results), {"mujoco": "3.17"})
     assert content["schema"] == 1 and content["seeds"] == [0, 1, 2, 3] and content["reference"] == "scripted+sorlc"
     assert list(content["methods"]) == ["scripted+sorlc", "scripted+pd", "fsams+sorlc", "fsams+pd"]
@@ -206,7 +206,7 @@ def test_one_draw_has_no_interval(tmp_path: Path) -> None:
 
 
 def test_report_leaves_whole_files(failing: SeedResults, tmp_path: Path) -> None:
-    """Every file of the folder, a page that names failures and needs no other file, and a figure."""
+    """The folder has every file; the page names failures and needs no other file, and there is a figure."""
     page = write_seed_report(failing, tmp_path, config=CONFIG)
     names = {path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()}
     assert names == {"summary.json", "episodes.csv", "tables.md", "tables.tex", "index.html"} | {
@@ -221,7 +221,7 @@ def test_report_leaves_whole_files(failing: SeedResults, tmp_path: Path) -> None
 
 
 def test_the_page_grows_as_methods_end(results: SeedResults, tmp_path: Path) -> None:
-    """A method is shown once all its draws have ended; until the reference has, others are compared with the first that has."""
+    """A method is shown once all its draws have ended; until the reference's have, the first finished method replaces it."""
     results = replace(results, methods=results.methods[:2])
     study = DrawsStudy(results.scenario, tuple((m.supervisor, m.controller) for m in results.methods), results.seeds)
     tell = growing_page(study, tmp_path, CONFIG)
@@ -240,7 +240,7 @@ def test_report_without_figures(failing: SeedResults, tmp_path: Path) -> None:
 
 
 def test_a_method_that_cannot_start_is_a_row_on_every_seed(tmp_path: Path) -> None:
-    """The oracle has no schedule for a draw, and a step of 25 ms is too long for some laws: the rest runs."""
+    """The oracle has no schedule for a draw, and a step of 25 ms is too long for some laws; the other methods run."""
     methods = [("scripted", "lqr"), ("oracle", "lqr"), ("scripted", "pd")]
     results = run_methods(paper(duration=0.5, substep=0.025), methods, (0, 1))
     ran, oracle, unstable = results.methods
@@ -257,13 +257,13 @@ def test_a_method_that_cannot_start_is_a_row_on_every_seed(tmp_path: Path) -> No
 
 
 def test_captions_flag_too_few_draws(results: SeedResults) -> None:
-    """Four draws have intervals that are too narrow, and every table says so."""
+    """Four draws give intervals that are too narrow, and every caption states it."""
     tables = make_seed_tables(results, analyse(results))
     assert all("(only 4 draws: intervals are too narrow)" in table.caption for table in tables)
 
 
 def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, failing: SeedResults) -> None:
-    """One supervisor with two controllers is one pooled row beside nothing."""
+    """One supervisor with two controllers gives a single pooled row, with nothing to compare."""
     assert "seeds-groups" in [table.name for table in make_seed_tables(results, analyse(results))]
     assert "seeds-groups" not in [table.name for table in make_seed_tables(failing, analyse(failing))]
 

@@ -1,6 +1,4 @@
-"""Set-based composition: avoidance holds for any desired velocity, orders keep their meaning, and every view of a world
-composes alike.
-"""
+"""Set-based composition: avoidance holds for any desired velocity, orders keep their meaning, and all simulators agree."""
 
 from dataclasses import replace
 
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 from marlbc_mj import tasks
 from marlbc_mj.controllers import SORLC
 from marlbc_mj.core.barriers import Barrier, bound_obstacles
-from marlbc_mj.core.braking import brake, least_distance, restrain, stopping_time
+from marlbc_mj.core.braking import brake, least_distance, path_time, restrain
 from marlbc_mj.engine.composition import PLANE_ROWS, WORKSPACE, compose_team, keep, limit
 from marlbc_mj.engine.inequalities import BARRIER_MARGIN, BARRIER_RATE, BARRIER_REACH, BARRIER_SPEED, make_barrier, workspace_rows
 from marlbc_mj.engine.plan import make_behaviors
@@ -35,7 +33,7 @@ LIMITS = {"speed_limit": 1.5, "acceleration_limit": 1.5}
 
 
 def crowd(rng: np.random.Generator, **changes) -> Scenario:
-    """Five agents at rest among discs, all clear of each other, with slots that lie on the other side of the others."""
+    """Five agents at rest among discs, all clear of each other, with random slots among them."""
     distance, agents = 1.0, 5
     placed: list[np.ndarray] = []
     while len(placed) < agents:
@@ -56,7 +54,7 @@ def crowd(rng: np.random.Generator, **changes) -> Scenario:
 
 
 def references(scenario: Scenario, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """p_r (T + 1, N, 2) [m] and v_r (T + 1, N, 2) [m/s] under orders (T, N), from rest, as the loop makes them."""
+    """p_r (T + 1, N, 2) [m] and v_r (T + 1, N, 2) [m/s] under orders (T, N), from rest, as the loop computes them."""
     behaviors = make_behaviors(scenario)
     workspace, grid, obstacles = np.zeros((workspace_rows(scenario), 2)), np.zeros(0), scenario.obstacle_array()
     places, velocities = [np.array(scenario.starts)], [np.zeros((scenario.agents, 2))]
@@ -80,7 +78,7 @@ def room(scenario: Scenario, places: np.ndarray) -> tuple[float, float]:
 
 
 def random_orders(scenario: Scenario, rng: np.random.Generator, steps: int) -> np.ndarray:
-    """(T, N) orders that each agent changes at random every 1 s or so."""
+    """(T, N) orders that change at random about once per second, for each agent separately."""
     orders = np.zeros((steps, scenario.agents), dtype=np.int64)
     for i in range(scenario.agents):
         for t in range(steps):
@@ -95,7 +93,7 @@ def random_orders(scenario: Scenario, rng: np.random.Generator, steps: int) -> n
 @given(seeds)
 @settings(max_examples=40)
 def test_references_never_use_up_the_margin(seed):
-    """d >= d_OA + m and d_ij >= d_AA + m for random discs, slots and orders: (1 - alpha T) of the room is left in every step."""
+    """d >= d_OA + m and d_ij >= d_AA + m for random discs, slots and orders: every step leaves (1 - alpha T) of the room."""
     rng = np.random.default_rng(seed)
     scenario = crowd(rng)
     places, velocities = references(scenario, random_orders(scenario, rng, 200))
@@ -107,7 +105,7 @@ def test_references_never_use_up_the_margin(seed):
 @given(seeds)
 @settings(max_examples=40)
 def test_references_of_limited_acceleration_never_use_it_up_either(seed):
-    """The same while |v_r| <= V and |dv_r| <= A T hold: braking stays possible whatever the orders are."""
+    """The same holds with |v_r| <= V and |dv_r| <= A T: braking remains possible under any orders."""
     rng = np.random.default_rng(seed)
     scenario = crowd(rng, **LIMITS)
     places, velocities = references(scenario, random_orders(scenario, rng, 200))
@@ -125,9 +123,7 @@ BRAKING = Barrier(
 
 @given(seeds)
 def test_any_wish_can_be_braked(seed):
-    """Hostile desired velocities, up to 8 m/s and new in every step, four agents, discs, no half-planes at all: braking alone
-    keeps d.
-    """
+    """Braking alone, without half-planes, keeps d for four agents among discs with hostile desired velocities up to 8 m/s."""
     rng = np.random.default_rng(seed)
     at = np.array([(-6.0, 0.0), (6.0, 0.0), (0.0, 6.0), (0.0, -6.0)]) + rng.uniform(-1, 1, (4, 2))
     discs = np.array([(0.0, 0.0, 2.0), *((*rng.uniform(9.3, 11) * u, 1.0) for u in np.eye(2))])
@@ -149,13 +145,13 @@ def test_any_wish_can_be_braked(seed):
 
 @given(st.floats(1e-6, 20.0), st.floats(0.5, 10.0), st.floats(0.02, 0.2))
 def test_ways_to_rest_are_nested(speed, braking, duration):
-    """L(s) >= s T + L(s - A T): after one mission step of braking, what is left was foreseen; and L is what braking takes."""
+    """L(s) >= s T + L(s - A T): after a mission step of braking, the rest was foreseen; and L is the way that braking takes."""
     barrier = BRAKING._replace(braking=braking, duration=duration)
     left, made = speed, 0.0
-    way = speed * stopping_time(speed, 0.0, barrier)
+    way = speed * path_time(speed, 0.0, barrier)
     while left > 0.0:
         made += left * duration
-        assert way >= made + brake(left, 0.0, barrier)[0] * stopping_time(*brake(left, 0.0, barrier), barrier) - 1e-9 * (1 + way)
+        assert way >= made + brake(left, 0.0, barrier)[0] * path_time(*brake(left, 0.0, barrier), barrier) - 1e-9 * (1 + way)
         left = brake(left, 0.0, barrier)[0]
     assert made <= way + 1e-9
     assert way <= made + braking * duration**2 / 8 + 1e-9
@@ -163,7 +159,7 @@ def test_ways_to_rest_are_nested(speed, braking, duration):
 
 @given(seeds)
 def test_the_braking_form_is_enough(seed):
-    """|v| max(0, -n . v) <= 2 A (d - D) keeps the whole way at D from a disc, as the mission step goes to zero."""
+    """|v| max(0, -n . v) <= 2 A (d - D) keeps the whole braking path at least D from a disc, for mission steps near zero."""
     rng = np.random.default_rng(seed)
     barrier = BRAKING._replace(duration=1e-9)
     p, radius, distance = rng.uniform(-10, 10, 2), rng.uniform(0, 3), 1.0
@@ -172,13 +168,13 @@ def test_the_braking_form_is_enough(seed):
     approach = max(0.0, -(p / np.linalg.norm(p)) @ v)
     if gap < 0 or np.linalg.norm(v) * approach > 2.0 * barrier.braking * gap:
         return
-    way = v * stopping_time(*v, barrier)
+    way = v * path_time(*v, barrier)
     assert least_distance(*p, *way, 0.0, 0.0) >= radius + distance - 1e-6
 
 
 @given(seeds)
 def test_least_distance_of_two_ways_is_the_least_over_a_grid(seed):
-    """Never above any pair of sampled points, and near the nearest of them."""
+    """It is never above the distance of any sampled pair of points, and close to the smallest of these."""
     rng = np.random.default_rng(seed)
     r, a, b = rng.normal(size=(3, 2)) * rng.choice([0.0, 1.0, 3.0], size=(3, 1))
     s = np.linspace(0, 1, 201)
@@ -189,7 +185,7 @@ def test_least_distance_of_two_ways_is_the_least_over_a_grid(seed):
 
 
 def test_half_planes_of_one_disc():
-    """At 2 m from a disc's middle (radius 0.5, d_OA 1): room 0.4, so n . v >= -1.6; with the disc's (1, 2) m/s, one more."""
+    """2 m from a disc's center (radius 0.5, d_OA 1) the room is 0.4 m, so n . v >= -1.6, or -0.6 if it moves at (1, 2) m/s."""
     barrier = Barrier(BARRIER_RATE, BARRIER_MARGIN, BARRIER_REACH, BARRIER_SPEED, np.inf, 0.05, 1.0, 0.0)
     planes, p = np.zeros((2, 4)), np.array([2.0, 0.0])
     far = [10.0, 0.0, 0.5]
@@ -203,7 +199,7 @@ def test_half_planes_of_one_disc():
 
 
 def test_far_from_everything_the_reference_is_the_complete_behavior():
-    """Nothing within reach: v_r is FM's or FR's to the bit, no longer than 6 m/s, whatever stands above it."""
+    """With nothing within reach, v_r is FM's or FR's, limited to 6 m/s, whichever behavior is above it."""
     scenario, null_space = paper(**SET_BASED), make_behaviors(paper())
     behaviors, at = make_behaviors(scenario), scenario.formations[0] + (-60.0, 0.1)
     for name, alone in (("FM", "FM"), ("OA>FM", "FM"), ("FR", "FR"), ("OA>FR", "FR")):
@@ -216,7 +212,7 @@ def test_far_from_everything_the_reference_is_the_complete_behavior():
 
 
 def test_of_two_that_contradict_the_first_wins():
-    """An agent between a disc and another agent, too near to both: OA first keeps off the disc, AA first off the agent."""
+    """For an agent too close to a disc and to another agent, OA first moves it off the disc, AA first off the agent."""
     scenario = replace(
         crowd(np.random.default_rng(0)),
         starts=((0.0, 0.0), (1.0, 0.0), (20.0, 0.0), (30.0, 0.0), (40.0, 0.0)),
@@ -237,7 +233,7 @@ def test_of_two_that_contradict_the_first_wins():
 
 
 def test_orders_of_one_command_give_one_motion():
-    """What counts as no switch moves nobody differently, where everything contradicts too."""
+    """A change that does not count as a switch changes no motion, even where all behaviors contradict each other."""
     rng = np.random.default_rng(3)
     scenario = crowd(rng)
     behaviors, orders = make_behaviors(scenario), scenario.orders
@@ -259,7 +255,7 @@ FM_ALONE = Scripted((Window(0.0, 0.0, -1, "FM"),))
 
 @pytest.mark.parametrize("family", ["field", "forest", "traffic"])
 def test_formation_maintenance_alone_flies_the_mission_without_a_violation(family):
-    """Three held-out layouts each, with the measured positions: every agent ends in its slot, and no clearance is violated."""
+    """On three held-out layouts per family, by measured positions, every agent ends in its slot without a violation."""
     scenario = make_scenario(family, split="test", **SET_BASED)
     world = World(scenario, record=True)
     for seed in range(3):
@@ -267,7 +263,7 @@ def test_formation_maintenance_alone_flies_the_mission_without_a_violation(famil
 
 
 def test_all_views_of_a_world_compose_alike():
-    """Compiled loop = Python path = dm_control, to the bit, over an episode with switches among obstacles that move."""
+    """Compiled loop, Python path and dm_control are identical over an episode with switches among moving obstacles."""
     scenario = make_scenario("traffic", duration=20.0, layout=None, **SET_BASED)
     compiled, python = (World(scenario, native=native) for native in (True, False))
     environment = tasks.load("formation", "traffic", random_state=0, duration=20.0, layout=None, **SET_BASED)
@@ -283,7 +279,7 @@ def test_all_views_of_a_world_compose_alike():
 
 
 def test_worlds_of_a_batch_are_those_alone():
-    """Three draws together and each by itself, to the bit; with an acceleration limit, so that references have a memory."""
+    """Three draws together and each alone are identical; an acceleration limit gives references a memory."""
     scenario = make_scenario("field", duration=10.0, speed_limit=3.0, acceleration_limit=3.0, **SET_BASED)
     together = World(scenario, worlds=3)
     together.reset(5)
@@ -298,7 +294,7 @@ def test_worlds_of_a_batch_are_those_alone():
 
 
 def test_predictions_compose_as_the_mission_does():
-    """MPCMS on a set-based scenario: it decides, keeps FM, and violates nothing."""
+    """MPCMS flies a set-based scenario without a violation."""
     scenario = make_scenario("field", split="test", duration=15.0, **SET_BASED)
     trajectory = run_episode(World(scenario, record=True), make_supervisor("mpcms"), seed=1)
     assert not outcome(measure(trajectory), scenario).violated
@@ -308,7 +304,7 @@ def test_predictions_compose_as_the_mission_does():
 
 
 def test_the_composition_is_a_setting_of_every_kind_of_scenario(tmp_path):
-    """By name, from a file, for a family and point by point; what does not fit is refused by name."""
+    """It can be set in Python and in a file, for families and single missions; values that do not fit are refused."""
     assert all(make_scenario(name).composition == "null-space" for name in ("paper", "cruise", "field", "robot_gate"))
     assert all(make_scenario(name, **SET_BASED).composition == "set-based" for name in ("paper", "forest", "robot_gate"))
     file = tmp_path / "mine.toml"
@@ -321,7 +317,7 @@ def test_the_composition_is_a_setting_of_every_kind_of_scenario(tmp_path):
 
 
 def test_barriers_have_the_robots_scale():
-    """A robot's unit scales lengths, its limits bound speed and rate; room for half-planes is that of obstacles and team."""
+    """A robot's unit scales lengths, its limits bound speed and rate; the workspace fits half-planes of obstacles and team."""
     barrier = make_barrier(make_scenario("field"))
     assert barrier[:5] == (BARRIER_RATE, BARRIER_MARGIN, BARRIER_REACH, BARRIER_SPEED, np.inf)
     assert (barrier.obstacle_distance, barrier.agent_distance) == (1.0, 1.5)
@@ -334,7 +330,7 @@ def test_barriers_have_the_robots_scale():
 
 
 def test_logs_and_provenance_name_the_composition(tmp_path):
-    """The metadata of a log and the configuration in it."""
+    """A log's metadata and the provenance of a configuration name it."""
     scenario = make_scenario("field", duration=0.1, **SET_BASED)
     path = tmp_path / "run.mcap"
     config = {"scenario": scenario}

@@ -1,4 +1,4 @@
-"""Settings: rules beside fields, and values from tables, JSON data and texts; every fault says where, what and what is valid."""
+"""Settings: rules of fields, values from tables, JSON data and texts; every error gives the place, the fault and valid values."""
 
 import math
 import re
@@ -32,7 +32,7 @@ class Inner:
 
 @dataclass(frozen=True)
 class Outer:
-    """One field of every kind."""
+    """A dataclass with one field of every kind."""
 
     count: Annotated[int, AT_LEAST_ONE]
     kind: Literal["a", "b"] = "a"
@@ -97,7 +97,7 @@ def test_what_is_wrong_in_a_table_is_named_with_its_place(table, message):
 
 @given(st.floats())
 def test_rules_hold_for_every_number(value):
-    """Not a number breaks all of them."""
+    """NaN breaks all of them."""
     finite = not math.isnan(value)
     assert SHARE.holds(value) == (0 <= value <= 1) and POSITIVE.holds(value) == (value > 0)
     assert AT_LEAST_ONE.holds(value) == (value >= 1) and NOT_NEGATIVE.holds(value) == (finite and not value < 0)
@@ -109,7 +109,7 @@ def test_a_broken_rule_names_the_field_with_its_prefix():
 
 
 def test_json_data_make_an_equal_dataclass():
-    """Of every kind of field, where it is infinite by default too."""
+    """This holds for every kind of field, including one with an infinite default."""
     whole = Outer(2, "b", True, "n", 4.0, 3.0, (1.0, 2.5), (Point(1.0), Point(2.0, 3.0)))
     for made in (Outer(1), whole):
         data = plain_data(made)
@@ -119,7 +119,7 @@ def test_json_data_make_an_equal_dataclass():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_json_data_make_an_equal_configuration(preset):
-    """Also where a number is infinite or a whole one stands for it; what is missing has its default."""
+    """This includes infinite numbers and whole numbers in float fields; missing fields get their defaults."""
     for config in (PRESETS[preset][0], make_config(preset, gamma=0, threads=3)):
         data = plain_data(config)
         assert from_json(data) == config and plain_data(from_json(data)) == data
@@ -164,22 +164,22 @@ def test_texts_that_are_no_setting_are_refused(setting, fragments):
 
 
 def test_texts_are_read_by_the_fields_they_are_for():
-    """Whole numbers for a field of floats too, and infinity."""
+    """A field of floats accepts whole numbers and infinity too."""
     together = with_settings(TrainConfig(), ("worlds=100000", "capacity=1000000", "shaping.dwell=3", "shaping.margin=0.2"))
-    assert (together.rows, together.shaping.dwell, together.shaping.margin) == (10, 3.0, 0.2)  # neither alone would do
+    assert (together.rows, together.shaping.dwell, together.shaping.margin) == (10, 3.0, 0.2)  # neither alone would be valid
     config = with_settings(TrainConfig(), ("huber=inf", "cool_by=1", "state=published", "shaping.dwell=2", "dueling=FALSE"))
     assert (config.huber, config.cool_by, config.state, config.dueling) == (math.inf, 1.0, "published", False)
     assert config.shaping.dwell == 2.0 and type(config.cool_by) is float
 
 
 def test_the_choices_of_a_configuration_are_those_that_there_are():
-    """State and action set, whose tables live elsewhere."""
+    """Choices of state and action set are those of the tables in other modules."""
     hints = get_type_hints(TrainConfig)
     assert set(get_args(hints["state"])) == set(STATES) and set(get_args(hints["actions"])) == set(ACTIONS)
 
 
 def test_converters_are_independent():
-    """What one of them takes for a number, another does not."""
+    """One converter accepts a text as a number, others do not."""
     assert convert(texts(), "3", float) == 3.0 and convert(json_data(), "inf", float) == math.inf
     for converter in (tables(), json_data()):
         with refusal("size must be a number, got '3'"):

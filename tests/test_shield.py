@@ -1,4 +1,4 @@
-"""The shield: the set of states from which agents can stop is left by no force, disturbance, supervisor or number of agents."""
+"""The shield: no force, disturbance, supervisor or number of agents leads out of the set of states from which agents can stop."""
 
 import json
 from dataclasses import dataclass, replace
@@ -31,7 +31,7 @@ from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError
 
 STRONG = Trial(ForceBound(linear=5.0 * np.sqrt(2.0)), speed_cap=14.0)
-"""The drag (43), five times: at the speed cap it takes half of the force limit."""
+"""Five times the drag (43), which takes half of the force limit at the speed cap."""
 
 
 @pytest.mark.parametrize(
@@ -39,13 +39,13 @@ STRONG = Trial(ForceBound(linear=5.0 * np.sqrt(2.0)), speed_cap=14.0)
 )
 @pytest.mark.parametrize("substep", [0.005, 0.001])
 def test_no_force_within_its_bound_leads_out_of_the_safe_set(bound, substep):
-    """Random states on the edge of S, hostile forces, f at its bound in the worst direction: one obstacle, or one neighbor."""
+    """Random states on the edge of S, near an obstacle or a neighbor, with hostile forces and f at its bound, worst direction."""
     assert leave_rate(Trial(bound, speed_cap=14.0, substep=substep, things=1), 100_000, seed=1) == 0.0
 
 
 @pytest.mark.parametrize("bound", [STRONG.bound, ForceBound(20.0, 1.0)], ids=str)
 def test_several_things_at_once_cost_no_more_than_the_creep_in_the_margin(bound):
-    """Where an agent is slower than f pushes it within a substep, and several things press, it may drift by h^2 B / m."""
+    """Near several things, an agent slower than f's push within a substep may drift by h^2 B / m."""
     assert leave_rate(Trial(bound, speed_cap=14.0, things=4), 100_000, seed=2) == 0.0
 
 
@@ -58,12 +58,12 @@ def test_several_things_at_once_cost_no_more_than_the_creep_in_the_margin(bound)
     ids=["brakes that are thought 10 % too strong", "a bound of half the disturbance"],
 )
 def test_the_same_states_find_a_wrong_assumption(wrong):
-    """Teeth: the test above fails for a shield that brakes too late."""
+    """The first test above fails for a shield that brakes too late."""
     assert leave_rate(wrong._replace(things=1), 100_000, seed=1) > 0.001
 
 
 def test_braking_ends_within_the_stopping_distance():
-    """The path of full braking against f at its bound is at most L, and not much less where f is constant."""
+    """The path of full braking against f at its bound is at most L, and not much less if f is constant."""
     numbers = ShieldNumbers(200.0, np.inf, 2.0, 30.0, 0.0, 0.0, np.inf, 0.0, 0.0, 0.0)
     speed, path, h = 10.0, 0.0, 1e-5
     while speed > 0.0:
@@ -79,7 +79,7 @@ def test_braking_ends_within_the_stopping_distance():
     ids=lambda d: type(d).__name__,
 )
 def test_no_disturbance_exceeds_its_bound(disturbance):
-    """At random times, positions and velocities; for all but gusts, whose sines do not peak together, the bound is reached."""
+    """Times, positions and velocities are random; all but gusts, with sines that do not peak together, nearly reach the bound."""
     rng, out, worst = np.random.default_rng(0), np.zeros(2), 0.0
     bound = disturbance.force_bound()
     gains = laws.as_gains(disturbance.law, disturbance.params())
@@ -92,12 +92,12 @@ def test_no_disturbance_exceeds_its_bound(disturbance):
 
 
 def test_every_disturbance_has_a_bound():
-    """So that True is a shield in every scenario that is shipped."""
+    """So ``shield=True`` is possible in every shipped scenario."""
     assert all(isinstance(make().force_bound(), ForceBound) for make, _ in DISTURBANCES.values())
 
 
 def corridor(**changes):
-    """Four agents in a tight place among the case study's obstacles and a few more."""
+    """Four agents in a tight place among six obstacles."""
     discs = ((20.0, 0.0, 3.0), (20.0, 12.0, 2.0), (28.0, 6.0, 0.0), (12.0, 6.0, 1.0), (28.0, -4.0, 2.0), (12.0, -5.0, 0.0))
     starts = ((15.0, 3.0), (25.0, 2.0), (15.0, 9.0), (24.5, 9.5))
     fields = {"obstacles": tuple(Obstacle(*d) for d in discs), "starts": starts, "perturbation": Perturbation(), "schedule": ()}
@@ -109,7 +109,7 @@ PLACES = tuple((o.x, o.y, o.radius) for o in corridor().obstacles)
 
 @laws.disturbance(gains={"scale": (), "places": (len(PLACES), 3), "constant": (), "linear": ()})
 def towards_nearest(gains, t, p, v, force_out):
-    """As strong as its bound allows, towards the nearest obstacle."""
+    """A force towards the nearest obstacle, ``scale`` times its bound."""
     best = np.inf
     for k in range(gains.places.shape[0]):
         x, y = gains.places[k, 0] - p[0], gains.places[k, 1] - p[1]
@@ -143,7 +143,7 @@ def harass(world, steps=300, seed=0, speed=15.0):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_nothing_is_hit_under_a_hostile_supervisor_and_a_hostile_disturbance(seed):
-    """In MuJoCo, at every substep: strictly more than the safe distance, and no two agents touch. Without a shield they do."""
+    """In MuJoCo, at every substep, clearances exceed the safe distance and no two agents touch. Without a shield both fail."""
     scenario = corridor(disturbance=Hostile())
     safe = World(scenario, PD(), record=True, shield=True)
     clearance, distance = harass(safe, seed=seed)
@@ -158,7 +158,7 @@ def test_nothing_is_hit_under_a_hostile_supervisor_and_a_hostile_disturbance(see
 
 @pytest.mark.parametrize("scale", [1.0, 5.0])
 def test_the_case_study_is_flown_without_a_violation(scale):
-    """By the schedule, which grazes the safe distance without a shield: no substep at or inside it."""
+    """Under the schedule, which grazes the safe distance without a shield, no substep is at or inside it."""
     scenario = paper(disturbance=PaperDrag(scale))
     trajectory = run_episode(World(scenario, SORLC(), record=True, shield=True), make_supervisor("scripted"))
     assert trajectory.clearances().min() > scenario.safe_distance
@@ -168,7 +168,7 @@ def test_the_case_study_is_flown_without_a_violation(scale):
 
 
 def test_compiled_loop_and_python_path_agree_bit_for_bit():
-    """One law, written once."""
+    """Both run the same source."""
     worlds = [World(corridor(disturbance=Hostile()), PD(), record=True, shield=True, native=native) for native in (True, False)]
     assert harass(worlds[0], steps=12) == harass(worlds[1], steps=12)
     for name in ("position", "velocity", "interventions", "force_change", "breaches"):
@@ -208,7 +208,7 @@ def test_a_wish_that_stays_safe_is_left_alone_bit_for_bit():
 
 
 def test_a_snapshot_has_the_counts_too():
-    """Restored, a world counts on from where it was."""
+    """A restored world continues its counts from those of the snapshot."""
     world = World(corridor(disturbance=Hostile()), PD(), record=True, shield=True)
     harass(world, steps=30)
     kept = world.snapshot()
@@ -228,7 +228,7 @@ def test_a_snapshot_has_the_counts_too():
     ids=["drag x 20", "half of the actuators is lost"],
 )
 def test_a_world_outside_the_assumptions_is_counted(changes, shield):
-    """Apart, by the assumption that does not hold; inside them nothing is counted."""
+    """Breaches are counted per assumption; if all assumptions hold, nothing is counted."""
     world = World(corridor(**changes), PD(), record=True, shield=shield)
     harass(world, steps=60, speed=4.0)
     assert ASSUMPTIONS[FORCE_BROKEN] == "force"
@@ -239,14 +239,14 @@ def test_a_world_outside_the_assumptions_is_counted(changes, shield):
 
 
 def refusal(scenario, shield=True):
-    """What a world says that cannot have this shield."""
+    """The error message of a world that cannot have this shield."""
     with pytest.raises(ConfigurationError) as refused:
         World(scenario, PD(), shield=shield)
     return str(refused.value)
 
 
 def test_assumptions_are_checked_when_a_world_is_made():
-    """With the number that breaks them."""
+    """The error names the number that breaks them."""
     case = paper()
     assert "at most 50 N" in refusal(replace(case, disturbance=PaperDrag(40.0)))
     assert "speed cap of 150 m/s" in refusal(case, Shield(speed_cap=150.0))
@@ -262,14 +262,14 @@ def test_assumptions_are_checked_when_a_world_is_made():
 
 
 def test_the_bound_is_that_of_the_greatest_drag_that_is_drawn():
-    """Not of the nominal one."""
+    """The nominal drag does not decide it."""
     drawn = paper(perturbation=Perturbation(drag_scale=(0.0, 2.0)))
     assert resolve(Shield(), drawn, 200.0).linear == pytest.approx(2.0 * np.sqrt(2.0))
     assert resolve(Shield(), paper(), 200.0).clearance == pytest.approx(2.0 + 1e-3 + LEAST_CREEP)
 
 
 def test_a_log_has_what_the_shield_did(tmp_path):
-    """Every mission step, on a topic with a schema."""
+    """It has the shield's counts at every mission step, on a topic with a schema."""
     scenario = paper(duration=20.0)
     world = World(scenario, SORLC(), record=True, shield=True)
     names = ("fsams", "sorlc")
@@ -294,7 +294,7 @@ def test_a_log_has_what_the_shield_did(tmp_path):
 
 
 def test_a_log_without_a_shield_says_that_nobody_was_changed(episode):
-    """An empty table, not a table of zeros."""
+    """Its table of counts is empty, not a table of zeros."""
     log = from_trajectory(episode("scripted", "sorlc"), SORLC())
     assert log.shield.shape == (len(log.time), 0, 2 + len(ASSUMPTIONS))
     assert log.intervened(3).shape == (0,)

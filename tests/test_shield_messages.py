@@ -1,4 +1,4 @@
-"""Agents with a shield whose messages are late or lost: a stamp is shared at every moment, so no two touch."""
+"""Shields with late or lost messages: two agents share a live stamp at every moment, so they never touch."""
 
 from itertools import product
 
@@ -14,34 +14,34 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.util.errors import ConfigurationError
 
 START = (0.0, NEVER_STAMPED)
-"""Live stamps at the start, which both share: the newest, the older."""
+"""Initial live stamps, which both agents share: the newest and the older one."""
 PLANE = np.zeros(3)
 
 
 def received(live, message, fits):
-    """Live stamps after a message (sent, newest): the very law that worlds run."""
+    """Live stamps after a message (sent, newest), by the law that worlds run."""
     stamps = np.array(live)
     plain(receive)(stamps, np.zeros((2, 3)), *message, PLANE, PLANE, *fits)
     return tuple(stamps.tolist())
 
 
 def hasty(live, message, fits):
-    """A law that is wrong on purpose: it proposes a stamp and drops the one that is shared, one message too early."""
+    """A deliberately wrong law: as it proposes a stamp, it drops the shared one, one message too early."""
     return received(live, message, fits)[NEWEST], NEVER_STAMPED
 
 
 def forgetful(live, message, fits):
-    """Another: it takes any message of the other for a confirmation of its own newest stamp."""
+    """Another wrong law: it takes any message from the other agent as a confirmation of its own newest stamp."""
     return received((live[NEWEST], NEVER_STAMPED), message, fits)
 
 
 def on_the_way(messages, more):
-    """Messages that may still arrive: of those on the way the newest three, each of which may yet be lost, late or overtaken."""
+    """Messages that may still arrive: the newest three under way, each of which may be lost, late or overtaken."""
     return frozenset(sorted({*messages, *more})[-3:])
 
 
 def moves_of(state, law):
-    """All states that one event leads to: both send, or one receives a message, whether the agent is inside its planes or not.
+    """Yield all states that one event leads to: both send, or one receives a message, inside its planes or not.
 
     A state is (time, live stamps of both, messages on the way to each). A message that is never received is lost.
     """
@@ -57,7 +57,7 @@ def moves_of(state, law):
 
 
 def explore(law, last):
-    """(states tried, the first that shares no stamp or None) of every order of events up to the time ``last``."""
+    """Try every order of events up to the time ``last``; return the number of states and the first without a shared stamp."""
     start = (0.0, (START, START), (frozenset(), frozenset()))
     seen, open_states = {start}, [start]
     while open_states:
@@ -73,7 +73,7 @@ def explore(law, last):
 
 
 def test_whatever_is_late_lost_or_overtaken_both_share_a_live_stamp():
-    """Every order of send, lose, deliver, adopt, confirm and propose to a depth; at most two stamps are live."""
+    """It holds for every order of send, lose, deliver, adopt, confirm and propose up to a depth, with at most two live stamps."""
     states, broken = explore(received, last=4.0)
     assert broken is None
     assert states > 4_000
@@ -81,12 +81,12 @@ def test_whatever_is_late_lost_or_overtaken_both_share_a_live_stamp():
 
 @pytest.mark.parametrize("wrong", [hasty, forgetful])
 def test_a_stamp_that_is_dropped_too_early_is_found(wrong):
-    """Teeth: the same search finds the state that shares nothing."""
+    """The same search finds a state without a shared stamp."""
     assert explore(wrong, last=4.0)[1] is not None
 
 
 def test_stamps_move_on_where_messages_arrive():
-    """Safe would be to keep the first stamp forever, too."""
+    """Safety alone would not require it: keeping the first stamp forever is safe too."""
     one, other = START, START
     for time in range(1, 50):
         one, other = (
@@ -107,7 +107,7 @@ MAILS = {
 
 @pytest.mark.parametrize("mail", MAILS.values(), ids=MAILS)
 def test_nothing_is_hit_whatever_messages_do(mail):
-    """In MuJoCo, under a hostile supervisor and a hostile disturbance, at every substep."""
+    """It holds in MuJoCo at every substep, under a hostile supervisor and a hostile disturbance."""
     scenario = corridor(disturbance=Hostile())
     world = World(scenario, PD(), record=True, shield=mail)
     clearance, distance = harass(world, steps=120, seed=1)
@@ -118,7 +118,7 @@ def test_nothing_is_hit_whatever_messages_do(mail):
 
 
 def test_compiled_and_python_worlds_exchange_the_same_messages():
-    """One law, written once; what is lost is drawn from the world's seed."""
+    """Both run the same source; lost messages are drawn from the world's seed."""
     shield = Shield(latency=0.01, message_loss=0.4)
     worlds = [World(corridor(), PD(), record=True, shield=shield, native=native) for native in (True, False)]
     for world in worlds:
@@ -130,7 +130,7 @@ def test_compiled_and_python_worlds_exchange_the_same_messages():
 
 
 def test_messages_that_cannot_be_are_refused():
-    """With the number that is wrong."""
+    """The error names the wrong number."""
     for wrong, said in (
         ({"latency": 0.003}, "latency of 0.003 s must be a whole multiple"),
         ({"silent": 7}, r"silent must be -1 \(none\) or 0 to 3, got 7"),

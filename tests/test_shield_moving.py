@@ -1,4 +1,4 @@
-"""A shield among obstacles that move: it stops relative to them. One alone is kept clear of; of several, failures are counted."""
+"""A shield among moving obstacles: it stops relative to them, keeps clear of a single one, and counts failures among several."""
 
 import numpy as np
 import pytest
@@ -17,17 +17,17 @@ AT_REST = Motion(0.0, 0.0, 0.0, 0.0, 10.0, 0.0)
 
 
 def test_one_obstacle_that_moves_within_its_bounds_leads_out_of_no_safe_state():
-    """Random states on the edge of S in the obstacle's frame, f and the obstacle's acceleration at their bounds."""
+    """States are random on the edge of S in the obstacle's frame, with f and the obstacle's acceleration at their bounds."""
     assert leave_rate(PURSUED, 100_000, seed=3) == 0.0
 
 
 def test_an_acceleration_that_is_not_believed_is_found():
-    """Teeth: the same states."""
+    """The same states detect that the shield believes in obstacles without acceleration."""
     assert leave_rate(PURSUED._replace(believed_acceleration=0.0), 100_000, seed=3) > 1e-4
 
 
 def test_an_agent_at_rest_gives_way_to_an_obstacle_that_comes():
-    """It is pushed along at the obstacle's speed, at the safe distance, and nobody else is."""
+    """It is pushed along at the obstacle's speed, outside the safe distance; the shield changes no other agent."""
     starts = ((0.0, 8.0), (0.0, 60.0), (0.0, 90.0), (0.0, 120.0))
     coming = Motion(-1.5, 0.0, 0.0, 0.0, 10.0, 0.0)
     scenario = paper(obstacles=(Obstacle(10.0, 8.0, 1.0),), motions=(coming,), starts=starts, schedule=(), duration=10.0)
@@ -44,7 +44,7 @@ def test_an_agent_at_rest_gives_way_to_an_obstacle_that_comes():
 
 
 def test_obstacles_that_could_move_but_do_not_change_nothing():
-    """One law: obstacles at rest are obstacles that move with velocity 0, up to where projections end (2 mm in 3 s of attack)."""
+    """Obstacles at rest equal obstacles with velocity 0, up to where projections stop (2 mm in 3 s of attack)."""
     scenario = corridor()
     moving = corridor(motions=(AT_REST,) * len(scenario.obstacles))
     shield = Shield(obstacle_speed=0.0, obstacle_acceleration=0.0)
@@ -56,7 +56,7 @@ def test_obstacles_that_could_move_but_do_not_change_nothing():
 
 
 def test_in_traffic_whoever_comes_too_near_was_counted_before():
-    """No violation without a breach that is counted apart; without a shield the same missions end badly."""
+    """Violations only occur with counted breaches; without a shield the same missions have more violations."""
     scenario = mission_of("traffic", 4, seconds=12.0)
     shielded, free = (run_missions(scenario, 8, seed=5, shield=shield) for shield in (True, None))
     assert free.violations > shielded.violations
@@ -75,6 +75,6 @@ def test_in_traffic_whoever_comes_too_near_was_counted_before():
     ],
 )
 def test_motions_that_are_not_assumed_are_refused(shield, said):
-    """With the number that breaks the assumption."""
+    """The error names the number that breaks the assumption."""
     with pytest.raises(ConfigurationError, match=said):
         World(make_scenario("traffic"), PD(), shield=shield)

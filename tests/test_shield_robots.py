@@ -1,4 +1,4 @@
-"""Shields of real robots: of forces where those act at once, of references within a measured or computed tube elsewhere."""
+"""Shields of real robots: of forces if these act at once, else of references within a measured or computed tube."""
 
 from dataclasses import replace
 
@@ -22,7 +22,7 @@ def limited(**changes):
 
 
 def crowded(robot):
-    """The gate of a robot, all close to its obstacles, so that a minute is not spent on the way there."""
+    """A robot's gate with all agents starting close to its obstacles, which saves the minute of the way there."""
     scenario = make_scenario("robot_gate", robot=robot)
     unit = make_robot(robot).length
     first = scenario.obstacles[0]
@@ -32,7 +32,7 @@ def crowded(robot):
 
 @pytest.mark.parametrize("robot", ["disc", "omni", "diff_drive", "crazyflie"])
 def test_robots_keep_clear_under_a_supervisor_that_means_harm(robot):
-    """In MuJoCo, at every substep, by their own numbers: no assumption is broken. Without a shield they hit something."""
+    """It holds in MuJoCo at every substep, with the robots' own numbers, and no assumption is broken."""
     scenario = crowded(robot)
     world = World(scenario, PD(*make_robot(robot).gains), record=True, shield=True)
     clearance, distance, off = attack(world, 240, speed=world.scenario.speed_limit, change=30)
@@ -46,7 +46,7 @@ def test_robots_keep_clear_under_a_supervisor_that_means_harm(robot):
 
 
 def test_references_of_point_masses_have_a_computed_tube():
-    """Nobody leaves it, and it is not three times too wide."""
+    """No agent leaves it, and it is less than three times as wide as needed."""
     world = World(limited(), PD(), record=True, shield=Shield(level="reference"))
     clearance, distance, off = attack(world, 240, speed=world.scenario.speed_limit, change=30)
     tube = world.plan.plant.shield[0].tube
@@ -59,7 +59,7 @@ def test_references_of_point_masses_have_a_computed_tube():
 
 
 def test_a_tube_that_is_too_narrow_is_counted():
-    """Whoever is farther from its reference than is assumed."""
+    """Agents farther from their references than the tube are counted."""
     world = World(limited(), PD(), record=True, shield=Shield(tube=1e-3))
     attack(world, 20, speed=world.scenario.speed_limit, change=30)
     assert world.state.breaches[..., TUBE_BROKEN].sum() > 0
@@ -86,13 +86,13 @@ def test_networks_that_are_off_have_the_tube_of_their_gains():
     ],
 )
 def test_what_a_shield_of_references_cannot_assume_is_refused(scenario, controller, shield, said):
-    """With the number that breaks it."""
+    """The error names what breaks the assumption."""
     with pytest.raises(ConfigurationError, match=said):
         World(scenario, controller, shield=shield)
 
 
 def test_a_robot_that_nobody_measured_is_told_what_is_missing(monkeypatch):
-    """Both numbers, and how to get them."""
+    """The error names both missing numbers and how to get them."""
     unknown = replace(make_robot("diff_drive"), name="unmeasured", tube=None)
     monkeypatch.setitem(ROBOTS, unknown.name, (lambda: unknown, ""))
     with pytest.raises(ConfigurationError, match="force_error is missing.*so is its tube.*shield_robots ROBOT"):

@@ -1,4 +1,4 @@
-"""The commands that put a shield to the test, each in small."""
+"""Small runs of the commands that test a shield."""
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ DRAG = float(np.sqrt(2.0))
 
 @pytest.mark.parametrize("bound", [ForceBound(), ForceBound(linear=5.0 * DRAG), ForceBound(20.0, 1.0)], ids=str)
 def test_the_safe_set_is_in_the_viability_kernel_and_nearly_all_of_it(bound):
-    """On a coarse grid, and in closed form; without a disturbance both are the same set."""
+    """It holds on a coarse grid and in closed form; without a disturbance both sets are the same."""
     found = kernel_shares(bound, nodes=61)
     assert found.outside == 0
     assert found.worst > -0.025
@@ -28,7 +28,7 @@ def test_the_safe_set_is_in_the_viability_kernel_and_nearly_all_of_it(bound):
 
 @pytest.mark.parametrize("family", ["field", "exchange"])
 def test_no_mission_fails_with_a_shield_and_some_do_without(family):
-    """A few seconds of a few missions, half of them attacked."""
+    """This runs a few seconds of a few missions, half of them attacked."""
     scenario = mission_of(family, 4, seconds=4.0)
     shielded, free = (run_missions(scenario, 4, seed=11, shield=shield) for shield in (True, None))
     assert (shielded.missions, shielded.failed, shielded.breaches.sum()) == (4, 0, 0.0)
@@ -37,7 +37,7 @@ def test_no_mission_fails_with_a_shield_and_some_do_without(family):
 
 
 SCRATCH_OF_A_SHIELD = {"grid": (1, 0), "looked": (1, 0, 3), "around": (1, 0, 1 + LISTED)}
-"""Parts of a team that only save time, and their shapes where there are none."""
+"""Parts of a team's state that only save time, and their shapes when empty."""
 
 
 LOOK_OUT = ("looked", "around")
@@ -45,7 +45,7 @@ LOOK_OUT = ("looked", "around")
 
 @pytest.mark.parametrize(("agents", "missing"), [(48, ("grid",)), (48, ("grid", *LOOK_OUT)), (48, LOOK_OUT), (5, LOOK_OUT)])
 def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agents, missing):
-    """Bit for bit: both only say early that nothing is near."""
+    """Results are identical to the last bit: both only find out early that nothing is near."""
     large = {"radius": (0.3, 0.6), "gap": 2.5, "length": 140.0} if agents == 48 else {}
     scenario = make_scenario("field", agents=agents, formation="grid", obstacles=agents, **large)
     worlds = [World(scenario, PD(), record=True, shield=True) for _ in range(2)]
@@ -56,7 +56,7 @@ def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agent
     )
     worlds[1]._hand_over()
     for name in missing:
-        assert getattr(worlds[1]._loop.arguments.team, name).size == 0  # the loop's own
+        assert getattr(worlds[1]._loop.arguments.team, name).size == 0  # in the loop's own arguments
     rng = np.random.default_rng(0)
     for step in range(30):
         together = worlds[0].state.position.mean(axis=1, keepdims=True) - worlds[0].state.position
@@ -69,7 +69,7 @@ def test_a_team_is_shielded_by_grids_and_a_look_out_as_by_trying_all_pairs(agent
 
 
 def test_the_report_bounds_the_rate_of_failures(capsys):
-    """A row per family and size, then 3 / n."""
+    """It has a row per family and size, then the bound 3 / n."""
     report_missions(["--missions", "2", "--seconds", "1", "--agents", "2", "--families", "field,open"])
     said = capsys.readouterr().out
     assert "| field | 2 | 2 | 0 | 0 |" in said
@@ -77,7 +77,7 @@ def test_the_report_bounds_the_rate_of_failures(capsys):
 
 
 def test_a_team_without_room_is_passed_over(capsys):
-    """With its reason; the others are flown."""
+    """The report gives the reason; other teams are flown."""
     report_missions(["--missions", "1", "--seconds", "0.5", "--agents", "64,2", "--families", "corridor"])
     said = capsys.readouterr().out
     assert "corridor, 64 agents, not flown: scenario 'corridor' cannot be flown" in said

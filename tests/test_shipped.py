@@ -1,4 +1,4 @@
-"""Shipped checkpoints: what their cards say is what they do; and how a run becomes one."""
+"""Shipped checkpoints: they perform as their cards report; and how a run becomes one."""
 
 import json
 import re
@@ -28,7 +28,7 @@ def test_a_shipped_policy_does_what_its_card_says(name):
 
 
 def test_a_message_names_a_shipped_checkpoint_without_its_place(tmp_path):
-    """Messages end up in results that are passed on; another checkpoint is named by its path."""
+    """Messages end up in results that users pass on, so the path is left out; any other checkpoint is named by its path."""
     mine = tmp_path / "marlms.safetensors"
     mine.write_bytes(shipped("marlms").read_bytes())
     for supervisor, said in ((make_supervisor("marlms"), "checkpoint marlms.safetensors"), (Learned.load(mine), str(mine))):
@@ -40,8 +40,9 @@ def test_a_message_names_a_shipped_checkpoint_without_its_place(tmp_path):
     ("name", "composition", "least"), [("marlms", "null-space", 15_017), ("marlms-general", "set-based", 15_500)]
 )
 def test_the_goal_is_reached_on_the_case_study(name, composition, least):
-    """Safe at every substep, no more switches than the paper's, and a return not below the schedule's; of the general policy,
-    which has never seen the mission, at least 15 500.
+    """Each policy is safe at every substep, with no more switches than the paper's and a return not below the schedule's.
+
+    The general policy, which has never seen the mission, returns at least 15 500.
     """
     metrics = measure(run_episode(World(paper(composition=composition), record=True), make_supervisor(name)))
     assert all(a["violation_time"] == 0.0 for a in metrics["agents"])

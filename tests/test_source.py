@@ -1,4 +1,4 @@
-"""What every source file keeps: few arguments, names instead of indices, no silenced tools without need."""
+"""Rules for every source file: few arguments, names instead of indices, few silenced tools."""
 
 import ast
 import re
@@ -11,9 +11,9 @@ MOST_PARAMETERS = 9
 MOST_BODY = 60  # lines
 MOST_IGNORES = 20
 NAMED = ("gains", "params", "state", "limits", "senses", "settings")
-"""Arguments of laws whose entries have names."""
+"""Arguments of laws that have named entries."""
 COMPILED = {"allocation_free", "behavior", "compiled", "controller", "disturbance", "drive", "inlined", "reading", "threaded"}
-"""Decorators of laws and of what they call."""
+"""Decorators of laws and of the functions that they call."""
 
 
 def crowded(path: Path) -> list[str]:
@@ -52,14 +52,14 @@ def indexed(text: str) -> list[str]:
 
 
 def literal(node: ast.Subscript) -> bool:
-    """Whether it is ``gains[3]`` or ``state[_TAU]``."""
+    """Whether a subscript has a form such as ``gains[3]`` or ``state[_TAU]``."""
     index = node.slice
     constant = isinstance(index, ast.Constant) or (isinstance(index, ast.Name) and index.id.isupper())
     return isinstance(node.value, ast.Name) and node.value.id in NAMED and constant
 
 
 def test_laws_read_names_instead_of_indices() -> None:
-    """In the library, in the how-tos and in the README."""
+    """This holds in the library, the documentation and the README."""
     pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
     blocks = [block for page in pages for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
     assert [name for text in (*(path.read_text() for path in sources(ROOT)), *blocks) for name in indexed(text)] == []

@@ -47,7 +47,7 @@ def test_success_comes_before_return_and_cost() -> None:
 
 
 def test_every_track_may_weigh_the_same() -> None:
-    """Two missions of one track against one of another."""
+    """One track has two missions, the other has one."""
     group = [flown(m, name, [m == A], track="first") for m in (A, B) for name in ("one", "two")]
     group += [flown(m, "three", [m == B], track="second") for m in (A, B)]
     by_mission, by_track = rank_methods(group), rank_methods(group, by_track=True)
@@ -56,7 +56,7 @@ def test_every_track_may_weigh_the_same() -> None:
 
 
 def test_a_method_that_did_not_fly_everything_has_no_rank() -> None:
-    """It is shown all the same, and the others' ranks do not count it."""
+    """It is still shown, but the others' ranks do not count it."""
     group = [flown(A, "one", [True]), flown(A, "two", [True]), flown(B, "one", [True])]
     first, second = rank_methods(group)
     assert (first.method, first.rank.value) == (A, 1.0)
@@ -76,7 +76,7 @@ merits = st.lists(st.tuples(*[st.integers(-3, 3).map(float)] * 2), min_size=1, m
 
 @given(merits)
 def test_the_chance_of_improvement_is_that_of_all_pairs(pairs: list[tuple[float, float]]) -> None:
-    """Mann and Whitney's U, and for every bootstrap sample the same with its weights."""
+    """It is Mann and Whitney's U as a share of all pairs, for every bootstrap sample with that sample's weights."""
     x, y = np.array(pairs).T
     drawn = np.random.default_rng(0).dirichlet(np.ones(len(x)), size=3)
     wins = (x[:, None] > y) + 0.5 * (x[:, None] == y)
@@ -86,7 +86,7 @@ def test_the_chance_of_improvement_is_that_of_all_pairs(pairs: list[tuple[float,
 
 
 def test_significance_is_paired() -> None:
-    """Ten layouts out of fifty that only one of them solves decide; two out of fifty do not."""
+    """Ten of fifty layouts that only one method solves make a significant difference; two of fifty do not."""
     y = np.ones(50, dtype=bool)
     for lost, decided in ((10, True), (2, False), (0, False)):
         x = y.copy()
@@ -106,7 +106,7 @@ def test_worst_and_median_are_runs_that_can_be_looked_at() -> None:
 
 
 def test_the_interval_of_a_median_is_that_of_the_sign_test() -> None:
-    """Of 50 values the 18th and the 33rd: 34 of the 51 possible counts below the median make up at least 95 %."""
+    """Of 50 values the 18th and the 33rd: the 15 middle ones of the 51 possible counts below the median make up at least 95 %."""
     assert median_interval(np.arange(1.0, 51.0)) == (25.5, 18.0, 33.0)
     assert median_interval(np.array([3.0, 1.0, 2.0])) == (2.0, 1.0, 3.0)
     alone, none = median_interval(np.array([4.0])), median_interval(np.zeros(0))

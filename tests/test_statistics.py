@@ -1,4 +1,4 @@
-"""Statistics against closed cases: hand arithmetic, binomial quantiles, the coverage that an interval promises."""
+"""Statistics compared with known cases: hand arithmetic, binomial quantiles, the nominal coverage of an interval."""
 
 from statistics import NormalDist
 
@@ -35,8 +35,9 @@ def test_bootstrap_of_constant_data_has_no_width() -> None:
 
 
 def test_bootstrap_of_two_points_has_binomial_quantiles() -> None:
-    """The mean of n draws from {0, 1} is Bin(n, 1/2) / n: its 2.5 and 97.5 % quantiles are 2 and 8 for n = 10, 4 and 12 for
-    n = 16.
+    """The mean of n draws from {0, 1} is Bin(n, 1/2) / n.
+
+    The 2.5 and 97.5 % quantiles of the count are 2 and 8 for n = 10, 4 and 12 for n = 16.
     """
     assert bootstrap([np.repeat([0.0, 1.0], 5)], mean) == (0.5, 0.2, 0.8)
     assert bootstrap([np.repeat([0.0, 1.0], 8)], mean) == (0.5, 0.25, 0.75)
@@ -48,7 +49,7 @@ def test_median_interval_of_three_points_is_their_range() -> None:
 
 
 def test_bootstrap_covers_a_normal_mean_as_often_as_it_says() -> None:
-    """30 values, 95 %: percentile intervals cover a little less (about 93.5 %); 600 repetitions have an error of 1 %."""
+    """With 30 values, 95 % percentile intervals cover a little less, about 93.5 %; 600 repetitions have an error of 1 %."""
     rng = np.random.default_rng(7)
     hits = 0
     for k in range(600):
@@ -64,7 +65,7 @@ def test_a_lower_level_gives_a_narrower_interval_inside() -> None:
 
 
 def test_strata_keep_their_weight() -> None:
-    """Between constant strata there is no variance; thrown together, the same values have one."""
+    """Constant strata have no variance; pooled into one stratum, the same values do."""
     strata = [np.zeros(6), np.full(3, 9.0)]
     assert bootstrap(strata, mean) == (3.0, 3.0, 3.0)
     loose = bootstrap([np.concatenate(strata)], mean)

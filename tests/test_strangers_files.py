@@ -1,4 +1,4 @@
-"""Scenario files, logs and checkpoints of strangers: read, or refused in one line; never run, never without bound."""
+"""Third-party scenario files, logs and checkpoints: read within bounds or refused in one line, never run as code."""
 
 import io
 import json
@@ -85,14 +85,14 @@ def test_a_wrong_scenario_file_is_one_line(tmp_path, name):
 
 def test_other_things_than_files_are_refused(tmp_path):
     for name in ("pipe.toml", "pipe.mcap"):
-        os.mkfifo(tmp_path / name)  # reading one would wait for ever
+        os.mkfifo(tmp_path / name)  # reading one would block forever
     for read, name in ((load_scenario, "pipe.toml"), (read_log, "pipe.mcap"), (load_scenario, ".toml")):
         with pytest.raises(ConfigurationError):
             read(tmp_path / name)
 
 
 def test_code_runs_only_where_it_is_allowed(tmp_path, capsys):
-    """Neither the file nor its neighbours are touched; `--allow-code` runs it."""
+    """A robot's Python file named in a scenario file runs only with `--allow-code`."""
     (tmp_path / "cart.py").write_text(f"import pathlib\npathlib.Path({str(tmp_path / 'ran')!r}).touch()\nROBOT = None\n")
     path = toml(tmp_path, OPEN + 'robot = "cart.py"\n')
     with pytest.raises(SystemExit) as stopped:
@@ -119,7 +119,7 @@ def test_a_robot_is_found_beside_its_file_and_gives_its_scale(tmp_path, monkeypa
 
 @pytest.fixture(scope="module")
 def log(episode, tmp_path_factory) -> Path:
-    """A short log."""
+    """The path of a short log."""
     from marlbc_mj.controllers import PD
     from marlbc_mj.engine.world import World
     from marlbc_mj.episode import run_episode
@@ -134,7 +134,7 @@ def log(episode, tmp_path_factory) -> Path:
 
 
 def rewritten(log: Path, out: Path, change=lambda topic, message: message, **metadata: str) -> Path:
-    """The same log with valid checksums and other content: messages as ``change`` leaves them, metadata replaced."""
+    """Write a copy of a log with valid checksums, its messages changed by ``change`` and its metadata replaced."""
     from mcap.reader import make_reader
 
     with open(log, "rb") as source, open(out, "wb") as target:
@@ -159,7 +159,7 @@ def rewritten(log: Path, out: Path, change=lambda topic, message: message, **met
 
 
 def edit(topic: str, name: str, value):
-    """A change of one field of every agent, or of a message, on one topic."""
+    """A change to one field of every agent, or of the message, on one topic."""
 
     def change(at: str, message):
         if at == topic and name in message:
@@ -235,7 +235,7 @@ def test_wrong_metadata_is_one_line(log, tmp_path, metadata):
 
 
 def test_a_rewritten_log_is_the_same_log(log, tmp_path):
-    """The tests above change what they say they change."""
+    """Rewriting alone changes nothing, so the tests above change only what they name."""
     assert np.array_equal(read_log(log).position, read_log(rewritten(log, tmp_path / "b.mcap")).position)
 
 
@@ -262,7 +262,7 @@ MESH = '<mujoco><asset><mesh name="m" file="{0}"/></asset><worldbody><geom type=
 )
 def test_a_logs_model_reads_no_file(log, tmp_path, model):
     outside = tmp_path / "outside.stl"
-    os.mkfifo(outside)  # opening it would wait for ever
+    os.mkfifo(outside)  # opening it would block forever
     found = read_log(rewritten(log, tmp_path / "b.mcap", model=model.format(outside)))
     with pytest.raises(ConfigurationError, match="the log's model cannot be shown") as error:
         make_stage(found)
@@ -280,7 +280,7 @@ def test_our_own_models_are_shown(robot):
 
 
 def bomb(path: Path, compress, kind: CompressionType, size: int, said: int) -> Path:
-    """A small MCAP whose one chunk holds ``size`` zeros and says that it holds ``said``."""
+    """Write a small MCAP with one chunk of ``size`` zeros that is declared to hold ``said`` bytes."""
     from mcap.data_stream import RecordBuilder
     from mcap.records import Chunk
 
@@ -302,7 +302,7 @@ def bomb(path: Path, compress, kind: CompressionType, size: int, said: int) -> P
 )
 @pytest.mark.parametrize("honest", [True, False])
 def test_a_bomb_is_not_opened(tmp_path, compress, kind, honest, monkeypatch):
-    """Whether it says how large it is or not."""
+    """It is refused whether or not it declares its true size."""
     size = 2 * mcap_file.MOST_CHUNK
     path = bomb(tmp_path / "b.mcap", compress, kind, size, size if honest else 100)
     monkeypatch.setattr(zstandard, "decompress", None)
@@ -319,7 +319,7 @@ def test_chunks_together_have_a_limit_too(log, monkeypatch):
 
 
 def test_what_a_checkpoint_says_cannot_be_changed(tmp_path):
-    """The digest covers margins, times and the state of generators as well as the arrays."""
+    """The digest covers margins, times and the state of random generators as well as the arrays."""
     path, arrays = tmp_path / "a.safetensors", {"x": np.arange(3.0)}
     write_arrays(path, arrays, {"margin": 0.25, "wall_s": 12.0, "rng": {"state": 17}})
     _, description = read_arrays(path)
@@ -351,7 +351,7 @@ def test_a_force_limit_that_mujoco_takes_for_zero_is_one_line(tmp_path, capsys):
 
 
 def test_files_are_tried_out_by_one_server_of_each_process(tmp_path):
-    """It loads MuJoCo once; one that was killed is replaced, a process that was forked has its own, none outlives its process."""
+    """It loads MuJoCo once; a killed server is replaced, a forked process has its own, and none outlives its process."""
     path = tmp_path / "ball.xml"
     path.write_text("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>")
     limits = trial.Limits(20.0, 5, 8 * 2**30)

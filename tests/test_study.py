@@ -1,4 +1,4 @@
-"""Studies of learners: what is run, skipped, continued and reported, on runs of seconds."""
+"""Studies of learners: which runs are started, skipped, resumed and reported, tested with runs of seconds."""
 
 import csv
 import json
@@ -65,13 +65,13 @@ def quiet(line: str, done: float, total: float) -> None:
 
 
 def listening(said: list[str]) -> Watch:
-    """Keeps every line that a job tells."""
+    """A watch that appends every progress line of a job to ``said``."""
     return Watch(lambda line, done, total: said.append(line))
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two variants on two seeds in this process, from the command line."""
+    """The folder of a study of two variants on two seeds, run by the command line in this process."""
     out = tmp_path_factory.mktemp("study") / "out"
     arguments = ["--variants", "marlms", "vdn", "--seeds", "2", "--budget", "1600", "--workers", "1"]
     main(["study", *arguments, "--out", str(out), "--set", *SETTINGS])
@@ -79,7 +79,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_study_leaves_what_it_promises(finished: Path) -> None:
-    """The report, and of every run its evaluations, progress, configuration and best checkpoint."""
+    """It writes the report and, for every run, its evaluations, progress, configuration and best checkpoint."""
     assert {p.name for p in finished.iterdir()} == REPORT | {"marlms", "vdn"}
     for variant in ("marlms", "vdn"):
         for seed in ("0", "1"):
@@ -121,7 +121,7 @@ def test_table_and_figure_from_csv_alone(finished: Path, tmp_path: Path) -> None
 
 
 def interrupted(job: TrainingJob, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave what a run killed after its save leaves."""
+    """Stop a run by a signal, so that it leaves a saved state."""
     with monkeypatch.context() as patch:
         original, calls = Trainer.advance, []
 
@@ -138,7 +138,7 @@ def interrupted(job: TrainingJob, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It is reported as unfinished, then resumed, and ends as the uninterrupted one; other settings do not continue it."""
+    """It is reported as unfinished, then resumed, and ends like an uninterrupted one; other settings are refused."""
     (job,) = jobs_of(tmp_path, "marlms")
     interrupted(job, monkeypatch)
     rows, _ = collect(tmp_path)
@@ -166,7 +166,7 @@ def test_an_interrupted_run_of_other_code_begins_anew(tmp_path: Path, monkeypatc
 
 
 def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With its reason in every file, beside those that ran; the next call tries it again, and success removes the reason."""
+    """Every file has its reason, beside the runs that succeeded; the next call retries it, and success removes the reason."""
     original = run.make_trainer
 
     def make(config):
@@ -194,12 +194,12 @@ def test_a_run_that_fails_is_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert cells["vdn"][:4] == ("1, 1 failed", "0 of 1", "∞", "∞") and cells["vdn"][4] == "–"
     assert train_job(jobs[1], Watch(quiet)).how == "finished" and not (jobs[1].folder / FAILED_MARK).exists()
     only = by_variant(rows)["qmix"]
-    write_comparison(tmp_path, only, [])  # nothing but a failure can still be drawn
+    write_comparison(tmp_path, only, [])  # a study with failures only can still be drawn
 
 
 @pytest.mark.slow
 def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
-    """The study passes it on to its worker processes, which save their runs; what there is can be compared."""
+    """The study passes it on to its worker processes, which save their runs; these are reported as unfinished."""
 
     def interrupt() -> None:
         while not list(tmp_path.glob("vdn/0/eval.csv")) and not over.is_set():
@@ -219,16 +219,16 @@ def test_a_signal_stops_the_workers(tmp_path: Path) -> None:
 
 
 def test_a_stopped_study_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    """After what there is; the exit status is the signal's."""
+    """The exit status is 128 plus the signal's number."""
     monkeypatch.setattr(trainings, "train_learners", lambda study, workers, progress: signal.SIGTERM)
     with pytest.raises(SystemExit) as stopped:
         main(["study", "--out", str(tmp_path)])
     assert stopped.value.code == 128 + signal.SIGTERM
-    assert capsys.readouterr().err == "marlbc: stopped, and every run saved; the same command goes on\n"
+    assert capsys.readouterr().err == "marlbc: stopped, and every run saved; repeat the command to resume\n"
 
 
 def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
-    """All can be configured, no two alike, each a switch away from marlms; a group fits a row of the figure."""
+    """All variants are valid and different; each ablation changes only its own settings; a group fits a row of the figure."""
     configs = {job.variant: job.config for job in LearnerStudy(tmp_path, seeds=1, budget=5_000).jobs()}
     assert list(configs) == list(VARIANTS) and len({repr(config) for config in configs.values()}) == len(VARIANTS)
     assert all((c.budget, c.threads, c.scenario) == (5_000, 1, "paper") for c in configs.values())
@@ -254,7 +254,7 @@ def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:
 
 
 def test_a_row_of_panels_holds_whole_groups():
-    """As many as have room; nothing is lost or moved."""
+    """A row has as many groups as fit; none is lost or moved."""
     every = rows_of_panels(list(VARIANTS))
     assert [len(row) for row in every] == [6, 6, 6]
     some = ["marlms", "no-leniency", "no-averaging", "no-dueling", "plain-hash", "paper", "hysteretic", "vdn"]
@@ -263,7 +263,7 @@ def test_a_row_of_panels_holds_whole_groups():
 
 
 def test_the_goal_is_the_scripted_supervisors() -> None:
-    """Which meets it itself; one switch more, any violation or a lower return do not."""
+    """The scripted supervisor's own result meets it; one switch more, any violation or a lower return does not."""
     goal = scripted_return("paper", "sorlc")
     good = {f"switches_{i + 1}": str(n) for i, n in enumerate(GOAL_SWITCHES)} | {"violation_time": "0", "return": f"{goal:.6g}"}
     assert meets_goal(good, goal)
@@ -272,7 +272,7 @@ def test_the_goal_is_the_scripted_supervisors() -> None:
 
 
 def test_a_goal_that_is_never_met_is_infinite() -> None:
-    """The median over runs counts a run that fails or never gets there; the interval may end at infinity."""
+    """A run that fails or never meets the goal counts as infinite in the median; the interval may end at infinity."""
     row = dict.fromkeys(RUN_COLUMNS, "")
     row |= {"variant": "marlms", "budget": "5000000", "goal_return": "15017", "best_switches": "4/2/2/4", "wall_s": "60"}
     numbers = dict.fromkeys(("best_return", "best_violation_time", "best_clearance_min", "final_return"), "1")
@@ -324,7 +324,7 @@ def test_damaged_csv_files_are_one_line(damage: str, finished: Path, tmp_path: P
 
 
 def test_workers_heed_their_study() -> None:
-    """A job that has not begun when the study stops is left alone."""
+    """A job that has not begun when the study stops is not run."""
     (job,) = jobs_of(Path("nowhere"), "marlms")
     with pytest.raises(Stopped):
         train_job(job, Watch(quiet, lambda: True))

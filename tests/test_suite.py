@@ -1,4 +1,4 @@
-"""The suite: a fixed definition, rows that survive their files, and one command from a supervisor to a leaderboard."""
+"""The suite: a fixed definition, rows restored from their files, and one command from a supervisor to a leaderboard."""
 
 import json
 import math
@@ -22,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("coarse_figures")
 
 
 def test_the_suite_is_the_frozen_one() -> None:
-    """Whoever changes a mission, by a default for example, makes another suite and gives it another version."""
+    """Any change to a mission, by a default for example, makes another suite, which needs another version."""
     assert {name: track_hash(name) for name in TRACKS} == FROZEN
 
 
@@ -36,13 +36,13 @@ def test_the_tracks_are_those_that_are_described() -> None:
 
 
 def test_layouts_are_held_out() -> None:
-    """Of every mission that draws layouts."""
+    """This holds for every mission that draws layouts."""
     drawn = [mission.scenario for name in TRACKS for mission in missions_of(name) if mission.scenario.layout is not None]
     assert len(drawn) == 5 + 15 + 4 and {scenario.split for scenario in drawn} == {"test"}
 
 
 def test_the_hash_sees_every_number_of_a_mission(monkeypatch: pytest.MonkeyPatch) -> None:
-    """But for its prose, and the last bits, which differ between machines."""
+    """It ignores only descriptions and the last bits of numbers, which differ between machines."""
     (mission, *_) = missions_of("paper")
 
     def hash_with(**changes: object) -> str:
@@ -69,7 +69,7 @@ def test_every_supervisor_flies_under_what_it_is_meant_for() -> None:
 
 
 def test_a_quick_run_is_a_part_of_the_whole() -> None:
-    """Its jobs are among those of the whole suite, so that nothing is flown again."""
+    """Its jobs are among those of the whole suite, so nothing is flown twice."""
     choice = Choice(("fixed",))
     quick = suite_jobs(choose_missions(["families"], ["field"], BLOCK), choice)
     whole = suite_jobs(choose_missions(["families"], ["field"]), choice)
@@ -153,7 +153,7 @@ def test_a_page_from_files_is_the_same_page(flown: Path, tmp_path: Path) -> None
 
 
 def test_rows_stand_beside_others(flown: Path, tmp_path: Path) -> None:
-    """Those that are flown anew replace theirs."""
+    """Methods that are flown again replace their old rows."""
     main([*FLY, "--supervisors", "lookahead", "fixed", "--from", str(flown), "--out", str(tmp_path / "more")])
     merged = read_suite(tmp_path / "more")
     assert [each.method.supervisor for each in merged.groups] == ["lookahead", "fixed", "marlms"]
@@ -165,7 +165,7 @@ def test_rows_stand_beside_others(flown: Path, tmp_path: Path) -> None:
     [
         ({"suite": {"version": "v0", "hash": "0" * 64}}, "is of suite v0 000000000000, this code's is v1"),
         ({"form": 99}, "has form 99, this code reads form 1"),
-        ({"suite": 3}, "is no file of the suite"),
+        ({"suite": 3}, "is not a file of the suite"),
     ],
 )
 def test_another_suite_is_refused(flown: Path, tmp_path: Path, change: dict, said: str, capsys) -> None:
@@ -178,7 +178,7 @@ def test_another_suite_is_refused(flown: Path, tmp_path: Path, change: dict, sai
 
 
 def test_rows_of_other_code_are_named(flown: Path, tmp_path: Path, capsys) -> None:
-    """In one line; the page is there all the same."""
+    """The warning is one line, and the page is still written."""
     for path in flown.iterdir():
         (tmp_path / path.name).write_bytes(path.read_bytes())
     content = json.loads((flown / "suite.json").read_text())
@@ -190,7 +190,7 @@ def test_rows_of_other_code_are_named(flown: Path, tmp_path: Path, capsys) -> No
 
 
 def test_clips_show_the_flights_of_the_rows(flown: Path, tmp_path: Path, monkeypatch) -> None:
-    """The worst and the median layout are flown again, and the page links to them; who never flew has none."""
+    """The worst and the median layout are flown again, and the page links to them; a method that never flew has no clips."""
     logs = {}
 
     def write(log, path, style, overwrite) -> None:

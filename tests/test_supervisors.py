@@ -17,7 +17,7 @@ FM, FR, OA = (PAPER.orders.index(name) for name in ("FM", "FR", "OA>FM"))
 URGENCY = {FM: 0, FR: 1, OA: 2}
 clearance_sequences = st.lists(
     st.lists(st.floats(-1.0, 6.0), min_size=4, max_size=4), min_size=2, max_size=60
-)  # (T, 4), as fast as can be
+)  # (T, 4), with jumps of any size
 
 
 def at(step: int, clearance=(9.0, 9.0, 9.0, 9.0)) -> Observation:
@@ -66,7 +66,7 @@ def test_the_schedule_of_the_case_study_has_strict_bounds(time, expected):
 
 @given(st.integers(0, 400), st.integers(1, 400))
 def test_a_time_on_a_windows_bound_is_outside_it(first, length):
-    """For every bound that is a multiple of 0.05 s as people write it: 3 * 0.05 > 0.15 in floating point is no reason."""
+    """This holds for every bound that is a decimal multiple of 0.05 s, although 3 * 0.05 > 0.15 in floating point."""
     start, end = round(first * 0.05, 2), round((first + length) * 0.05, 2)
     scripted = Scripted(windows=(Window(start, end, 1, "FR"),))
     memory = scripted.start(PAPER, 1)
@@ -75,7 +75,7 @@ def test_a_time_on_a_windows_bound_is_outside_it(first, length):
 
 
 def test_later_windows_win_and_defaults_fill():
-    """Two overlapping windows and another default order."""
+    """Two windows overlap, and the default order is another than FM."""
     scripted = Scripted(windows=(Window(0.1, 1.0, -1, "FM"), Window(0.2, 0.5, 2, "OA>FR")), default="FR")
     assert names_at(scripted, 0.05) == ["FR"] * 4
     assert names_at(scripted, 0.3) == ["FM", "FM", "OA>FR", "FM"]
@@ -92,7 +92,7 @@ def test_later_windows_win_and_defaults_fill():
     ],
 )
 def test_a_script_that_does_not_fit_is_refused(supervisor, scenario, message):
-    """Agent, order, or no schedule at all; the message names it."""
+    """The message names the wrong agent or order, or the missing schedule."""
     with pytest.raises(ConfigurationError, match=message):
         supervisor.start(scenario, 1)
 
@@ -125,7 +125,7 @@ def test_the_published_rule_has_no_memory(clearances):
 
 @given(clearance_sequences, st.floats(0.0, 0.9), st.integers(0, 20))
 def test_dwell_delays_relaxing_and_nothing_else(clearances, hysteresis, dwell_steps):
-    """A less urgent state comes at least the dwell after the last change; a more urgent one at the step that asks for it."""
+    """A less urgent state begins at least the dwell after the last change, a more urgent one at the step that requires it."""
     orders = run(FSAMS(hysteresis=hysteresis, dwell=dwell_steps * 0.05), clearances)
     urgency = np.vectorize(URGENCY.get)(orders)
     asked = (np.array(clearances) <= 4.0 - hysteresis).astype(int) + (np.array(clearances) <= 2.0 - hysteresis)
@@ -140,7 +140,7 @@ def test_dwell_delays_relaxing_and_nothing_else(clearances, hysteresis, dwell_st
 
 @given(clearance_sequences, st.floats(0.01, 0.9))
 def test_hysteresis_needs_the_clearance_to_cross_the_whole_band(clearances, hysteresis):
-    """Up at threshold - hysteresis, down above threshold + hysteresis: inside a band the state stays on its side."""
+    """A state is entered at threshold - hysteresis and left above threshold + hysteresis; inside the band it does not change."""
     orders = run(FSAMS(hysteresis=hysteresis), clearances)
     urgency, d = np.vectorize(URGENCY.get)(orders), np.array(clearances)
     before = np.vstack([np.zeros(4, dtype=int), urgency[:-1]])
@@ -150,7 +150,7 @@ def test_hysteresis_needs_the_clearance_to_cross_the_whole_band(clearances, hyst
 
 
 def test_the_literal_dwell_also_delays_the_urgent_state():
-    """``dwell_delays_urgent``: OA waits too, as an option."""
+    """With the option ``dwell_delays_urgent``, OA waits too."""
     sequence = [(3.0,) * 4] + [(1.0,) * 4] * 11
     assert run(FSAMS(dwell=0.5), sequence)[1].tolist() == [OA] * 4
     delayed = run(FSAMS(dwell=0.5, dwell_delays_urgent=True), sequence)
@@ -159,7 +159,7 @@ def test_the_literal_dwell_also_delays_the_urgent_state():
 
 @given(clearance_sequences)
 def test_an_automaton_is_deterministic_and_leaves_its_memory_alone(clearances):
-    """State in, state out: an old memory can be used again, and gives the same."""
+    """A decision does not change its memory: an old memory can be used again and gives the same orders."""
     supervisor = FSAMS(hysteresis=0.3, dwell=0.5)
     np.testing.assert_array_equal(run(supervisor, clearances), run(supervisor, clearances))
     memory = supervisor.start(PAPER, 1)
@@ -170,7 +170,7 @@ def test_an_automaton_is_deterministic_and_leaves_its_memory_alone(clearances):
 
 
 def test_thresholds_follow_the_scenarios_safe_distance():
-    """d_OA is the scenario's."""
+    """The automaton uses the scenario's d_OA."""
     scenario = paper(safe_distance=3.0)
     supervisor = FSAMS()
     orders, _ = supervisor.decide(at(0, (3.0, 3.1, 6.0, 6.1)), supervisor.start(scenario, 1))
@@ -188,6 +188,6 @@ def test_every_named_supervisor_keeps_the_protocol(name):
 
 
 def test_the_fair_automaton_is_the_published_one_with_hysteresis_and_dwell():
-    """0.3 m and 0.5 s."""
+    """The hysteresis is 0.3 m and the dwell 0.5 s."""
     fair = make_supervisor("fsams-hysteresis")
     assert (fair.hysteresis, fair.dwell, fair.dwell_delays_urgent) == (0.3, 0.5, False)

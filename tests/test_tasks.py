@@ -90,7 +90,7 @@ def test_plain_python_controller_runs() -> None:
 
 
 def test_divergence_stops_the_environment() -> None:
-    """A drag that no actuator can hold raises an error that names agent and time."""
+    """A drag that makes the simulation diverge raises an error that names agent and time."""
     from marlbc_mj.core.disturbances import PaperDrag
 
     environment = tasks.load("formation", "paper", disturbance=PaperDrag(20.0))

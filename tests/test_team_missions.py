@@ -20,7 +20,7 @@ TEAMS = [("wedge", 4), ("circle", 8), ("line", 6), ("grid", 9), ("circle", 12), 
 @pytest.mark.parametrize(("formation", "agents"), TEAMS)
 @pytest.mark.parametrize("family", ["field", "gates", "corridor"])
 def test_the_column_is_shorter_than_the_way(family: str, formation: str, agents: int) -> None:
-    """In front of the column and behind it is at least a fifth of the way."""
+    """At least a fifth of the way is left in front of the column, and as much behind it."""
     scenario = team_mission(family, formation, agents)
     column = scenario.formations[1]
     way = scenario.duration * scenario.path_velocity[0]
@@ -40,7 +40,7 @@ def test_only_families_make_room() -> None:
 
 
 def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
-    """Two blocked lanes within its bins make a column, one does not; it stays while the way back of anybody is blocked."""
+    """Two lanes blocked within its bins make a column, one does not; the column stays while any agent's way back is blocked."""
     inputs, last, bins = np.ones((4, 3, INPUTS)), np.full((4, 3), FORMATION), np.full(4, 6)
     inputs[0, :2, 5] = inputs[1, :2, 6] = inputs[2, 1, 5] = -0.5
     inputs[3, 1, LANES] = -0.5
@@ -60,7 +60,7 @@ def test_shut_out_is_far_from_both_slots_with_both_ways_blocked() -> None:
 
 
 def test_an_episode_ends_where_an_agent_is_lost() -> None:
-    """A team that never leaves its formation is lost at a gate; the cost of all time to come is in the last reward."""
+    """A team that never leaves its formation is lost at a gate; the last reward includes the cost of all future time."""
     config = GeneralConfig(families=("gates",), teams=("line-6",), lossy=0.0, guided=0.0, least_exploration=0.0)
     squad = Squad(team_mission("gates", "line", 6, composition="set-based", substep=0.01), config, learner_config(config), 0)
     squad.end[:] = squad.scenario.mission_steps
@@ -74,7 +74,7 @@ def test_an_episode_ends_where_an_agent_is_lost() -> None:
 
 
 def test_a_mission_is_over_at_its_end_and_who_is_late_pays() -> None:
-    """The last decision of a whole mission is terminal; where an episode is cut short, to begin in another phase, it is not."""
+    """The last decision of a whole mission is terminal; that of an episode cut short to begin in another phase is not."""
     config = GeneralConfig(families=("field",), teams=("wedge-4",), lossy=0.0, guided=0.0, least_exploration=0.0)
     mission = team_mission("field", "wedge", 4, composition="set-based", substep=0.01, duration=6.0)
     squad = Squad(mission, config, learner_config(config), 0)
@@ -93,7 +93,7 @@ def test_a_mission_is_over_at_its_end_and_who_is_late_pays() -> None:
 
 @pytest.mark.parametrize("approach", ["straight", "line"])
 def test_who_is_late_finds_the_opening_along_its_line(approach: str) -> None:
-    """Agents in front of the walls beside an opening that their column has passed: straight they stay, by lines they do not."""
+    """Once the column has passed an opening, agents before the walls beside it stay if they approach straight, not by lines."""
     scenario = team_mission("gates", "line", 6, composition="set-based", substep=0.01, column_approach=approach, gates=1)
     world = World(scenario, make_controller("pd"))
     world.reset(0)

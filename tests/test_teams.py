@@ -1,4 +1,4 @@
-"""Supervisors of B teams: what one team is told does not depend on the others, and a supervisor of one team serves B."""
+"""Supervisors of B teams: one team's decisions do not depend on the others, and a supervisor of one team serves B teams."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,17 +23,17 @@ PAPER = paper()
 FM, FR = (PAPER.orders.index(name) for name in ("FM", "FR"))
 QUICK = tuple(name for name in SUPERVISORS if name not in ("mpcms-mujoco", "oracle"))
 NEEDS = {"marlms-general": {"composition": "set-based"}}
-"""What supervisors ask of a scenario."""
+"""Settings of the scenario that supervisors require."""
 
 
 def bits(decision) -> list[bytes]:
-    """A decision, team by team, to the last bit."""
+    """The bytes of a decision, team by team."""
     orders, velocity = (decision.orders, decision.velocity) if isinstance(decision, Blend) else (decision, None)
     return [row.tobytes() + (b"" if velocity is None else velocity[b].tobytes()) for b, row in enumerate(orders)]
 
 
 def told(supervisor: Supervisor, world: World, steps: int) -> list[list[bytes]]:
-    """Decisions for all teams of a world over some mission steps, and at the end where they are."""
+    """Bytes of the decisions for all teams of a world over some mission steps, followed by their final positions."""
     memory, observation, said = supervisor.start(world.scenario, world.worlds), world.observe(), []
     for _ in range(steps):
         decision, memory = supervisor.decide(observation, memory)
@@ -43,7 +43,7 @@ def told(supervisor: Supervisor, world: World, steps: int) -> list[list[bytes]]:
 
 
 def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> None:
-    """Each team of ``world`` is told, to the bit, what it would be told in a world of its own."""
+    """Assert that each team of ``world`` gets decisions identical to those in a world of its own."""
     alone = [World(world.scenario, world.plan.controller) for _ in range(world.worlds)]
     for b, own in enumerate(alone):
         own.copy_world(world, b, 0)
@@ -55,7 +55,7 @@ def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if name != "oracle-schedule"])
 def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
-    """Three draws of a whole episode of 25 s, past the first point; of 8 s where a decision takes long."""
+    """Three draws run for 25 s, past the first point, or for 8 s if decisions are slow."""
     duration = 8.0 if name in ("mpcms", "rollout") else 25.0
     world = World(paper(perturbation=AROUND, duration=duration, **NEEDS.get(name, {})), worlds=3)
     world.reset(4)
@@ -64,7 +64,7 @@ def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
 
 @pytest.mark.parametrize("name", QUICK)
 def test_teams_may_be_at_different_steps_of_the_mission(name):
-    """Five places of the case study, under PD; decisions that hold for an interval hold for each team's own."""
+    """Teams are at five places of the case study, under PD; decisions that hold for an interval use each team's own interval."""
     world = World(paper(perturbation=AROUND, **NEEDS.get(name, {})), PD(), worlds=TEAMS)
     world.reset(1)
     for b, step in enumerate((0, 353, 862, 1057, 1621)):
@@ -75,7 +75,7 @@ def test_teams_may_be_at_different_steps_of_the_mission(name):
 
 @pytest.mark.parametrize("name", ["fsams", "fms", "layered", "mpcms"])
 def test_teams_that_give_way_are_told_what_they_are_told_alone(name):
-    """Agent avoidance, among obstacles that move and with sensors that are not perfect."""
+    """This covers agent avoidance, with imperfect sensors and among moving obstacles."""
     crossing = imperfect(make_scenario("exchange", agents=4))
     for scenario in (crossing, make_scenario("traffic", duration=8.0)):
         world = World(scenario, worlds=3)
@@ -104,7 +104,7 @@ def test_a_prediction_for_many_teams_does_not_depend_on_the_number_of_threads(th
 
 
 def test_a_team_without_a_finite_cost_is_named():
-    """The second of two teams has an obstacle without end."""
+    """The second of two teams has an obstacle of infinite radius."""
     observation = World(PAPER, worlds=2).observe()
     observation.obstacles[1, 0, 2] = np.inf
     supervisor = MPCMS()
@@ -113,7 +113,7 @@ def test_a_team_without_a_finite_cost_is_named():
 
 
 def test_simulated_predictions_of_two_teams_are_those_of_each_alone():
-    """MuJoCo: every team's twin begins as the only one of one team does."""
+    """In the MuJoCo prediction, every team's twin begins like the twin of a single team."""
     world = World(PAPER, worlds=2)
     world.place(1, 362, np.array([15.6, 0.0]) + PAPER.formations[0], np.tile((1.0, 0.0), (4, 1)), np.zeros(4, dtype=np.int64))
     assert_teams_are_alone(MPCMS(horizon=4, instants=(0,), prediction="mujoco"), world, 3)
@@ -132,7 +132,7 @@ class Near(NamedTuple):
 
 @dataclass(frozen=True)
 class Careful:
-    """Avoids below a clearance with hysteresis; written for one team, told how long its solver takes."""
+    """A supervisor of one team that avoids below a clearance, with hysteresis, and reports its solver's time."""
 
     def start(self, scenario):
         return Near(np.zeros(scenario.agents, dtype=bool), np.array([scenario.orders.index(n) for n in ("FM", "OA>FM")]))
@@ -145,7 +145,7 @@ class Careful:
 
 @dataclass(frozen=True)
 class CarefulTeams:
-    """The same for B teams."""
+    """The same supervisor written for B teams."""
 
     def start(self, scenario, teams):
         return Careful().start(scenario)._replace(near=np.zeros((teams, scenario.agents), dtype=bool))
@@ -157,10 +157,10 @@ class CarefulTeams:
 
 @dataclass(frozen=True)
 class Says:
-    """Always the same decision, for the team at whose step this is."""
+    """A supervisor that always returns ``decision``, or ``other`` if there is one and the team is past step 0."""
 
     decision: object
-    other: object = None  # that of a team which is further
+    other: object = None  # for a team past step 0
 
     def start(self, scenario):
         return None
@@ -170,7 +170,7 @@ class Says:
 
 
 def test_a_supervisor_of_one_team_decides_for_many():
-    """Wrapped, and only then; the same orders as one that is written for B."""
+    """Only such a supervisor is wrapped, and it gives the same orders as one written for B teams."""
     assert isinstance(batched(Careful()), OneTeam) and isinstance(batched(CarefulTeams()), CarefulTeams)
     for make in (lambda: World(PAPER, worlds=3), partial(World, PAPER)):
         world = make()
@@ -185,12 +185,12 @@ def test_a_supervisor_of_one_team_decides_for_many():
     memory = batched(Careful()).start(PAPER, 3)
     assert memory.solver_ms is None or memory.solver_ms == 0.0
     _, memory = batched(Careful()).decide(World(PAPER, worlds=3).observe(), memory)
-    assert memory.solver_ms == 6.0  # of all three
+    assert memory.solver_ms == 6.0  # the sum of all three teams
     assert batched(Says(np.full(4, FM))).start(PAPER, 2).solver_ms is None
 
 
 def test_episodes_take_both_forms():
-    """Bit by bit the same."""
+    """Both give identical episodes."""
     scenario = paper(duration=24.0)
     runs = [run_episode(World(scenario, record=True), supervisor) for supervisor in (Careful(), CarefulTeams())]
     assert (np.diff(runs[0].command[:, 0]) != 0).any()
@@ -206,7 +206,7 @@ def test_velocities_of_one_team_are_stacked():
 
 
 class SomeMemories:
-    """Nothing remembered of some teams."""
+    """Empty memories of several teams."""
 
     def __init__(self, teams: int) -> None:
         self.teams = (None,) * teams
@@ -226,13 +226,13 @@ class SomeMemories:
     ],
 )
 def test_decisions_that_are_none_are_named(decision, message):
-    """Of one team, by its own shape; of B teams, with theirs."""
+    """The error says what is wrong, with the shape for one team."""
     with pytest.raises(ConfigurationError, match=message):
         run_episode(World(paper(duration=1.0), record=True), Says(decision))
 
 
 def test_a_decision_for_one_team_is_none_for_many():
-    """A batch supervisor that forgets its leading axis, and teams of which only some get velocities."""
+    """Orders without the axis of teams are refused, and velocities for only some of the teams."""
     with pytest.raises(ConfigurationError, match=r"orders must have shape \(2, 4\), got \(4,\)"):
         split_decision(np.full(4, FM), (2, 4))
     observation = World(PAPER, worlds=2).observe()

@@ -1,4 +1,4 @@
-"""Parts of MARLMS against hand arithmetic and closed forms."""
+"""Parts of MARLMS compared with hand arithmetic and closed forms."""
 
 import json
 from dataclasses import replace
@@ -39,7 +39,7 @@ def network(dueling=True, seed=0, risk=False):
 
 
 def one_agent(net, agent, state):
-    """Agent's network written out."""
+    """The values of one agent's network, computed layer by layer."""
     x = state / np.arange(1.0, S + 1)
     weights = [w.detach().numpy()[agent] for w in net.weights]
     biases = [b.detach().numpy()[agent, 0] for b in net.biases]
@@ -120,7 +120,7 @@ def test_greedy_leaves_an_order_only_for_a_lead_above_the_margin(seed, margin):
 
 
 def test_a_last_action_that_is_none_is_refused():
-    """By every entry, since compiled code would read beyond the values."""
+    """Every entry is checked, since compiled code would read beyond the values."""
     values, fresh = np.zeros((2, N, A)), np.zeros(2, dtype=bool)
     for wrong in (-1, A):
         last = np.zeros((2, N), dtype=np.int64)
@@ -161,7 +161,7 @@ def test_temperatures_cool_backwards_from_the_end(path):
 
 @given(st.integers(0, 2**31 - 1), st.integers(1, 6), st.integers(0, 20))
 def test_cooling_reads_the_ring_where_it_wraps(seed, length, first):
-    """The same episode in a ring of 6 rows, wherever it begins, as in one that never wraps."""
+    """An episode in a ring of 6 rows, wherever it begins, gives the same temperatures as one that does not wrap."""
     rng = np.random.default_rng(seed)
     codes, actions = rng.integers(3, size=(length, 2)), rng.integers(A, size=(length, 2, N))
     ring_codes, ring_actions = rng.integers(3, size=(6, 2)), rng.integers(A, size=(6, 2, N))
@@ -175,7 +175,7 @@ def test_cooling_reads_the_ring_where_it_wraps(seed, length, first):
 
 
 def test_the_leniency_that_is_stored_is_that_of_the_action_before_it_cooled(monkeypatch):
-    """Also in decisions whose episode ends in them, so that their temperature falls at once."""
+    """This includes decisions that end their episode, so that the temperature falls at once."""
     config = make_config(
         "fast", worlds=100, interval=2, hidden=(4,), batch=8, updates=1, capacity=10_000, threads=1, exploring_starts=1.0,
         start_length=0.5, hash="plain", bits=4,
@@ -208,7 +208,7 @@ def test_a_positive_error_always_counts_and_a_negative_one_with_probability_1_mi
 
 @given(st.integers(1, 4), st.lists(st.sampled_from(["go", "cut", "over"]), min_size=8, max_size=14), st.integers(5, 9))
 def test_n_step_returns_stop_where_an_episode_ends(steps, ends, rows):
-    """Against a plain loop over one world, with rewards that name their row."""
+    """They equal those of a plain loop over one world, with rewards that identify their row."""
     replay, gamma = Replay(rows, 1, 1, 1), 0.5
     for k, end in enumerate(ends):
         replay.store(
@@ -257,13 +257,13 @@ def test_one_update_by_hand(huber):
 
 
 def gradients(net):
-    """(N, P) of every network in a row."""
+    """(N, P) gradients, one network per row."""
     return torch.cat([p.grad.flatten(start_dim=1) for p in net.parameters()], dim=1)
 
 
 @pytest.mark.parametrize("kind", [Learner, RLMS, VDN])
 def test_a_large_error_shortens_the_steps_of_its_own_network_only(kind):
-    """Each agent's gradient is clipped by itself where agents learn apart, all together where one loss trains them."""
+    """Gradients are clipped for each agent separately if agents learn apart, together if one loss trains them."""
 
     def step(reward):
         config = replace(TrainConfig(), hidden=(6,), copies=2, learner="plain", risk_gamma=0.0)
@@ -297,7 +297,7 @@ def test_clipping_keeps_each_direction_and_bounds_each_norm(seed, size):
 
 @pytest.mark.slow
 def test_risks_are_the_discounted_chance_that_loss_is_unavoidable():
-    """A corridor of three states with two orders: from the last, the first order is lost; from there on all is lost."""
+    """In a corridor of three states with two orders, the first order leads from the last state to loss, which is final."""
     config = replace(TrainConfig(), hidden=(32,), copies=2, push_every=10, capacity=4000, learner="plain", risk_gamma=0.5)
     learner = Learner(config, 2, 2, np.ones(4), generator())
     rng, eye = np.random.default_rng(0), np.eye(4, dtype=np.float32)
@@ -338,7 +338,7 @@ def test_the_policy_is_the_running_mean_of_the_weights():
 
 
 def test_updates_learn_a_bandit():
-    """Two agents, reward 1 for one order each: the values find it."""
+    """Two agents get reward 1 for one order each, and the values converge to it."""
     config = replace(TrainConfig(), hidden=(16,), copies=2, capacity=4000, learner="plain", risk_gamma=0.0)
     learner = Learner(config, 2, A, np.ones(S), generator())
     rng = np.random.default_rng(0)
@@ -362,7 +362,7 @@ def test_exploration_follows_the_temperature():
 @pytest.mark.parametrize("temperature", [[0.03] * N, [0.5] * N, [1.0] * N, [0.1, 0.6, 0.9]])
 @pytest.mark.parametrize(("hold", "together"), [(1, 0.0), (1, 0.5), (6, 0.0), (6, 0.5), (3, 1.0)])
 def test_the_share_of_random_orders_is_the_temperature(hold, together, temperature):
-    """In every decision of an episode, the first as well as later ones, for each agent, whatever is held and shared."""
+    """This holds for every decision of an episode, from the first, and for each agent, whatever is held and shared."""
     worlds, decisions = 3000, 14
     config = replace(TrainConfig(), worlds=worlds, hold=hold, together=together, least_exploration=0.0, capacity=30_000)
     explore, rng, best = Exploration(config, N, A), np.random.default_rng(3), np.full((worlds, N), 9)
@@ -386,7 +386,7 @@ def test_joint_and_own_shares_make_up_the_whole(share, together):
 
 
 def test_of_equal_agents_explorations_the_share_together_is_joint():
-    """A share ``together`` of an agent's random orders are the team's."""
+    """A share ``together`` of an agent's random orders is common to the team."""
     best, rng = np.full((3000, N), 9), np.random.default_rng(0)
     for together in (0.5, 0.3):
         config = replace(TrainConfig(), worlds=3000, hold=4, together=together, capacity=30_000)
@@ -418,7 +418,7 @@ def test_held_orders_last_and_are_shared():
 
 
 def quiet(**changes):
-    """No exploration but what is asked for."""
+    """A configuration without exploration except for ``changes``."""
     return replace(TrainConfig(), worlds=400, together=0.0, agreement=0.0, least_exploration=0.0, capacity=40_000, **changes)
 
 
@@ -449,7 +449,7 @@ def test_a_torn_team_agrees_on_a_members_order():
     allowed[:, 0, 3] = False
     chosen = np.concatenate([explore(best, cold, rng, last=last, allowed=allowed) for _ in range(30)])
     assert (chosen[:, 0] == 1).all() and (chosen[:, 1:] == 3).all(axis=1).any()
-    for unmoved in (best, np.full_like(best, 3)):  # nobody wants to change; all want the same
+    for unmoved in (best, np.full_like(best, 3)):  # no agent wants to change; all agents want the same
         assert (explore(unmoved, cold, rng, last=best if unmoved is best else last) == unmoved).all()
 
 
@@ -507,7 +507,7 @@ def test_shaped_reward_by_hand():
 
 
 def test_what_an_agent_does_when_lost_is_its_own_business():
-    """The others' returns go on past the decision in which one agent is lost; its own ends there, without a bootstrap."""
+    """The others' returns continue past the decision in which one agent is lost; its own ends there, without a bootstrap."""
     replay = Replay(4, 1, 2, 1)
     for k in range(4):
         replay.store(
@@ -594,8 +594,9 @@ def test_unknown_preset():
 
 @pytest.mark.parametrize(("exploring_starts", "capacity", "rows"), [(0.0, 600, 100), (0.0, 360, 90), (0.5, 600, 84)])
 def test_states_are_hashed_once_the_buffer_has_seen_the_mission(exploring_starts, capacity, rows, monkeypatch):
-    """After a whole mission's decisions where all episodes begin at the start, after the warm-up otherwise; only decisions that
-    have a code of their own cool a temperature.
+    """Hashing begins after a whole mission's decisions if all episodes begin at the start, else after the warm-up.
+
+    Only decisions that have a code of their own cool a temperature.
     """
     config = make_config(
         "fast", worlds=4, interval=20, hidden=(4,), batch=8, updates=1, capacity=capacity, threads=1,

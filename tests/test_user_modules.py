@@ -1,4 +1,4 @@
-"""Users' Python files: the same in every process and folder, anew after an edit, and every slip in one line."""
+"""Users' Python files: the same in every process and folder, reloaded after an edit, every mistake reported in one line."""
 
 import json
 import linecache
@@ -84,7 +84,7 @@ print(json.dumps(ctrl.tolist()))
 
 @pytest.fixture
 def skate(tmp_path: Path) -> Path:
-    """A robot whose file uses another one beside it."""
+    """The path of a robot's file that imports another file beside it."""
     folder = tmp_path / "skate"
     folder.mkdir()
     (folder / "skate.xml").write_text(SKATE)
@@ -94,7 +94,7 @@ def skate(tmp_path: Path) -> Path:
 
 
 def in_a_process(name: str, cwd: Path) -> list[float]:
-    """Controls that a new process has for a force of 1 along both axes."""
+    """Controls that a new process computes for a force of 1 N along both axes."""
     environment = {**os.environ, "PYTHONPATH": ":".join(p for p in sys.path if p)}
     environment.pop("NUMBA_CACHE_DIR", None)
     done = subprocess.run(
@@ -106,7 +106,7 @@ def in_a_process(name: str, cwd: Path) -> list[float]:
 
 @pytest.mark.slow
 def test_a_users_robot_is_the_same_in_every_process(skate, tmp_path):
-    """The second one included, from another folder, by another spelling; after an edit of a helper it is the edited one."""
+    """This includes later processes, other folders and other spellings; after an edit of a helper, the edited one is used."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]
     assert in_a_process("skate.py", skate.parent) == in_a_process("skate/skate.py:ROBOT", tmp_path) == [0.5, 0.5]
     skate.with_name("helper.py").write_text(HELPER.replace("0.5", "0.8"))
@@ -118,7 +118,7 @@ def test_a_users_robot_is_the_same_in_every_process(skate, tmp_path):
 
 
 def test_a_robot_is_made_anew_after_an_edit_or_in_another_folder(skate, tmp_path, monkeypatch):
-    """In the same process, as in a notebook: of its file, of a helper, of its MJCF; without one it is the same object."""
+    """In one process, as in a notebook, its file, a helper or its MJCF is edited; without an edit it is the same object."""
     monkeypatch.chdir(skate.parent)
 
     def made() -> tuple[float, float, float]:
@@ -142,7 +142,7 @@ def test_a_robot_is_made_anew_after_an_edit_or_in_another_folder(skate, tmp_path
 
 @pytest.mark.slow
 def test_torn_files_of_the_cache_are_compiled_anew(skate, tmp_path):
-    """Whatever another program left there."""
+    """Any content that another program left there is replaced."""
     assert in_a_process(str(skate), tmp_path) == [0.5, 0.5]
     for file in (skate.parent / "__pycache__").glob("*.nb?"):
         file.write_bytes(b"torn")
@@ -150,7 +150,7 @@ def test_torn_files_of_the_cache_are_compiled_anew(skate, tmp_path):
 
 
 def test_helpers_of_one_name_in_two_folders_are_two(skate, tmp_path):
-    """In one process: each file sees the one beside it."""
+    """In one process, each file imports the helper beside it."""
     moved = shutil.copytree(skate.parent, tmp_path / "moved")
     (moved / "helper.py").write_text(HELPER.replace("0.5", "0.3"))
     found = []
@@ -162,7 +162,7 @@ def test_helpers_of_one_name_in_two_folders_are_two(skate, tmp_path):
 
 
 def add_up(count):
-    """0 + 1 + ... in a loop that threads may share."""
+    """0 + 1 + ... + (count - 1), in a loop that threads may share."""
     total = 0
     for k in numba.prange(count):
         total += k
@@ -170,7 +170,7 @@ def add_up(count):
 
 
 def test_without_a_folder_for_the_cache_code_is_compiled_in_memory(monkeypatch):
-    """As in a container whose package and home are read-only: slower, and nothing else."""
+    """This happens in a container with a read-only package and home; it is slower, but otherwise the same."""
     njit = compiling.numba.njit
 
     def refuse(*, cache=False, **options):
@@ -184,7 +184,7 @@ def test_without_a_folder_for_the_cache_code_is_compiled_in_memory(monkeypatch):
 
 
 def test_matplotlib_gets_a_folder_where_its_own_cannot_be_written(monkeypatch, tmp_path):
-    """A home that is a file cannot hold one; a folder that is named already, or can be made, is left alone."""
+    """A home that is a file cannot hold its folder; a folder that is already set, or can be created, is kept."""
     for name in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setenv("HOME", str(tmp_path))
@@ -227,13 +227,13 @@ def breaks(): raise KeyError("gain")
 
 @pytest.fixture
 def mine(tmp_path: Path) -> str:
-    """A file with supervisors, controllers and scenarios."""
+    """The path of a file with supervisors, controllers and scenarios."""
     (tmp_path / "mine.py").write_text(MINE)
     return str(tmp_path / "mine.py")
 
 
 def test_names_in_a_users_file_are_taken(mine):
-    """Objects, classes and functions, of every kind; files are named without their folder."""
+    """Objects, classes and functions of every kind can be named; keys of methods leave out the file's folder."""
     assert make_controller(f"{mine}:soft") == PD(25.0, 10.0) and make_controller(f"{mine}:STIFF") == PD(64.0, 16.0)
     assert isinstance(make_supervisor(f"{mine}:Careful"), OneTeam)
     assert type(make_supervisor(f"{mine}:SCRIPT")).__name__ == "Scripted"
@@ -245,7 +245,7 @@ def test_names_in_a_users_file_are_taken(mine):
 
 
 def test_what_is_in_a_users_file_goes_to_another_process(mine, tmp_path):
-    """A pickle finds the file again, where the package is installed; without the file it says which module is missing."""
+    """A pickle finds the file again wherever the package is installed; without the file, the error names the missing module."""
     kept = pickle.dumps(make_supervisor(f"{mine}:Careful"))
     code = "import pickle, sys; print(type(pickle.load(sys.stdin.buffer)).__name__)"
     environment = {**os.environ, "PYTHONPATH": ":".join(p for p in sys.path if p)}
@@ -280,14 +280,14 @@ class Push:
 
 
 def test_a_law_of_a_notebook_runs_and_travels(monkeypatch, tmp_path):
-    """``__main__`` without a file: it runs compiled, and a copy by cloudpickle is compiled anew."""
+    """A law in a ``__main__`` without a file runs compiled, and a copy made by cloudpickle is compiled anew."""
     main, paths = ModuleType("__main__"), ModuleType("IPython.paths")
-    vars(paths)["get_ipython_cache_dir"] = lambda: str(tmp_path)  # which numba asks
+    vars(paths)["get_ipython_cache_dir"] = lambda: str(tmp_path)  # numba calls it
     monkeypatch.setitem(sys.modules, "IPython", ModuleType("IPython"))
     monkeypatch.setitem(sys.modules, "IPython.paths", paths)
     monkeypatch.setitem(sys.modules, "__main__", main)
     cell, lines = "<ipython-input-3-0123456789ab>", NOTEBOOK.splitlines(keepends=True)
-    monkeypatch.setitem(linecache.cache, cell, (len(NOTEBOOK), None, lines, cell))  # as IPython keeps what was typed
+    monkeypatch.setitem(linecache.cache, cell, (len(NOTEBOOK), None, lines, cell))  # as IPython stores a cell
     exec(compile(NOTEBOOK, cell, "exec"), vars(main))
     world = World(paper(duration=0.5), main.Push())
     orders = np.zeros((1, 4), dtype=np.int64)
@@ -300,7 +300,7 @@ def test_a_law_of_a_notebook_runs_and_travels(monkeypatch, tmp_path):
 
 
 def test_a_checkpoint_is_a_supervisor_by_its_path():
-    """As the shipped ones are by their names."""
+    """Shipped checkpoints are supervisors by their names, other checkpoints by their paths."""
     path = str(shipped("marlms"))
     assert isinstance(make_supervisor(path), Learned) and method_key(path, "sorlc") == "marlms+sorlc"
     with pytest.raises(ConfigurationError, match=r"gone.safetensors"):
@@ -310,24 +310,24 @@ def test_a_checkpoint_is_a_supervisor_by_its_path():
 @pytest.mark.parametrize(
     ("make", "attribute", "message"),
     [
-        (make_controller, "Careful", "is no controller: Careful lacks law, limited"),
-        (make_supervisor, "STIFF", "is no supervisor: PD lacks start, decide"),
-        (make_scenario, "STIFF", "is no Scenario, but PD"),
+        (make_controller, "Careful", "is not a controller: Careful lacks law, limited"),
+        (make_supervisor, "STIFF", "is not a supervisor: PD lacks start, decide"),
+        (make_scenario, "STIFF", "is not a Scenario but PD"),
         (make_controller, "leaves", r"leaves\(\) fails: it calls sys.exit\(5\)"),
         (make_supervisor, "breaks", r"breaks\(\) fails: KeyError: 'gain'"),
-        (make_controller, "number", "is no controller: int lacks"),
+        (make_controller, "number", "is not a controller: int lacks"),
         (make_controller, "gone", "has nothing named 'gone'; it has: .*STIFF"),
         (make_robot, "number", "defines neither ROBOT"),
     ],
 )
 def test_what_is_something_else_is_refused(make, attribute, message, mine):
-    """By what it lacks."""
+    """The error says what it lacks or how it fails."""
     with pytest.raises(ConfigurationError, match=message):
         make(f"{mine}:{attribute}")
 
 
 def test_files_that_are_not_there_or_fail_are_named(tmp_path):
-    """For every kind."""
+    """This holds for controllers, supervisors, scenarios and robots."""
     for make in (make_controller, make_supervisor, make_scenario, make_robot):
         with pytest.raises(ConfigurationError, match="gone.py"):
             make(f"{tmp_path}/gone.py:Mine")
@@ -350,15 +350,15 @@ def test_files_that_are_not_there_or_fail_are_named(tmp_path):
     ],
 )
 def test_a_law_that_leaves_its_arrays_fails_its_check(line, said, skate):
-    """It is run as plain Python first, its compiled helpers too, and nothing of it is run as compiled code."""
+    """The law and its compiled helpers are first run as plain Python, and then not at all as compiled code."""
     text = SKATE_PY.replace("@laws.drive", "@laws.allocation_free\ndef beyond(x):\n    return x[7]\n\n\n@laws.drive", 1)
     skate.write_text(text.replace("    ctrl_out[1] = helper", f"    {line}\n    ctrl_out[1] = helper"))
     items = list(checklist(str(skate)))
-    assert items[-1].name == "laws" and not items[-1].passed and said in items[-1].said
+    assert items[-1].name == "laws" and not items[-1].passed and said in items[-1].detail
 
 
 def test_a_plain_law_is_plain_down_to_its_helpers():
-    """And gives the same numbers."""
+    """It gives the same numbers as the compiled law."""
     robot = make_robot("crazyflie")
     gains, ctrl = laws.as_gains(robot.drive, robot.params), np.zeros((2, 4))
     pose, force = np.array([0.1, 0.2, 0.2, 1.0, 0.01, 0.02, 0.0]), np.array([0.02, -0.01])
@@ -369,7 +369,7 @@ def test_a_plain_law_is_plain_down_to_its_helpers():
 
 
 def test_a_law_with_another_number_of_arguments_is_refused():
-    """Where it is declared, with what it is called with."""
+    """The error is raised where it is declared, and lists the arguments that it is called with."""
     with pytest.raises(
         ConfigurationError, match=r"law 'short' takes \(gains, state, qpos, qvel, force, ctrl_out\), .* h, ctrl_out\)"
     ):

@@ -1,4 +1,4 @@
-"""Users' laws and supervisors that raise errors, or return something else than they should: one line with where and what."""
+"""Users' laws and supervisors that raise errors or return wrong values: one line says where and what."""
 
 import sys
 from dataclasses import dataclass, field
@@ -20,7 +20,7 @@ JOINT = np.zeros((1, 4), dtype=np.int64)
 
 
 def plain_law(body: Any) -> Any:
-    """A plain controller law."""
+    """A controller law in plain Python that writes ``body(gains, p)`` as the force."""
 
     def law(gains, state, p, v, p_r, v_r, drag, h, force_out):
         force_out[:] = body(gains, p)
@@ -30,7 +30,7 @@ def plain_law(body: Any) -> Any:
 
 @dataclass(frozen=True)
 class Mine:
-    """A controller whose parts may be wrong."""
+    """A controller with parts that may be wrong."""
 
     law: Any = field(default_factory=lambda: plain_law(lambda gains, p: 0.0))
     limited: Any = True
@@ -61,7 +61,7 @@ LAWS = {
 
 @pytest.mark.parametrize("name", LAWS)
 def test_a_law_that_fails_is_named(name):
-    """With the line in the user's file; in a World, in Gymnasium and in dm_control."""
+    """The error names the law, in a World, in Gymnasium and in dm_control; an exception also has its line in the user's file."""
     controller, said = LAWS[name]
     env = PaperFormation(controller=controller, duration=0.5)
     env.reset(seed=0)
@@ -78,7 +78,7 @@ def test_a_law_that_fails_is_named(name):
 
 
 PARTS = {
-    "nothing": (3, "is no controller: int lacks law"),
+    "nothing": (3, "is not a controller: int lacks law"),
     "no law": (Mine(law=3), "its law is 3"),
     "gains that fail": (Mine(gains=broken), r"controller Mine: params\(\) fails: KeyError: 'stiffness'"),
     "gains that are texts": (Mine(gains=("a",)), "the gains of law 'law' must be numbers"),
@@ -98,9 +98,9 @@ def test_a_wrong_part_of_a_controller_is_named(name):
 
 
 def test_a_class_in_place_of_what_it_makes():
-    with pytest.raises(ConfigurationError, match=r"controller is the class PD; make one of it: PD\(\)"):
+    with pytest.raises(ConfigurationError, match=r"controller is the class PD; create an instance: PD\(\)"):
         World(paper(duration=0.5), PD)
-    with pytest.raises(ConfigurationError, match=r"supervisor is the class Decider; make one of it: Decider\(\)"):
+    with pytest.raises(ConfigurationError, match=r"supervisor is the class Decider; create an instance: Decider\(\)"):
         run_episode(World(paper(duration=0.5), PD(), record=True), Decider)
 
 
@@ -160,14 +160,14 @@ def helped(gains, state, p, v, p_r, v_r, drag, h, force_out):
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="nothing is compiled")
 @pytest.mark.parametrize("law", [asserting, helped])
 def test_a_compiled_law_cannot_raise(law):
-    """Threads would lose it: it is refused before it flies, and told what to do."""
+    """Threads would lose the error, so the law is refused before it runs."""
     with pytest.raises(ConfigurationError, match=rf"law '{law.__name__}' raises an error \(test_users_faults.py, line \d+\)"):
         World(paper(duration=0.5), Mine(law, gains={"limit": 1.0}))
 
 
 @dataclass(frozen=True)
 class Decider:
-    """A supervisor whose answers may be wrong."""
+    """A supervisor that may return wrong answers."""
 
     answer: Any
     memory: Any = 0

@@ -1,4 +1,4 @@
-"""ORCA and the second-order barrier function: planes by hand and by another implementation, and the program that they share."""
+"""ORCA and the second-order barrier function: planes checked by hand and by another implementation, and their shared program."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 
 def solve(planes: np.ndarray, wish, speed: float) -> tuple[np.ndarray, bool]:
-    """Velocity (2,), and whether all half-planes (K, 3) hold."""
+    """The velocity (2,) nearest to ``wish``, and whether all half-planes (K, 3) hold."""
     rows, out = np.zeros((2 * len(planes) + 1, 4)), np.empty(2)
     rows[: len(planes), :3] = planes
     held = closest(np.asarray(wish, dtype=float), speed, rows, len(planes), out)
@@ -32,7 +32,7 @@ def solve(planes: np.ndarray, wish, speed: float) -> tuple[np.ndarray, bool]:
 
 
 def random_planes(rng: np.random.Generator, count: int, through: float) -> np.ndarray:
-    """(count, 3) half-planes; all hold at a common point where ``through`` is 0, most contradict where it is large."""
+    """(count, 3) half-planes; all hold at a common point if ``through`` is 0, most contradict each other if it is large."""
     angle = rng.uniform(0, 2 * np.pi, count)
     normals = np.column_stack([np.cos(angle), np.sin(angle)])
     common = rng.uniform(-1, 1, 2)
@@ -40,9 +40,7 @@ def random_planes(rng: np.random.Generator, count: int, through: float) -> np.nd
 
 
 def corners(planes: np.ndarray, wish: np.ndarray, speed: float) -> np.ndarray:
-    """Every point at which the optimum can lie: the desired velocity, its feet on lines and circle, and where two of these
-    meet.
-    """
+    """All points that can be the optimum: the desired velocity, its projections on lines and circle, and intersections."""
     points = [wish, wish * speed / np.linalg.norm(wish)]
     for n, c in zip(planes[:, :2], planes[:, 2], strict=True):
         points.append(wish + (c - n @ wish) * n)
@@ -58,7 +56,7 @@ def corners(planes: np.ndarray, wish: np.ndarray, speed: float) -> np.ndarray:
 
 @given(seeds, st.integers(0, 7))
 def test_the_program_finds_the_nearest_of_all_corners(seed, count):
-    """Feasible problems in the disc of radius 2: as near as the best of the finitely many candidates."""
+    """For feasible problems in the disc of radius 2, the result is as near as the best of the finitely many candidates."""
     rng = np.random.default_rng(seed)
     planes, wish = random_planes(rng, count, 0.0), rng.uniform(-4, 4, 2)
     v, held = solve(planes, wish, 2.0)
@@ -71,7 +69,7 @@ def test_the_program_finds_the_nearest_of_all_corners(seed, count):
 
 @given(seeds, st.integers(3, 8))
 def test_where_half_planes_contradict_the_greatest_violation_is_least(seed, count):
-    """Against a linear program over v and the violation z, the disc a polygon of 360 sides around it."""
+    """Compared with a linear program over v and the violation z, in which the disc is a circumscribed polygon of 360 sides."""
     rng = np.random.default_rng(seed)
     planes = random_planes(rng, count, 1.0)
     v, held = solve(planes, rng.uniform(-1, 1, 2), 2.0)
@@ -89,21 +87,21 @@ def test_where_half_planes_contradict_the_greatest_violation_is_least(seed, coun
 
 
 def plane_for(x, relative, radius: float, v=(0.0, 0.0), share: float = 1.0, times=(2.0, 0.05)) -> np.ndarray:
-    """The half-plane of an agent at ``v`` for a body at ``x`` that moves relative to it."""
+    """The half-plane of an agent of velocity ``v`` for a body at relative position ``x`` and velocity ``relative``."""
     plane = np.empty(3)
     orca_plane(np.array([x, relative], dtype=float), radius, np.asarray(v, dtype=float), share, times, plane)
     return plane
 
 
 def least_distance(x: np.ndarray, relative: np.ndarray, within: float) -> float:
-    """Of two bodies at relative position x, relative velocity ``relative``, over [0, within]."""
+    """Least distance of two bodies at relative position x and relative velocity ``relative``, over [0, within]."""
     when = np.clip(-(x @ relative) / max(relative @ relative, 1e-300), 0.0, within)
     return float(np.linalg.norm(x + when * relative))
 
 
 @given(seeds)
 def test_on_the_line_of_a_body_the_agent_just_touches_it(seed):
-    """Changing the velocity by u, straight to the line, makes the least distance within the horizon the radius, exactly."""
+    """After a change of velocity by u, the shortest to the line, the least distance within the horizon is exactly the radius."""
     rng = np.random.default_rng(seed)
     radius = rng.uniform(0.5, 2.0)
     turn = rng.uniform(0, 2 * np.pi)
@@ -117,7 +115,7 @@ def test_on_the_line_of_a_body_the_agent_just_touches_it(seed):
 
 
 def test_two_agents_share_what_one_would_do_alone():
-    """Half of u each; and at rest an agent may cross the gap of 3 m in no less than the horizon of 2 s."""
+    """Each takes half of u; towards a body at rest, an agent may cross a gap of 3 m in no less than the horizon of 2 s."""
     whole = plane_for((4.0, 0.0), (-4.0, 0.0), 1.0, v=(2.0, 0.0))
     half = plane_for((4.0, 0.0), (-4.0, 0.0), 1.0, v=(2.0, 0.0), share=0.5)
     assert half[2] - half[:2] @ (2.0, 0.0) == pytest.approx(0.5 * (whole[2] - whole[:2] @ (2.0, 0.0)))
@@ -126,14 +124,14 @@ def test_two_agents_share_what_one_would_do_alone():
 
 
 def test_bodies_that_overlap_part_within_one_mission_step():
-    """0.1 m too near: at least 2 m/s apart, of which an agent takes half."""
+    """Bodies 0.1 m too near must part at 2 m/s or faster, of which an agent takes half."""
     plane = plane_for((0.9, 0.0), (0.0, 0.0), 1.0, share=0.5)
     np.testing.assert_allclose(plane, [-1.0, 0.0, 1.0], atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_orca_agrees_with_the_reference_implementation(seed):
-    """RVO2 by way of pyrvo (single precision): the velocities of five agents on their way, one step on."""
+    """The reference is RVO2 through pyrvo (single precision): velocities of five moving agents after one step."""
     pyrvo = pytest.importorskip("pyrvo")
     rng = np.random.default_rng(seed)
     radius, most, tau, dt = 0.75, 6.0, 2.0, 0.05
@@ -165,7 +163,7 @@ def barrier(x, relative, least: float, pole: float = 3.0, share: float = 1.0) ->
 
 
 def test_a_barrier_by_hand():
-    """2 m from a wall-like body, least 1 m, approaching at 1 m/s, pole 3: n.a >= -(6 * -1 + 9 * 1) = -3; sideways adds v^2/D."""
+    """At 2 m from a body, at least 1 m allowed, approach at 1 m/s, pole 3: n.a >= -(6 * -1 + 9 * 1) = -3; sideways adds v^2/D."""
     np.testing.assert_allclose(barrier((2.0, 0.0), (-1.0, 0.0), 1.0), [-1.0, 0.0, -3.0], atol=1e-12)
     np.testing.assert_allclose(barrier((2.0, 0.0), (-1.0, 2.0), 1.0), [-1.0, 0.0, -5.0], atol=1e-12)
     np.testing.assert_allclose(barrier((2.0, 0.0), (-1.0, 0.0), 1.0, share=0.5), [-1.0, 0.0, -1.5], atol=1e-12)
@@ -174,7 +172,7 @@ def test_a_barrier_by_hand():
 
 @given(seeds)
 def test_the_derivatives_in_a_barrier_are_those_of_the_distance(seed):
-    """h'' + 2 rho h' + rho^2 h = 0 on the line, h by finite differences along the motion with that acceleration."""
+    """h'' + 2 rho h' + rho^2 h = 0 on the line, with finite differences of h along the motion with that acceleration."""
     rng = np.random.default_rng(seed)
     x, relative = rng.uniform(1.0, 3.0, 2), rng.uniform(-2, 2, 2)
     plane = barrier(x, relative, 1.0)
@@ -189,7 +187,7 @@ def test_the_derivatives_in_a_barrier_are_those_of_the_distance(seed):
 
 @pytest.mark.parametrize("name", ["orca", "cbf-qp"])
 def test_far_from_everything_the_wish_is_granted(name):
-    """In formation, nothing near: the path's velocity; and the label is FM."""
+    """In formation with nothing near, the velocity is the path's and the orders are FM."""
     supervisor, observation = make_supervisor(name), World(OPEN).observe()
     memory = supervisor.start(OPEN, 1)
     for _ in range(100):
@@ -200,7 +198,7 @@ def test_far_from_everything_the_wish_is_granted(name):
 
 @pytest.mark.parametrize("name", ["orca", "cbf-qp"])
 def test_no_agent_comes_too_near_anything(name):
-    """Held-out layouts of the field, with obstacles at rest and moving: no violation, no collision, whether it arrives or not."""
+    """On held-out layouts with obstacles at rest or moving, nothing is violated or hit, whether the team arrives or not."""
     for family in ("field", "traffic", "gates"):
         scenario = held_out(make_scenario(family))
         found = outcome(measure(run_episode(World(scenario, record=True), make_supervisor(name), seed=7200)), scenario)

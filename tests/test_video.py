@@ -38,12 +38,12 @@ SMALL: dict[str, Any] = {"size": (320, 180)}
 
 @pytest.fixture(scope="module")
 def log(episode: Episode) -> EpisodeLog:
-    """The case study under the scripted supervisor, with SORLC."""
+    """Log of the case study under the scripted supervisor, with SORLC."""
     return from_trajectory(episode("scripted", "sorlc"), SORLC())
 
 
 def _look(log: EpisodeLog, camera: str, time: float, points: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """A picture without bars, 640 x 360, and the pixels (P, 2) of points (P, 3), of the agents' middles by default."""
+    """A picture of 640 x 360 without bars, and the pixels (P, 2) of points (P, 3), by default the agents' centers."""
     stage = make_stage(log)
     size = 640, 360
     with Offscreen(stage, make_camera(camera, stage, size[0] / size[1]), *size) as offscreen:
@@ -54,20 +54,20 @@ def _look(log: EpisodeLog, camera: str, time: float, points: np.ndarray | None =
 
 
 def _hue(color: np.ndarray) -> np.ndarray:
-    """Direction of a color from gray, which light and shade leave alone."""
+    """Direction of a color from gray, which light and shade do not change."""
     difference = np.asarray(color, dtype=float) - np.mean(color)
     return np.asarray(difference / np.linalg.norm(difference))
 
 
 def _read(path: Path) -> tuple[str, np.ndarray]:
-    """What ffmpeg says of a video, and its frames (F, 180, 320, 3)."""
+    """ffmpeg's report on a video, and its frames (F, 180, 320, 3)."""
     command = [imageio_ffmpeg.get_ffmpeg_exe(), "-i", str(path), "-f", "rawvideo", "-pix_fmt", "rgb24", "-"]
     done = subprocess.run(command, capture_output=True, check=True)
     return done.stderr.decode(), np.frombuffer(done.stdout, np.uint8).reshape(-1, 180, 320, 3)
 
 
 def test_video_decodes_to_what_was_asked_for(log: EpisodeLog, tmp_path: Path) -> None:
-    """Two seconds of the mission at 4x and 20 frames a second are ten frames, and the first one is the still of its time."""
+    """Two seconds of the mission at 4x and 20 frames per second are ten frames, and the first shows the still of its time."""
     path = tmp_path / "clip.mp4"
     counted: list[tuple[int, int]] = []
     count = render_video(log, path, VideoStyle(start=19, end=21, fps=20, **SMALL), progress=lambda *done: counted.append(done))
@@ -84,7 +84,7 @@ def test_video_decodes_to_what_was_asked_for(log: EpisodeLog, tmp_path: Path) ->
 
 @pytest.mark.parametrize("suffix", [".webp", ".gif"])
 def test_animations_repeat_for_ever_and_show_the_frames(log: EpisodeLog, tmp_path: Path, suffix: str) -> None:
-    """Five frames of 0.1 s, of which the first one is the still of its time."""
+    """They have five frames of 0.1 s, and the first shows the still of its time."""
     path = tmp_path / f"clip{suffix}"
     assert render_video(log, path, VideoStyle(start=19, end=21, fps=10, samples=4, **SMALL)) == 5
     with Image.open(path) as animation:
@@ -102,14 +102,14 @@ def test_animations_repeat_for_ever_and_show_the_frames(log: EpisodeLog, tmp_pat
     "text", ["1280", "1280x", "x720", "12.5x3", "1280x720x3", "-64x64", "99999999999x64", "66x65", "\u00b2x64"]
 )
 def test_a_wrong_size_is_named(text: str) -> None:
-    """With what a size looks like."""
+    """The error shows an example of a size."""
     with pytest.raises(ConfigurationError, match=f"size must be two even numbers .*, 1280x720 for example; got '?{text}"):
         parse_size(text)
     assert parse_size("640X360") == (640, 360)
 
 
 def test_video_replaces_a_file_only_when_told(log: EpisodeLog, tmp_path: Path) -> None:
-    """An existing file stays as it is, unless overwriting is asked for."""
+    """An existing file is kept unless ``overwrite`` is set."""
     path = tmp_path / "clip.mp4"
     path.write_bytes(b"mine")
     with pytest.raises(ConfigurationError, match="exists"):
@@ -133,14 +133,14 @@ def test_interrupted_video_leaves_nothing(log: EpisodeLog, tmp_path: Path) -> No
 @pytest.mark.parametrize("camera", ["track", "top", "wide"])
 @pytest.mark.parametrize("time", [20.0, 65.0])
 def test_agents_are_where_they_are_projected(log: EpisodeLog, camera: str, time: float) -> None:
-    """The pixel at an agent's projected middle has the agent's hue."""
+    """The pixel at an agent's projected center has the agent's hue."""
     picture, pixels = _look(log, camera, time)
     for agent, (column, row) in enumerate(pixels):
         assert _hue(picture[row, column]) @ _hue(np.array(agent_color(agent)[:3])) > 0.95
 
 
 def test_halo_has_the_color_of_the_command(log: EpisodeLog) -> None:
-    """While agent 1 avoids an obstacle its halo is that of OA, the others' is that of FM."""
+    """While agent 1 avoids an obstacle, its halo has OA's color, the others' halos have FM's."""
     stage = make_stage(log)
     stage.pose(20.0)
     rims = stage.middles() + np.array([1.22 * stage.radii[0], 0.0, 0.1 - stage.radii[0]])
@@ -152,14 +152,14 @@ def test_halo_has_the_color_of_the_command(log: EpisodeLog) -> None:
 
 
 def test_picture_follows_the_log(log: EpisodeLog) -> None:
-    """The same time gives the same pixels, another one others."""
+    """The same time gives the same pixels, another time different ones."""
     first, again, later = (_look(log, "top", time)[0] for time in (10.0, 10.0, 12.0))
     np.testing.assert_array_equal(first, again)
     assert (first != later).any(axis=2).sum() > 50
 
 
 def test_obstacle_is_drawn_where_the_log_has_it(log: EpisodeLog) -> None:
-    """The model has the nominal place; a perturbed episode's log has its own."""
+    """The model has the nominal position, but a perturbed episode's log has its own, which is drawn."""
     obstacles = log.obstacles.copy()
     obstacles[2, :2] = 10.0, -4.0
     moved = replace(log, obstacles=obstacles)
@@ -191,7 +191,7 @@ def test_corners_stay_close_to_the_path() -> None:
 
 
 def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
-    """100 s at 4x and 30 frames a second are 750 frames, the last one before the end."""
+    """100 s at 4x and 30 frames per second are 750 frames, the last one before the end."""
     times = frame_times(log, speed=4.0, fps=30, start=None, end=None)
     assert len(times) == 750
     assert times[0] == 0.0
@@ -216,14 +216,14 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
     ],
 )
 def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, Any], message: str) -> None:
-    """What cannot be used is refused before anything is written."""
+    """Invalid settings are refused before anything is written."""
     with pytest.raises(ConfigurationError, match=message):
         render_video(log, tmp_path / "clip.mp4", VideoStyle(**{**SMALL, **changes}))
     assert list(tmp_path.iterdir()) == []
 
 
 def test_wrong_files_and_logs_are_named(log: EpisodeLog, tmp_path: Path) -> None:
-    """A name that is no video's, a folder that cannot be made, a log without steps or with another's model."""
+    """Refused are unknown video formats, folders that cannot be created, and logs without steps or with a foreign model."""
     with pytest.raises(ConfigurationError, match=r"must end in \.mp4, \.webp or \.gif, got 'clip.avi'"):
         render_video(log, tmp_path / "clip.avi")
     (tmp_path / "none").touch()
@@ -236,14 +236,14 @@ def test_wrong_files_and_logs_are_named(log: EpisodeLog, tmp_path: Path) -> None
 
 
 def test_top_camera_of_the_model_sees_the_mission(log: EpisodeLog) -> None:
-    """As it is in the MJCF, in a 16:9 picture, for anyone who renders the model without this package."""
+    """The camera in the MJCF does so in a 16:9 picture, for users who render the model without this package."""
     model = mujoco.MjModel.from_xml_string(log.mjcf)
     half = model.camera("top").pos[2] * np.tan(np.radians(0.5 * model.camera("top").fovy[0])) * np.array([16 / 9, 1.0])
     assert (np.abs(log.position - model.camera("top").pos[:2]) < half).all()
 
 
 def _choose_in_a_new_process(**environment: str) -> str:
-    """What choose_gl says there."""
+    """The output of choose_gl in a new process with these environment variables."""
     code = (
         "import sys\nfrom marlbc_mj.util.errors import ConfigurationError\nfrom marlbc_mj.recording.gl import choose_gl\n"
         "assert 'mujoco' not in sys.modules\n"
@@ -255,7 +255,7 @@ def _choose_in_a_new_process(**environment: str) -> str:
 
 
 def test_missing_opengl_is_one_clear_line() -> None:
-    """It names the packages that help; here EGL's loader finds no driver."""
+    """If EGL's loader finds no driver, the error names the packages that help."""
     said = _choose_in_a_new_process(MUJOCO_GL="egl", __EGL_VENDOR_LIBRARY_DIRS="/nonexistent")
     assert said.count("\n") == 1
     for part in ("tried egl", "libegl1 libgl1-mesa-dri", "libosmesa6", "MUJOCO_GL=osmesa"):
@@ -270,7 +270,7 @@ def test_gl_setting_is_respected() -> None:
 
 
 def test_viewer_without_display_says_what_to_do(log: EpisodeLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line, which names the other way to see the episode."""
+    """The error names the other way to see the episode."""
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
@@ -300,7 +300,7 @@ SIGHTS = {
     "deuteranopia": [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]],
     "protanopia": [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]],
 }
-"""What linear RGB becomes, by sight (Machado, Oliveira and Fernandes 2009)."""
+"""Matrices that map linear RGB to its appearance for each kind of vision (Machado, Oliveira and Fernandes 2009)."""
 
 
 def _linear(color: str) -> np.ndarray:
@@ -309,7 +309,7 @@ def _linear(color: str) -> np.ndarray:
 
 
 def _lab(color: str, sight: str) -> np.ndarray:
-    """CIELAB of a color as a sight sees it."""
+    """CIELAB coordinates of a color as it appears to one kind of vision."""
     to_xyz = np.array([[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]])
     seen = np.clip(np.array(SIGHTS[sight]) @ _linear(color), 0.0, 1.0)
     x, y, z = np.cbrt(to_xyz @ seen / [0.95047, 1.0, 1.08883])
@@ -318,7 +318,7 @@ def _lab(color: str, sight: str) -> np.ndarray:
 
 @pytest.mark.parametrize(("sight", "least"), [("normal", 30.0), ("deuteranopia", 10.0), ("protanopia", 10.0)])
 def test_agents_and_behaviors_share_no_color(sight: str, least: float) -> None:
-    """The first four agents' colors differ from each other and from behaviors' in CIELAB, the others' for normal sight."""
+    """The first four agents' colors differ from each other and behaviors' in CIELAB, the rest from behaviors' in normal sight."""
     agents = [_lab(color, sight) for color in (AGENT_COLORS if sight == "normal" else AGENT_COLORS[:4])]
     behaviors = [_lab(color, sight) for color in BEHAVIOR_COLORS.values()]
     assert min(np.linalg.norm(a - b) for a in agents for b in behaviors) > least
@@ -326,7 +326,7 @@ def test_agents_and_behaviors_share_no_color(sight: str, least: float) -> None:
 
 
 def test_a_poster_is_a_frame_of_the_video(log: EpisodeLog, tmp_path: Path) -> None:
-    """As a JPEG; none beyond the video's end."""
+    """It is a JPEG, and there is none beyond the video's end."""
     render_video(log, tmp_path / "clip.mp4", VideoStyle(start=19, end=21, fps=10, **SMALL))
     with Image.open(BytesIO(poster(tmp_path / "clip.mp4", 0.3))) as picture:
         assert (picture.format, picture.size) == ("JPEG", (320, 180))
@@ -344,13 +344,13 @@ def test_a_poster_is_a_frame_of_the_video(log: EpisodeLog, tmp_path: Path) -> No
     ],
 )
 def test_missions_have_titles(name: str, title: str) -> None:
-    """What people read; a name of one's own stays readable."""
+    """Every scenario and robot has a title for people; a user's own name stays readable."""
     assert mission_title(name) == title
     assert set(MISSION_TITLES) == set(SCENARIOS) and set(ROBOT_TITLES) == set(ROBOTS)
 
 
 @pytest.mark.parametrize("color", [*AGENT_COLORS, *BEHAVIOR_COLORS.values()])
 def test_text_is_readable_on_every_color(color: str) -> None:
-    """At least 2.6 to 1 (WCAG's contrast), which suits large bold text."""
+    """The contrast (WCAG) is at least 2.6 to 1, which suits large bold text."""
     low, high = sorted(float(np.dot([0.2126, 0.7152, 0.0722], _linear(name))) for name in (color, ink_on(color)))
     assert (high + 0.05) / (low + 0.05) > 2.6

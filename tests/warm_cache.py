@@ -1,6 +1,6 @@
-"""Compiles what many tests need before they share it: parallel workers that start without a cache would each compile it all.
+"""Compiles the functions that many tests share, before they run: parallel workers without a cache would each compile them all.
 
-Nothing is done where no source is newer than the last time.
+Does nothing if :func:`state` has not changed since the last time.
 """
 
 import os
@@ -13,13 +13,13 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-DONE = ROOT / ".cache" / "warm"  # what state() was the last time
+DONE = ROOT / ".cache" / "warm"  # file with the state() of the last time
 LOCAL = ("set-based-rule", "lookahead", "orca", "cbf-qp", "marlms-general")
 RULES = ("scripted", "fsams", "fms", "mpcms", "layered", "motor-schema", "fuzzy-blend", "marlms", "rollout")
 
 
 def loop() -> None:
-    """The mission step: on one thread, on two, as Python; robots, obstacles that move, shields."""
+    """Compile the mission step: on one thread, on two, in plain Python, with robots, moving obstacles and a shield."""
     from marlbc_mj import World, make_scenario, paper
 
     scenario, orders = paper(duration=0.5), np.zeros((2, 4), dtype=np.int64)
@@ -34,7 +34,7 @@ def loop() -> None:
 
 
 def decisions() -> None:
-    """What controllers and supervisors compute by themselves; under both compositions, for those that decide on them."""
+    """Compile the laws of controllers and the decisions of supervisors, those in LOCAL under the set-based composition."""
     from marlbc_mj import World, make_controller, make_scenario, make_supervisor, paper, run_episode
     from marlbc_mj.controllers import CONTROLLERS
     from marlbc_mj.core import laws
@@ -51,7 +51,7 @@ def decisions() -> None:
 
 
 def rest() -> None:
-    """The shield alone, as its study of random states has it; robots; networks of one hidden layer."""
+    """Compile the shield alone, as its study of random states uses it, robots, and networks with one hidden layer."""
     from marlbc_mj import World, make_scenario
     from marlbc_mj.core.stopping import ForceBound
     from marlbc_mj.policies.greedy import Policy, best_actions
@@ -68,7 +68,7 @@ def rest() -> None:
 
 
 def state() -> str:
-    """All that compiled code is kept for: sources, pinned packages, Python, and the folder where it is kept."""
+    """Text that changes with whatever compiled code depends on: sources, pinned packages, Python, and the cache folder."""
     sources = [path for folder in ("marlbc_mj", "tasks", "training") for path in (ROOT / folder).rglob("*.py")]
     times = [path.stat().st_mtime_ns for path in (*sources, ROOT / "constraints.txt")]
     return f"{len(times)} {max(times)} {sys.version} {os.environ.get('NUMBA_CACHE_DIR')}"
@@ -78,7 +78,7 @@ if __name__ == "__main__":
     before = state()
     if DONE.is_file() and DONE.read_text() == before:
         sys.exit(0)
-    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # what one has compiled is kept for the others
+    with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:  # each caches what it compiles for the other
         for part in [pool.submit(work) for work in (loop, decisions, rest)]:
             part.result()
     DONE.parent.mkdir(exist_ok=True)

@@ -1,7 +1,7 @@
-"""Is the wheel small, and does it work where nothing else of the project is? ``python tests/wheel.py dist [--install FOLDER]``.
+"""Checks that the wheel is small and works without the rest of the project: ``python tests/wheel.py dist [--install FOLDER]``.
 
-With ``--install`` it goes into a new environment in the folder, which is removed afterwards, and an episode is flown there. What
-is printed: seconds and megabytes of the installation, seconds of each command, a wrong word and an evaluation among them.
+With ``--install`` the wheel is installed into a new environment in the folder, which is removed afterwards, and commands are run
+there, among them an episode, an evaluation, and one with a misspelled name. The times and the installed size are printed.
 """
 
 import argparse
@@ -23,7 +23,7 @@ WRONG_WORD = ("run", "paper", "--supervisor", "scriptd")
 
 
 def the_wheel(folder: Path) -> Path:
-    """The one wheel in a folder; the process ends with 1 where there is none, or it is too large."""
+    """The only wheel in a folder; exits with status 1 if there is not exactly one, or if a distribution is too large."""
     wheels = sorted(folder.glob("*.whl"))
     if len(wheels) != 1:
         sys.exit(f"{folder} holds {len(wheels)} wheels")
@@ -36,7 +36,7 @@ def the_wheel(folder: Path) -> Path:
 
 
 def install(wheel: Path, folder: Path, extras: Sequence[str]) -> None:
-    """A new environment with the wheel, from which commands are run in an empty folder."""
+    """Install the wheel into a new environment in ``folder``, run commands there, and print what they take."""
     shutil.rmtree(folder, ignore_errors=True)
     began = time.monotonic()
     venv.create(folder / "env", with_pip=True)
@@ -59,13 +59,13 @@ def install(wheel: Path, folder: Path, extras: Sequence[str]) -> None:
 
 
 def processor_time() -> float:
-    """Of all commands so far [s]; it says more than the clock where others use the machine."""
+    """Processor time of all commands so far [s]; unlike elapsed time it hardly depends on other load."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 
 
 def call(command: Sequence[str], folder: Path, status: int = 0) -> None:
-    """Run a command in the folder with nothing of the caller's Python; this process ends with 1 where its status is another."""
+    """Run a command in the folder without the caller's Python settings; exit with status 1 if its status is not ``status``."""
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV", "PIP_TARGET")}
     done = subprocess.run(command, cwd=folder, env={**environment, "NUMBA_CACHE_DIR": str(folder.resolve() / "cache")})
     if done.returncode != status:
@@ -73,7 +73,7 @@ def call(command: Sequence[str], folder: Path, status: int = 0) -> None:
 
 
 def main() -> None:
-    """Check the wheel, and install it if asked."""
+    """Check the wheel, and install it if ``--install`` is given."""
     options = argparse.ArgumentParser(description=__doc__)
     options.add_argument("dist", type=Path)
     options.add_argument("--install", type=Path)

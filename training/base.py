@@ -97,7 +97,7 @@ class BaseTrainer(ABC):
         config = self.config
         return config.final_learning_rate + (config.learning_rate - config.final_learning_rate) * max(0.0, 1.0 - share)
 
-    def refuse_nonsense(self) -> None:
+    def check_finite(self) -> None:
         """Raise ConfigurationError if the last update's error is not finite."""
         if not np.isfinite(self.error):
             raise ConfigurationError(f"the networks diverged after {self.steps} mission steps; try a lower learning_rate")
@@ -149,7 +149,7 @@ def check_device(device: str) -> None:
         ConfigurationError: the device is cuda, and torch finds no GPU.
     """
     if device == "cuda" and not torch.cuda.is_available():
-        raise ConfigurationError("device cuda was asked for and torch finds none; choose cpu")
+        raise ConfigurationError("device is cuda, but torch finds no GPU; choose cpu")
 
 
 def single_thread() -> None:

@@ -60,7 +60,7 @@ class MAPPO(BaseTrainer):
         }
         self.row = 0  # number of rows of the rollout filled so far
         self.made = 0  # gradient steps taken
-        self.surprise = 1.0  # mean entropy of the policy at the last update, relative to its maximum
+        self.entropy = 1.0  # mean entropy of the policy at the last update, relative to its maximum
 
     @property
     def updates(self) -> int:
@@ -70,7 +70,7 @@ class MAPPO(BaseTrainer):
     @property
     def temperature(self) -> float:
         """Mean entropy of the actors, 1 if all actions are equally likely."""
-        return self.surprise
+        return self.entropy
 
     @property
     def network(self) -> TeamNetwork:
@@ -135,8 +135,8 @@ class MAPPO(BaseTrainer):
                 self.optimiser.step()
                 self.made += 1
                 self.error = float((returns[:, part] - value).detach().abs().mean())
-                self.surprise = float(entropy.detach().mean()) / float(np.log(self.batch.actions))
-        self.refuse_nonsense()
+                self.entropy = float(entropy.detach().mean()) / float(np.log(self.batch.actions))
+        self.check_finite()
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""
@@ -147,7 +147,7 @@ class MAPPO(BaseTrainer):
             **prefixed("rollout", self.rows),
             "returns": self.scaling.sums.copy(),
         }
-        return arrays, scalars | {"row": self.row, "updates": self.made, "entropy": self.surprise}
+        return arrays, scalars | {"row": self.row, "updates": self.made, "entropy": self.entropy}
 
     def restore(self, arrays: dict[str, np.ndarray], scalars: dict[str, Any]) -> None:
         """Restore a :meth:`snapshot` of a run with the same configuration."""
@@ -156,7 +156,7 @@ class MAPPO(BaseTrainer):
         for name, array in self.rows.items():
             array[:] = arrays[f"rollout.{name}"]
         self.scaling.sums[:] = arrays["returns"]
-        self.row, self.made, self.surprise = scalars["row"], scalars["updates"], scalars["entropy"]
+        self.row, self.made, self.entropy = scalars["row"], scalars["updates"], scalars["entropy"]
 
 
 class ValueScale:

@@ -50,7 +50,7 @@ def check_origin(path: Path, description: Mapping[str, Any], kinds: Mapping[str,
     """
     for name, kind in kinds.items():
         if not isinstance(description.get(name), kind):
-            raise ConfigurationError(f"{path} is not a saved run: it says no {name}")
+            raise ConfigurationError(f"{path} is not a saved run: its description has no {name}")
     here = provenance()
     revisions = description["git_revision"], here["git_revision"]
     pairs = {name: (description["versions"].get(name), here["versions"][name]) for name in SAME}
@@ -132,7 +132,7 @@ def check_snapshot(path: Path, found: Snapshot, new: Snapshot) -> None:
     fault = ""
     for name in sorted(arrays.keys() | like.keys()):
         if name not in arrays or name not in like:
-            fault = f"array {name} is {'missing' if name in like else 'not of such a run'}"
+            fault = f"array {name} is {'missing' if name in like else 'unexpected'}"
         elif (arrays[name].shape, arrays[name].dtype) != (like[name].shape, like[name].dtype):
             a, b = arrays[name], like[name]
             fault = f"array {name} is {a.dtype} {a.shape}, not {b.dtype} {b.shape}"

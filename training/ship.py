@@ -105,20 +105,20 @@ def _cells(row: dict[str, str]) -> tuple[str, ...]:
 def _settings(train: dict[str, object]) -> list[str]:
     """``--set`` and the settings that differ from the method's preset; empty if none differ."""
     preset = make_config(str(train["preset"]), **METHODS[str(train["method"])][0])
-    return changed_settings(train, preset, said={"method", "preset", "seed", "budget", "threads"})
+    return changed_settings(train, preset, given={"method", "preset", "seed", "budget", "threads"})
 
 
-def changed_settings(train: dict[str, Any], preset: Any, said: set[str]) -> list[str]:
+def changed_settings(train: dict[str, Any], preset: Any, given: set[str]) -> list[str]:
     """``--set`` and the settings of a run that differ from those of a preset; empty if none differ.
 
     Args:
         train: JSON data of the run's configuration.
         preset: configuration to compare with.
-        said: settings that the command gives in other options.
+        given: settings that the command gives in other options.
     """
     usual = flat_settings(plain_data(preset))
     changed = [
-        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if usual.get(name) != value and name not in said
+        f"{name}={_text(value)}" for name, value in flat_settings(train).items() if usual.get(name) != value and name not in given
     ]
     return ["--set", *changed] if changed else []
 

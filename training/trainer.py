@@ -161,7 +161,7 @@ class Trainer(BaseTrainer):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng, share)
             self.error = self.learner.update(batch, self.learning_rate(share))
             self.replay.learnt(batch, self.learner.errors)
-        self.refuse_nonsense()
+        self.check_finite()
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """The state that resumes the run bit for bit: arrays, and the remaining values as JSON data."""

@@ -57,7 +57,7 @@ class StudyCommand:
         report = study.report((), study.out)
         self.output.report(report.text, report.document)
         if stopped:
-            note("stopped, and every run saved; the same command goes on")
+            note("stopped, and every run saved; repeat the command to resume")
             sys.exit(128 + stopped)
         failed = failed_runs(study)
         if failed:

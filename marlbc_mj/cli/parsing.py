@@ -18,7 +18,7 @@ from marlbc_mj.cli.choices import WrongWord
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.text import nearest_word, one_line
 
-LEAST = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1, "--agents": 2}
+MINIMUMS = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1, "--agents": 2}
 """Smallest values of options that have the same meaning in every command."""
 ABOVE_ZERO = ("--duration", "--substep")
 """Options whose value, a time, must be above zero in every command."""
@@ -27,7 +27,7 @@ ABOVE_ZERO = ("--duration", "--substep")
 class Refusal(NamedTuple):
     """The error in the arguments, and the command whose help explains more."""
 
-    said: str
+    message: str
     command: str
 
 
@@ -117,7 +117,7 @@ def check_least(option: str, word: str) -> None:
     """Raise WrongWord for a number below the minimum of an option. The code that uses it checks it, too, once it is loaded."""
     if option in ABOVE_ZERO and (number := _number(word)) is not None and number <= 0.0:
         raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} must be positive and finite, got {number}"))
-    least = LEAST.get(option)
+    least = MINIMUMS.get(option)
     if least is None or not word.removeprefix("-").isdecimal() or int(word) >= least:
         return
     bound = f"must be at least {least}" if least else "must not be negative"
@@ -160,7 +160,7 @@ def _refused_word(chosen: Chosen) -> Refusal | None:
 
 
 def _exit(prog: str, refusal: Refusal) -> None:
-    print(f"{prog}: {one_line(refusal.said)}; see `{refusal.command} --help`", file=sys.stderr)
+    print(f"{prog}: {one_line(refusal.message)}; see `{refusal.command} --help`", file=sys.stderr)
     sys.exit(2)
 
 

@@ -25,7 +25,7 @@ class RobotCheckCommand:
 
         items = []
         for item in checklist(self.file):
-            self.output.say(f"{'ok  ' if item.passed else 'FAIL'}  {item.name:<10}  {item.said}")
+            self.output.say(f"{'ok  ' if item.passed else 'FAIL'}  {item.name:<10}  {item.detail}")
             items.append(item)
         self.output.report("", items)
         if not all(item.passed for item in items):

@@ -87,17 +87,24 @@ def progress_bars(*, ends: bool = True) -> Iterator[Told]:
 def seldom(every: float = SELDOM, *, ends: bool = True) -> Progress:
     """Progress callback that prints a line when a stage ends and, now and then, one with the rate and the time left of a stage.
 
+    A stage of which less is done than before has begun again.
+
     Args:
         every: least time between two lines on running stages [s].
         ends: whether to print a line when a stage ends.
     """
     began: dict[str, tuple[float, float]] = {}
+    reached: dict[str, float] = {}
     ended: set[str] = set()
     last = monotonic()
 
     def tell(what: str, done: float, total: float) -> None:
         nonlocal last
         now = monotonic()
+        if done < reached.get(what, done):
+            began.pop(what)
+            ended.discard(what)
+        reached[what] = done
         start, before = began.setdefault(what, (now, done))
         if ends and total > 1 and done >= total and what not in ended:
             ended.add(what)

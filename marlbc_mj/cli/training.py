@@ -65,7 +65,7 @@ class TrainCommand:
                 folder = self.out or Path("runs") / f"{config.method}-{config.preset}-{config.seed}"
                 ended = run.train(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, run.Interrupted):
-            say_how_to_go_on(folder, ended)
+            exit_interrupted(folder, ended)
         best = max(ended, key=run.rank)
         switches = "/".join(f"{value:.0f}" for name, value in best.items() if name.startswith("switches_"))
         text = (
@@ -89,7 +89,7 @@ class TrainCommand:
                 folder = self.out or Path("runs") / f"{self.method}-{config.seed}"
                 ended = train_general(config, folder, overwrite=self.overwrite, progress=progress)
         if isinstance(ended, Interrupted):
-            say_how_to_go_on(folder, ended)
+            exit_interrupted(folder, ended)
         best = max(ended, key=judged_rank)
         rates = ", ".join(f"{k.removeprefix('success_')} {100 * v:.4g} %" for k, v in best.items() if k.startswith("success_"))
         text = f"best of {len(ended)} evaluations, after {best['mission_steps']:.0f} mission steps: success {rates}"
@@ -140,7 +140,7 @@ class TrainCommand:
         return with_settings(config, self.set)
 
 
-def say_how_to_go_on(folder: Path, ended: "Interrupted") -> NoReturn:
+def exit_interrupted(folder: Path, ended: "Interrupted") -> NoReturn:
     """Print how to resume an interrupted run, and exit with the status of the signal."""
-    print(f"marlbc: saved; go on with: marlbc train --resume {folder}", file=sys.stderr)
+    print(f"marlbc: saved; resume with: marlbc train --resume {folder}", file=sys.stderr)
     sys.exit(128 + ended.signal)

@@ -49,13 +49,13 @@ def require_controller(found: object, name: str = "controller") -> Controller:
         ConfigurationError: it is a class, lacks an attribute of a controller, or has a law that cannot be called.
     """
     if isinstance(found, type):
-        raise ConfigurationError(f"{name} is the class {found.__name__}; make one of it: {found.__name__}()")
+        raise ConfigurationError(f"{name} is the class {found.__name__}; create an instance: {found.__name__}()")
     lacking = [each for each in CONTROLLER_PARTS if not hasattr(found, each)]
     if lacking:
-        raise ConfigurationError(f"{name} is no controller: {type(found).__name__} lacks {', '.join(lacking)}")
+        raise ConfigurationError(f"{name} is not a controller: {type(found).__name__} lacks {', '.join(lacking)}")
     controller = cast(Controller, found)
     if not callable(controller.law):
-        raise ConfigurationError(f"{name} is no controller: its law is {controller.law!r}, which cannot be called")
+        raise ConfigurationError(f"{name} is not a controller: its law is {controller.law!r}, which cannot be called")
     return controller
 
 

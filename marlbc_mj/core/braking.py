@@ -58,7 +58,7 @@ def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
 
     (``brake_x``, ``brake_y``) [m/s] is its velocity if it brakes now; the other arguments are those of :func:`restrain`.
     """
-    time, brake_time = stopping_time(x, y, barrier), stopping_time(brake_x, brake_y, barrier)
+    time, brake_time = path_time(x, y, barrier), path_time(brake_x, brake_y, barrier)
     a, b, c, d = time * x, time * y, brake_time * brake_x, brake_time * brake_y
     length = np.sqrt(a * a + b * b)
     if barrier.obstacle_distance > 0.0 and obstacles.shape[1] == 3:
@@ -75,7 +75,7 @@ def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
             if j == i:
                 continue
             v_x, v_y = (v_r[j, 0], v_r[j, 1]) if j < i else brake(v_r[j, 0], v_r[j, 1], barrier)
-            other_time = stopping_time(v_x, v_y, barrier)
+            other_time = path_time(v_x, v_y, barrier)
             e, f = other_time * v_x, other_time * v_y
             r_x, r_y = at[i, 0] - at[j, 0], at[i, 1] - at[j, 1]
             if r_x * r_x + r_y * r_y < (least + length + np.sqrt(e * e + f * f)) ** 2:
@@ -86,7 +86,7 @@ def stays_clear(i, x, y, brake_x, brake_y, barrier, at, obstacles, v_r):
 
 
 @allocation_free
-def stopping_time(x, y, barrier):
+def path_time(x, y, barrier):
     """L(s) / s [s], where L(s) = (s + A T / 2)^2 / (2 A) is the length of the braking path from a velocity (x, y) of speed s.
 
     The reference holds s for a mission step T and then loses A T in every step. L(s) - s T >= L(s - A T), so paths are nested.

@@ -49,7 +49,7 @@ class Names:
     def _check(self) -> None:
         for name in self.names:
             if not name.isidentifier():
-                raise ConfigurationError(f"{name!r} cannot name a number of a law: it is no identifier")
+                raise ConfigurationError(f"{name!r} cannot name a number of a law: it is not an identifier")
             if hasattr(np.record, name) or hasattr(np.recarray, name):
                 raise ConfigurationError(
                     f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name"

@@ -39,7 +39,7 @@ class Mail(NamedTuple):
     stamps: np.ndarray  # (N, N, 2) live stamps of i with j, the newest first [substeps]
     planes: np.ndarray  # (N, N, 2, 3) their half-planes: n, c [m]
     memory: np.ndarray  # (R, N, 3) p [m] and L [m] of all agents in the last R substeps, a ring buffer
-    said: np.ndarray  # (R, N, N) the newest stamps of i with j in those substeps
+    sent_stamps: np.ndarray  # (R, N, N) the newest stamps of i with j in those substeps
 
 
 @allocation_free
@@ -109,7 +109,7 @@ def exchange(numbers, view, mail):
                 mail.planes[i, j, OLDER, 2] = np.inf
     for i in range(agents):
         for j in range(agents):
-            mail.said[now, i, j] = mail.stamps[i, j, NEWEST]
+            mail.sent_stamps[now, i, j] = mail.stamps[i, j, NEWEST]
     for i in range(agents):
         for j in range(agents):
             if i != j and not first and arrives(mail, i, j, agents):
@@ -129,7 +129,7 @@ def _take(numbers, view, mail, i, j):
     """Agent ``i`` receives the message that ``j`` sent one latency ago."""
     ring = mail.memory.shape[0]
     sent = mail.now - mail.latency
-    newest = mail.said[sent % ring, j, i]
+    newest = mail.sent_stamps[sent % ring, j, i]
     proposed, adopted = mail.planes[i, i, 0], mail.planes[i, i, 1]  # scratch: no agent has half-planes with itself
     fits_newest = newest >= 0.0 and mail.now - newest < ring
     if fits_newest:

@@ -174,8 +174,8 @@ def exchange_messages(b, count, view, numbers, team):
     """Exchange the messages between agents of world ``b``, ``count`` substeps after the mission began."""
     fill_stopping(numbers, view)
     latency, seed = int(numbers.latency), team.noise_seed[b]
-    stamps, planes, memory, said = team.stamps[b], team.planes[b], team.memory[b], team.said[b]
-    exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, said))
+    stamps, planes, memory, sent_stamps = team.stamps[b], team.planes[b], team.memory[b], team.sent_stamps[b]
+    exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, sent_stamps))
 
 
 @allocation_free

@@ -97,7 +97,7 @@ class Team(NamedTuple):
     stamps: np.ndarray  # (B, N, N, 2) live stamps, see marlbc_mj.core.stamps; (B, 0, 0, 2) if agents know all states
     planes: np.ndarray  # (B, N, N, 2, 3) their half-planes
     memory: np.ndarray  # (B, R, N, 3) past p and stopping distances [m], see Mail
-    said: np.ndarray  # (B, R, N, N) newest stamps in those substeps, see Mail
+    sent_stamps: np.ndarray  # (B, R, N, N) newest stamps in those substeps, see Mail
     tracks: np.ndarray  # (B, K, 5) scratch of a shield: moving obstacles at the current time; (B, 0, 5) if all are at rest
 
 

@@ -241,7 +241,7 @@ def _check_sensors(shield: Shield, scenario: Scenario) -> None:
     if blurred or ((errors.velocity_noise > 0 or errors.delay > 0) and shield.velocity_error == 0):
         raise ConfigurationError(
             f"shield: sensors have noise of {errors.position_noise:g} m and {errors.velocity_noise:g} m/s and are "
-            f"{errors.delay:g} s late; position_error and velocity_error must bound what that makes, got "
+            f"{errors.delay:g} s late; position_error and velocity_error must bound the resulting errors, got "
             f"{shield.position_error:g} m and {shield.velocity_error:g} m/s"
         )
 

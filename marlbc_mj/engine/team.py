@@ -73,7 +73,7 @@ def make_team(plan: Plan, worlds: int) -> Team:
         stamps=np.full((*mailed, 2), NEVER_STAMPED),
         planes=np.zeros((*mailed, 2, 3)),
         memory=np.zeros((worlds, ring, mailed[1], 3)),
-        said=np.full((worlds, ring, *mailed[1:]), NEVER_STAMPED),
+        sent_stamps=np.full((worlds, ring, *mailed[1:]), NEVER_STAMPED),
         tracks=np.zeros((worlds, count if moving and forces[1] else 0, MOVING)),
     )
 
@@ -128,7 +128,7 @@ def place(
     team.robot[b] = plan.robot_state
     team.steps[b], team.command[b], team.since[b], team.reward[b] = step, command, NEVER, 0.0
     team.interventions[b], team.force_change[b], team.breaches[b] = 0.0, 0.0, 0.0
-    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED
+    team.stamps[b], team.sent_stamps[b] = NEVER_STAMPED, NEVER_STAMPED
     laws.plain(judge)(b, plan.mission, team)
 
 
@@ -140,7 +140,7 @@ def put(plan: Plan, team: Team, b: int, data: Any, position: np.ndarray, velocit
     """
     plant = plan.plant
     team.last_substep[b] = np.nan
-    team.stamps[b], team.said[b] = NEVER_STAMPED, NEVER_STAMPED  # all agents know the new places
+    team.stamps[b], team.sent_stamps[b] = NEVER_STAMPED, NEVER_STAMPED  # all agents know the new places
     base = plant.qpos_index.ravel()
     data.qpos[base] = np.ravel(position)
     data.qvel[plant.qvel_index.ravel()] = np.ravel(velocity)

@@ -75,7 +75,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     try:
         description = json.loads(header or "")
     except (ValueError, RecursionError):
-        raise ConfigurationError(f"{path} is no checkpoint of marlbc_mj: its header does not describe one") from None
+        raise ConfigurationError(f"{path} is not a checkpoint of marlbc_mj: its header does not describe one") from None
     if not isinstance(description, dict) or description.get("format") != FORMAT:
         found = description.get("format") if isinstance(description, dict) else description
         raise ConfigurationError(f"checkpoint {path} has format {found!r}; this version reads {FORMAT}")

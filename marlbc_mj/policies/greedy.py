@@ -121,7 +121,7 @@ def best_actions(values, last, fresh, margin):
     for b in range(last.shape[0]):
         for i in range(last.shape[1]):
             if not 0 <= last[b, i] < values.shape[2]:
-                raise IndexError("a last action is no index into the action values")
+                raise IndexError("a last action is not an index into the action values")
             action = values[b, i].argmax()
             lead = values[b, i, action] - values[b, i, last[b, i]]
             best[b, i] = action if takes_best(lead, fresh[b], margin) else last[b, i]

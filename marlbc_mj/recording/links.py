@@ -8,7 +8,7 @@ from marlbc_mj.recording.log import EpisodeLog
 from marlbc_mj.util.palette import LINK_COLOR, rgba
 
 HALF_LIFE = 0.5  # age at which a link has half the opacity of a fresh one [s]
-CLEAREST, FAINTEST = 0.9, 0.12  # opacity of a fresh link, and least opacity
+MAX_OPACITY, MIN_OPACITY = 0.9, 0.12  # opacity of a fresh link, and least opacity
 MOST_LINKS = 400  # largest number of links drawn; if there are more, the shortest are drawn
 
 
@@ -35,7 +35,7 @@ def drawn_links(position: np.ndarray, link: np.ndarray, age: np.ndarray) -> Draw
         length = np.linalg.norm(position[ends[:, 0]] - position[ends[:, 1]], axis=1)
         ends = ends[np.sort(np.argsort(length, kind="stable")[:MOST_LINKS])]
     older = np.maximum(age, age.T)[ends[:, 0], ends[:, 1]]
-    return DrawnLinks(ends, np.maximum(CLEAREST * 0.5 ** (older / HALF_LIFE), FAINTEST))
+    return DrawnLinks(ends, np.maximum(MAX_OPACITY * 0.5 ** (older / HALF_LIFE), MIN_OPACITY))
 
 
 def links_of_log(log: EpisodeLog, step: int) -> DrawnLinks:

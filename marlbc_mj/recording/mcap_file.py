@@ -121,7 +121,7 @@ def _unpacked(chunk: Chunk) -> int:
     """Decompressed size of a chunk [bytes]; ValueError if it is too large or differs from that of the compressed data."""
     said, packed = chunk.uncompressed_size, len(chunk.data)
     if said > MOST_CHUNK:
-        raise ValueError(f"a chunk of {packed} bytes says that it holds {said}; none has more than {MOST_CHUNK}")
+        raise ValueError(f"a chunk of {packed} bytes claims to hold {said}; none has more than {MOST_CHUNK}")
     if chunk.compression == "zstd":
         found = zstandard.frame_content_size(chunk.data)
     elif chunk.compression == "lz4":

@@ -81,9 +81,9 @@ def _check_log(log: EpisodeLog) -> None:
     if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
         raise ValueError(f"a command is none of the {len(log.commands)} that there are")
     if not all(isinstance(name, str) for name in log.commands):
-        raise ValueError("the names of commands are no texts")
+        raise ValueError("the names of commands are not strings")
     if not (np.diff(log.time) > 0).all() or not (0 < log.mission_step < np.inf and 0 < log.safe_distance < np.inf):
-        raise ValueError("times do not grow, or mission_step or safe_distance is not positive")
+        raise ValueError("times do not increase, or mission_step or safe_distance is not positive")
     if (
         not np.isfinite(log.obstacles).all()
         or not np.isfinite(log.motions).all()
@@ -222,7 +222,7 @@ def _course(metadata: dict[str, str], agents: int) -> Course:
     own = json.loads(metadata.get("robot_force_limits", json.dumps([limit] * agents)))
     limits = np.array(own, dtype=np.float64).reshape(agents)
     if not min(*numbers.values(), *limits) > 0 or not np.isfinite([*given, *limits]).all():
-        raise ValueError("substep, safe_distance, force_limit, path or slots are no numbers of a scenario")
+        raise ValueError("substep, safe_distance, force_limit, path or slots are invalid")
     return Course(**numbers, force_limits=limits, path_origin=(x, y), path_velocity=(vx, vy), formations=formations)
 
 

@@ -42,7 +42,7 @@ _FORCES = (
 )
 _PARETO = (
     "Control cost against what it buys. Colors are supervisors, shapes are controllers. A mark that would cover another "
-    "stands aside; a thin line leads to its place. Formation error: mean distance of an agent from its slot in "
+    "is shifted; a thin line leads to its place. Formation error: mean distance of an agent from its slot in "
     "the first formation, relative to the centroid. Dashed: LQR, whose gains minimize this cost in regulation."
 )
 _CONTROL = (

@@ -62,7 +62,7 @@ class Failure(NamedTuple):
     of: int  # total number of runs
 
 
-class Look(NamedTuple):
+class NotableLayout(NamedTuple):
     """A layout worth watching."""
 
     track: str
@@ -79,7 +79,7 @@ class Detail(NamedTuple):
     name: Name
     facts: str
     failures: tuple[Failure, ...]
-    looks: tuple[Look, ...]
+    looks: tuple[NotableLayout, ...]
 
 
 def write_leaderboard(
@@ -272,7 +272,7 @@ def _details(groups: Sequence[MissionRuns], folder: Path) -> list[Detail]:
     return details
 
 
-def _look(one: Notable, folder: Path) -> Look:
+def _look(one: Notable, folder: Path) -> NotableLayout:
     run = one.run
     faults = {
         "not in formation at the end": not run.reached,
@@ -282,4 +282,4 @@ def _look(one: Notable, folder: Path) -> Look:
     }
     ended = ", ".join(words for words, holds in faults.items() if holds) or "success"
     clip = one.clip if (folder / one.clip).is_file() else ""
-    return Look(one.track, one.kind, one.mission, run.seed, f"{ended}, return {run.score('return'):.0f}", clip)
+    return NotableLayout(one.track, one.kind, one.mission, run.seed, f"{ended}, return {run.score('return'):.0f}", clip)

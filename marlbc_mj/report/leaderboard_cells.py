@@ -8,7 +8,7 @@ from marlbc_mj.report.formats import DASH, fixed, significant
 from marlbc_mj.results.layout_runs import Method
 from marlbc_mj.results.standings import Standing
 from marlbc_mj.results.statistics import Estimate
-from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS
+from marlbc_mj.supervisors import OWN, VELOCITY_SUPERVISORS
 from marlbc_mj.util.method_names import source_of
 
 WIDTH = 64
@@ -71,7 +71,7 @@ class BoardColumn(NamedTuple):
 def shown_name(method: Method, *, by_controller: bool = False) -> Name:
     """Texts of a method under its supervisor's name, or under its controller's."""
     source = source_of(method.controller if by_controller else method.supervisor)
-    composition = OWN if method.supervisor in VELOCITY_GIVERS else method.composition
+    composition = OWN if method.supervisor in VELOCITY_SUPERVISORS else method.composition
     facts = [*([] if by_controller else [composition]), *(["shield"] if method.shield else [])]
     return Name(source.display, source.citation, ", ".join(facts), method.key)
 

@@ -16,7 +16,7 @@ from marlbc_mj.util.text import one_line
 
 SAME_ORDER = "same order"
 LIMITED = "-limited"
-TOLD = ("finite-time", "fixed-time", "lqr", "terminal-sliding", "predefined-time")
+KNOWS_DRAG = ("finite-time", "fixed-time", "lqr", "terminal-sliding", "predefined-time")
 """Controllers that receive the true drag."""
 COST_SCALE = 1e-4
 """Factor from costs to the paper's unit, 10⁴."""
@@ -170,9 +170,9 @@ class _Comparison:
 
     def notes(self) -> list[str]:
         """Notes on columns, on published methods that did not run here, and on failures."""
-        told = [n for n in TOLD if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
+        told = [n for n in KNOWS_DRAG if n in self.chosen or f"{n}{LIMITED}" in self.chosen] if self.of_controllers else []
         notes = (
-            [f"Told the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
+            [f"Given the true drag, which the others have to identify or ignore: {', '.join(map(display_name, told))}."]
             if told
             else []
         )

@@ -121,7 +121,7 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
 def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, Any]]) -> None:
     """Draw marks at points (P, 2) after the axes have their limits; shift marks that would cover others, on a thin line."""
     inch = axes.figure.dpi_scale_trans
-    shifts = _asides(72.0 * inch.inverted().transform(axes.transData.transform(points)))
+    shifts = _shifts(72.0 * inch.inverted().transform(axes.transData.transform(points)))
     for point, shift, style in zip(points, shifts, styles, strict=True):
         aside = axes.transData + ScaledTranslation(shift[0] / 72.0, shift[1] / 72.0, inch)
         if shift.any():
@@ -130,7 +130,7 @@ def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, An
         axes.plot(*point, linestyle="none", clip_on=False, transform=aside, **style)
 
 
-def _asides(places: np.ndarray) -> np.ndarray:
+def _shifts(places: np.ndarray) -> np.ndarray:
     """Shifts (P, 2) of marks at places (P, 2), all in pt: the smallest candidates that keep marks about ``_APART`` apart."""
     rings = [(k, 6 * k) for k in range(1, 1 + len(places))]
     turns = [(_APART * k, 0.5 * np.pi + 2.0 * np.pi * j / count) for k, count in rings for j in range(count)]

@@ -138,7 +138,7 @@ def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
     except (OSError, ValueError) as error:
         raise ConfigurationError(f"cannot read {path}: {one_line(error)}") from error
     if tuple(header) != _HEADER:
-        raise ConfigurationError(f"{path} is no file of layouts: its columns are {', '.join(header)}")
+        raise ConfigurationError(f"{path} is not a file of layouts: its columns are {', '.join(header)}")
     found: dict[tuple[str, Method], list[LayoutRun]] = {}
     for line, row in enumerate(rows, 2):
         try:

@@ -96,7 +96,7 @@ def _parse(path: Path, here: Path) -> ElementTree.Element:
     except (OSError, ElementTree.ParseError, ValueError, LookupError, RecursionError) as error:
         if isinstance(error, ConfigurationError):
             raise
-        raise ConfigurationError(f"{path} is no MJCF that MuJoCo reads: {here.name}: {one_line(error)}") from error
+        raise ConfigurationError(f"{path} is not a valid MJCF file: {here.name}: {one_line(error)}") from error
 
 
 _TOKEN = re.compile(r"""<!--.*?-->|<!\[CDATA\[.*?\]\]>|<\?.*?\?>|<!|<(?:[^>"']|"[^"]*"|'[^']*')*>|[^<]+""", re.DOTALL)
@@ -141,7 +141,7 @@ def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:
         raise ConfigurationError(f"{path} uses a file that is not there: {file}")
     for place in there:
         if not place.is_file():
-            raise ConfigurationError(f"{path} uses {file}, which is no regular file")
+            raise ConfigurationError(f"{path} uses {file}, which is not a regular file")
         if place.stat().st_size > _MOST_BYTES:
             raise ConfigurationError(f"{path} uses {file} of {place.stat().st_size} bytes; at most {_MOST_BYTES} are read")
     return there[0].resolve()

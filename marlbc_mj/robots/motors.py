@@ -144,7 +144,7 @@ def check_motors(model: mujoco.MjModel, dofs: tuple[int, int], motors: Sequence[
         u = model.actuator(name).id
         why = no_motor(model, u)
         if why is not None:
-            raise ConfigurationError(f"actuator {name!r} is no motor: {why}")
+            raise ConfigurationError(f"actuator {name!r} is not a motor: {why}")
         if not _pushes(upright[u], turned[u], dof):
             raise ConfigurationError(f"motors[{axis}] {name!r} does not push along {'xy'[axis]} alone; motors name those of x, y")
         found.append(_motor(model, u, dof, float(upright[u, dof])))

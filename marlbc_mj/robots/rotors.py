@@ -67,7 +67,7 @@ def _rotors(model: mujoco.MjModel, data: mujoco.MjData, name: str) -> dict[str, 
     for u in range(model.nu):
         why = no_motor(model, u)
         if why is not None:
-            raise ConfigurationError(f"{name}: actuator {model.actuator(u).name!r} is no motor: {why}")
+            raise ConfigurationError(f"{name}: actuator {model.actuator(u).name!r} is not a motor: {why}")
     effect = effects(model, data)
     rotors = effect[:, 2:6].T * model.actuator_gainprm[:, 0]  # (4, rotors): lift and moments
     if np.linalg.matrix_rank(rotors[:3], tol=1e-9) < 3:

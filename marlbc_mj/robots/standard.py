@@ -64,7 +64,7 @@ def _standard_text(path: Path, place: Path, state: tuple[tuple[str, int, int], .
 
 
 def _blame(error: Exception) -> str:
-    return "is no MJCF that MuJoCo reads" if "XML" in str(error) or "Schema" in str(error) else "does not compile"
+    return "is not a valid MJCF file" if "XML" in str(error) or "Schema" in str(error) else "does not compile"
 
 
 def _try_out(path: Path) -> None:

@@ -154,7 +154,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
         **_size(model, data, root, base),
     }
     if isinstance(motors, Reason):
-        raise ConfigurationError(f"{path}: actuator {motors.name!r} is no motor: {motors.why}; {_WAY_OUT}")
+        raise ConfigurationError(f"{path}: actuator {motors.name!r} is not a motor: {motors.why}; {_WAY_OUT}")
     if motors is not None:
         turning = f"; {', '.join(moved)} taken after the slides, so that it turns about itself" if moved else ""
         return _direct({**fields, "description": f"two motors along x and y{turning}"}, (motors[0].name, motors[1].name), limit)

@@ -49,7 +49,7 @@ def _from_python(name: str, changes: dict[str, Any]) -> Scenario:
     """A scenario defined in a user's Python file, or returned by a function in it."""
     scenario = made(name, Scenario)
     if not isinstance(scenario, Scenario):
-        raise ConfigurationError(f"{name} is no Scenario, but {type(scenario).__name__}")
+        raise ConfigurationError(f"{name} is not a Scenario but {type(scenario).__name__}")
     try:
         return replace(scenario, **changes)
     except TypeError as error:

@@ -28,7 +28,7 @@ MOST_BEHAVIORS = 6  # 6 behaviors have 720 orders, still few enough for a table
 REFERENCE_MODES = ("virtual", "actual")
 COMPOSITIONS = ("null-space", "set-based")
 """Null-space composition treats avoidance as an equality task (12), set-based composition as an inequality."""
-YOUNG = {"young": True}
+ADDED_LATER = {"young": True}
 """Metadata of a field added later: at its default it changes nothing and is left out of hashes, so old hashes stay valid."""
 
 
@@ -115,21 +115,29 @@ class Scenario:
     mass: float = 1.0  # [kg]
     force_limit: float = 200.0  # per axis [N]
     # force for a controller's output of 1 [N]; set to a robot's mass, it makes controller gains per unit mass
-    unit_force: float = field(default=1.0, metadata=YOUNG)
-    speed_limit: float = field(default=np.inf, metadata=YOUNG)  # speed limit of references [m/s]; the paper's point mass has none
-    acceleration_limit: float = field(default=np.inf, metadata=YOUNG)  # acceleration limit of references [m/s^2]
-    imperfections: Imperfections = field(default=NO_IMPERFECTIONS, metadata=YOUNG)  # sensor noise, sensor delay, actuator loss
+    unit_force: float = field(default=1.0, metadata=ADDED_LATER)
+    speed_limit: float = field(
+        default=np.inf, metadata=ADDED_LATER
+    )  # speed limit of references [m/s]; the paper's point mass has none
+    acceleration_limit: float = field(default=np.inf, metadata=ADDED_LATER)  # acceleration limit of references [m/s^2]
+    imperfections: Imperfections = field(
+        default=NO_IMPERFECTIONS, metadata=ADDED_LATER
+    )  # sensor noise, sensor delay, actuator loss
     disturbance: Disturbance = field(default_factory=PaperDrag)
     perturbation: Perturbation = Perturbation()
     schedule: tuple[Window, ...] = ()  # windows of the scripted supervisor; outside all of them the order is FM
     description: str = ""
-    motions: tuple[Motion, ...] = field(default=(), metadata=YOUNG)  # one per obstacle, or empty if all obstacles are at rest
-    layout: Layout | None = field(default=None, metadata=YOUNG)  # draws obstacles and motions anew for every seed
-    split: Literal["train", "test"] = field(default="train", metadata=YOUNG)  # which layouts are drawn
+    motions: tuple[Motion, ...] = field(
+        default=(), metadata=ADDED_LATER
+    )  # one per obstacle, or empty if all obstacles are at rest
+    layout: Layout | None = field(default=None, metadata=ADDED_LATER)  # draws obstacles and motions anew for every seed
+    split: Literal["train", "test"] = field(default="train", metadata=ADDED_LATER)  # which layouts are drawn
     # how an order becomes a reference, see COMPOSITIONS
-    composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=YOUNG)
-    communication: Communication = field(default=IDEAL, metadata=YOUNG)  # range, delay and loss of messages
-    robots: tuple[str, ...] = field(default=(), metadata=YOUNG)  # robot of each agent if they differ; ``robot`` is then the first
+    composition: Literal["null-space", "set-based"] = field(default="null-space", metadata=ADDED_LATER)
+    communication: Communication = field(default=IDEAL, metadata=ADDED_LATER)  # range, delay and loss of messages
+    robots: tuple[str, ...] = field(
+        default=(), metadata=ADDED_LATER
+    )  # robot of each agent if they differ; ``robot`` is then the first
 
     def __post_init__(self) -> None:
         check_kinds(self, f"scenario {self.name!r}: ")

@@ -183,7 +183,7 @@ class Corridor(Gates):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Crossing(Family):
+class TrafficFamily(Family):
     """Moving obstacles, which the paper's Assumption 2 excludes: some cross the route as the team passes, others swing across."""
 
     name: str = "traffic"
@@ -239,7 +239,7 @@ FAMILIES: dict[str, type[Family]] = {
     "forest": Forest,
     "gates": Gates,
     "corridor": Corridor,
-    "traffic": Crossing,
+    "traffic": TrafficFamily,
 }
 """Family classes by name."""
 

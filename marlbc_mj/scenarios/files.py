@@ -100,10 +100,10 @@ def _read(path: Path) -> dict[str, Any]:
         if path.exists() and not path.is_file():
             raise ConfigurationError(f"{path} is not a file")
         if path.stat().st_size > MOST_BYTES:
-            raise ConfigurationError(f"{path} is larger than {MOST_BYTES} bytes; that is no scenario file")
+            raise ConfigurationError(f"{path} is larger than {MOST_BYTES} bytes; it is not a scenario file")
         text = path.read_text(encoding="utf-8-sig")
         if _depth(text) > MOST_DEPTH:
-            raise ConfigurationError(f"{path} is nested more than {MOST_DEPTH} deep; that is no scenario file")
+            raise ConfigurationError(f"{path} is nested more than {MOST_DEPTH} deep; it is not a scenario file")
         return tomllib.loads(text)
     except ConfigurationError:
         raise

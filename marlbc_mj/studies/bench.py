@@ -19,7 +19,7 @@ from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.episodes import EpisodeJob, fly, fly_or_fail, name_method, prepare
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
-from marlbc_mj.studies.so_far import SoFar
+from marlbc_mj.studies.so_far import PartialPage
 from marlbc_mj.supervisors import CHECKPOINT_SUFFIX, ON_REQUEST, SUPERVISORS
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError, SimulationError, check_named_once, unknown
 from marlbc_mj.util.files import check_folder, write_json
@@ -142,7 +142,7 @@ def run_bench(
         ConfigurationError: an invalid setting or output folder; nothing is written then.
     """
     study = BenchStudy(scenario, config)
-    page = SoFar(out, [job.key for job in study.jobs()], partial(write_so_far, config=describe(scenario, config)))
+    page = PartialPage(out, [job.key for job in study.jobs()], partial(write_so_far, config=describe(scenario, config)))
 
     def tell(job: EpisodeJob, result: Result) -> None:
         page.add(result.key, result)

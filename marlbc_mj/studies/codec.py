@@ -71,7 +71,7 @@ class Encoder:
             return {_MARK: "path", "v": str(value)}
         names = _field_names(kind)
         if names is None:
-            raise ConfigurationError(f"{value!r} of type {kind.__name__} is no data that can be kept")
+            raise ConfigurationError(f"{value!r} of type {kind.__name__} cannot be stored")
         self.types.add(kind)
         return {_MARK: f"{kind.__module__}:{kind.__qualname__}", "v": {name: self._plain(getattr(value, name)) for name in names}}
 
@@ -126,7 +126,7 @@ def _object(plain: dict[str, Any], arrays: memoryview) -> Any:
     fields = {name: _value(entry, arrays) for name, entry in plain["v"].items()}
     names = _field_names(kind)
     if names is None or set(names) != set(fields):
-        raise ValueError(f"{plain[_MARK]} has other fields now")
+        raise ValueError(f"{plain[_MARK]}: its fields have changed")
     if issubclass(kind, tuple):
         return tuple.__new__(kind, (fields[name] for name in names))
     made = object.__new__(kind)
@@ -144,7 +144,7 @@ def _type(name: str) -> type:
     for part in path.split("."):
         found = getattr(found, part)
     if not isinstance(found, type):
-        raise ValueError(f"{name} is no type")
+        raise ValueError(f"{name} is not a type")
     return found
 
 

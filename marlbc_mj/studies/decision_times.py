@@ -16,7 +16,7 @@ from marlbc_mj.policies.general import decision_steps
 from marlbc_mj.policies.general_inputs import make_sight
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.teams import team_mission
-from marlbc_mj.studies.safety import GROUNDS
+from marlbc_mj.studies.safety import MISSION_FAMILIES
 from marlbc_mj.supervisors import carry_out, make_supervisor
 from marlbc_mj.util.method_names import display_name
 
@@ -80,7 +80,7 @@ def per_decision(agents: int, seed: int) -> float:
 def report_times() -> None:
     """Print all times, and each supervisor's mean as a multiple of the policy's."""
     seed = int(sys.argv[1]) if len(sys.argv) > 1 else 90_000
-    for family in GROUNDS:
+    for family in MISSION_FAMILIES:
         found = per_mission_step(family, seed)
         for name, times in found.items():
             share = times.mean / found[DECIDERS[0]].mean

@@ -17,7 +17,7 @@ from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.bench import BenchConfig, describe
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_jobs, run_study
-from marlbc_mj.studies.so_far import SoFar
+from marlbc_mj.studies.so_far import PartialPage
 from marlbc_mj.supervisors import make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, check_named_once
 from marlbc_mj.util.files import write_json
@@ -129,7 +129,7 @@ def growing_page(study: DrawsStudy, out: Path, facts: Mapping[str, Any]) -> Call
     def write(ended: Sequence[list[MethodRuns]], total: int, folder: Path) -> None:
         write_seeds_so_far(study.gather(list(chain.from_iterable(ended))), total, folder, facts)
 
-    page = SoFar(out, list(own), write)
+    page = PartialPage(out, list(own), write)
 
     def tell(job: DrawsJob, runs: MethodRuns) -> None:
         key = _key(job)

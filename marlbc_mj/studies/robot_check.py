@@ -38,7 +38,7 @@ class Item(NamedTuple):
 
     name: str
     passed: bool
-    said: str
+    detail: str
 
 
 def checklist(name: str) -> Iterator[Item]:
@@ -260,7 +260,7 @@ def _flight(robot: Robot, world: World, truths: Sequence[Truth]) -> Iterator[Ite
         error = max(found["height_error"], moved)
         yield Item("height", error < _HEIGHT, f"held within {1e3 * error:.1f} mm")
     else:
-        why = "" if moved < _HEIGHT else ": nothing holds it up; give it ground to stand on, slides, or no gravity"
+        why = "" if moved < _HEIGHT else ": nothing supports it; give it ground to stand on, slides, or no gravity"
         yield Item("height", moved < _HEIGHT, f"body {robot.body!r} stays within {1e3 * moved:.3g} mm{why}")
     if "tilt" in found:
         degrees = float(np.degrees(found["tilt"]))

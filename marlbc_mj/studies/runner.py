@@ -30,7 +30,7 @@ from typing import Any, Generic, NamedTuple
 
 from marlbc_mj.studies.addresses import Addresses, code_version
 from marlbc_mj.studies.engines import Task, Work, make_engine
-from marlbc_mj.studies.engines.base import Ears, StopRequest
+from marlbc_mj.studies.engines.base import EngineCallbacks, StopRequest
 from marlbc_mj.studies.protocol import JobT, Report, ResultT, Stopped, Study
 from marlbc_mj.studies.store import RunStore, open_store
 from marlbc_mj.util.errors import ConfigurationError
@@ -46,7 +46,7 @@ class Conclusion(NamedTuple, Generic[ResultT]):
     report: Report
 
 
-class Means(NamedTuple):
+class EngineSettings(NamedTuple):
     """The engine and the number of workers; no result depends on them."""
 
     workers: int = 1
@@ -91,7 +91,7 @@ def run_study(
     with open_store(out, overwrite=overwrite) as store:
         _begin(store, study, keys, out, overwrite)
         try:
-            results = _Run(study, jobs, keys, store, ended).results(Means(workers, engine), Ears(progress))
+            results = _Run(study, jobs, keys, store, ended).results(EngineSettings(workers, engine), EngineCallbacks(progress))
             store.close()
             with staged_folder(out, overwrite=overwrite) as folder:
                 store.place_files(dict.fromkeys(keys), folder)
@@ -99,7 +99,9 @@ def run_study(
         except BaseException as error:
             if store.kept:
                 done = sum(key in store.kept for key in keys)
-                error.add_note(f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; the same command goes on")
+                error.add_note(
+                    f"{done} of {len(keys)} jobs are done and kept in {out / JOBS_FOLDER}; repeat the command to resume"
+                )
             raise
     return Conclusion(results, report)
 
@@ -129,7 +131,9 @@ def run_jobs(
         Stopped: ``stop`` was set; the state of jobs that had started is saved.
     """
     jobs = study.jobs()
-    results = _Run(study, jobs, [""] * len(jobs), None, ended).results(Means(workers, engine), Ears(progress, stop))
+    results = _Run(study, jobs, [""] * len(jobs), None, ended).results(
+        EngineSettings(workers, engine), EngineCallbacks(progress, stop)
+    )
     if stop is not None and stop.signal:
         raise Stopped(stop.signal)
     return results
@@ -156,14 +160,14 @@ class _Run(NamedTuple):
     store: RunStore | None
     ended: Callable[[Any, Any], None] | None
 
-    def results(self, means: Means, ears: Ears) -> list[Any]:
+    def results(self, means: EngineSettings, ears: EngineCallbacks) -> list[Any]:
         """Results in the order of the jobs; fewer if the study was stopped."""
         engine = make_engine(means.engine, means.workers)
         found = {place: self.store.result(key) for place, key in self._found()} if self.store is not None else {}
         for place, result in found.items():
             self._tell(place, result)
         tasks = [Task(place, self.keys[place], job) for place, job in enumerate(self.jobs) if place not in found]
-        count = _Count(len(self.jobs), len(found), ears.progress if self.store is not None and means != Means() else silent)
+        count = _Count(len(self.jobs), len(found), ears.progress if self.store is not None and len(self.jobs) > 1 else silent)
         ears.retried = count.retried
         work = Work(self.study) if self.store is None else Work(self.study, self.store.files, self.store.engine)
         with closing(engine.map(work, tasks, ears)) as finished:
@@ -200,7 +204,7 @@ class _Count:
     def retried(self, reason: str) -> None:
         """Report that a worker died and that its work is repeated."""
         self.again += 1
-        note(f"{reason}; what it did is done again ({self.again} so far)")
+        note(f"{reason}; its work is repeated ({self.again} so far)")
 
 
 def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Path, overwrite: bool) -> None:

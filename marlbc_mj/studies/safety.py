@@ -22,19 +22,19 @@ from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.studies.batches import evaluate_batch
 from marlbc_mj.studies.draws import SEEDS_PER_JOB, with_drag_range
 from marlbc_mj.studies.protocol import Report, Watch
-from marlbc_mj.supervisors import OWN, VELOCITY_GIVERS, make_supervisor
+from marlbc_mj.supervisors import OWN, VELOCITY_SUPERVISORS, make_supervisor
 from marlbc_mj.util.errors import ConfigurationError, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 from marlbc_mj.util.provenance import provenance
 
-GROUNDS = ("field", "forest", "gates", "corridor", "traffic")
+MISSION_FAMILIES = ("field", "forest", "gates", "corridor", "traffic")
 """Mission families that draw layouts."""
 DRAG_DRAWS = {"paper-drag-0": (0.0, 0), "paper-drag-2": (2.0, 67), "paper-drag-5": (5.0, 134)}
 """Draws around the case study: drag factor and first seed of each."""
 DRAWS_EACH = 67
-ORDER_GIVERS = (
+ORDER_SUPERVISORS = (
     "fixed",
     "scripted",
     "fsams",
@@ -72,9 +72,9 @@ class SafetyStudy:
         ConfigurationError: an empty setting, an unknown name, or a number below 1.
     """
 
-    missions: tuple[str, ...] = GROUNDS
+    missions: tuple[str, ...] = MISSION_FAMILIES
     """Scenarios that draw layouts, of which the held-out ones are used, or keys of :data:`DRAG_DRAWS`."""
-    supervisors: tuple[str, ...] = (*ORDER_GIVERS, *VELOCITY_GIVERS)
+    supervisors: tuple[str, ...] = (*ORDER_SUPERVISORS, *VELOCITY_SUPERVISORS)
     compositions: tuple[str, ...] = COMPOSITIONS
     shields: tuple[bool, ...] = (False, True)
     layouts: int = 1000
@@ -106,7 +106,7 @@ class SafetyStudy:
             for mission in self.missions
             for composition in (*self.compositions, OWN)
             for supervisor in self.supervisors
-            if (composition == OWN) == (supervisor in VELOCITY_GIVERS)
+            if (composition == OWN) == (supervisor in VELOCITY_SUPERVISORS)
             for shield in self.shields
         ]
 

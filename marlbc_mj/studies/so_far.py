@@ -14,7 +14,7 @@ REWRITE_AFTER = 1.0  # least time between two rewrites of the page [s]
 WRITING_SHARE = 0.1  # greatest share of the run's time spent on writing the page
 
 
-class SoFar(Generic[EndedT]):
+class PartialPage(Generic[EndedT]):
     """The page and tables of an unfinished run; they grow as methods end.
 
     Args:

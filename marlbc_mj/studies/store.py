@@ -23,7 +23,7 @@ from marlbc_mj.studies import codec
 from marlbc_mj.studies.packs import PackWriter, entries, next_pack, packs
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import JOBS_FOLDER, busy, check_folder, duplicate, remove_orphans, write_json, writing
-from marlbc_mj.util.locks import held_alone
+from marlbc_mj.util.locks import exclusive_lock
 
 STORE_SCHEMA = 1
 _BEGUN = ".begun-"
@@ -140,7 +140,7 @@ def open_store(out: Path, *, overwrite: bool) -> Iterator[RunStore]:
     folder, made = out / JOBS_FOLDER, not out.exists()
     with writing(out):
         folder.mkdir(parents=True, exist_ok=True)
-    with held_alone(folder / _LOCK, busy(out)):
+    with exclusive_lock(folder / _LOCK, busy(out)):
         store = RunStore(folder)
         try:
             yield store

@@ -14,7 +14,7 @@ from marlbc_mj.policies.general import mean_policy, read_general
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.studies.communication import NetworkCase
-from marlbc_mj.studies.safety import GROUNDS
+from marlbc_mj.studies.safety import MISSION_FAMILIES
 from marlbc_mj.training.general.config import JUDGED_WITH, GeneralConfig
 from marlbc_mj.training.general.judging import Judge
 from marlbc_mj.util.errors import MarlbcError, unknown
@@ -24,7 +24,7 @@ POOR_NETWORK = NetworkCase(range=1.2, delay=0.1, loss=0.2, silent=True)
 _SILENT, _LINES = "silent", "lines"
 """Suffixes of mission names: with :data:`POOR_NETWORK`, and with FR approaching its slots along their lines."""
 VALIDATION_MISSIONS = (
-    *(f"{family} wedge-4" for family in GROUNDS),
+    *(f"{family} wedge-4" for family in MISSION_FAMILIES),
     *(f"{family} wedge-4 {_SILENT}" for family in ("field", "gates", "corridor")),
     *(f"gates {team}" for team in ("line-6", "circle-8", "grid-9", f"grid-9 {_LINES}", "circle-12", "wedge-16", "grid-16")),
     *(f"corridor {team}" for team in ("line-6", "circle-8", "grid-9", "circle-12")),

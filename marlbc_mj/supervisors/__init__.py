@@ -75,12 +75,12 @@ ORACLES = ("oracle", "oracle-schedule")
 """Supervisors whose factories take the name of the controller with which the schedule was found."""
 LEARNED = ("marlms", "rlms")
 """Supervisors loaded from shipped checkpoints; each has a model card in ``training/checkpoints``."""
-LOCAL_RIVALS = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "orca", "cbf-qp")
+LOCAL_BASELINES = ("fixed", "set-based-rule", "lookahead", "lookahead-distributed", "rollout", "orca", "cbf-qp")
 """Baseline supervisors that need no prior knowledge of a layout; ``marlbc evaluate`` compares them."""
-ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_RIVALS, "marlms-general")
+ON_REQUEST = ("mpcms-mujoco", "oracle-schedule", *LOCAL_BASELINES, "marlms-general")
 """Supervisors that a benchmark runs only if they are named. The first takes minutes per episode, the second is identical to the
 oracle if nothing is perturbed, and the others are not part of the paper's comparison."""
-VELOCITY_GIVERS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
+VELOCITY_SUPERVISORS = ("layered", "motor-schema", "fuzzy-blend", "orca", "cbf-qp")
 """Supervisors that return reference velocities, so the composition has no effect."""
 OWN = "own"
 """Replaces the name of the composition for supervisors that return reference velocities."""
@@ -104,7 +104,7 @@ def make_supervisor(name: str, controller: str = "sorlc") -> Supervisor:
         supervisor = made(name, Supervisor)
         lacking = [each for each in ("start", "decide") if not callable(getattr(supervisor, each, None))]
         if lacking:
-            raise ConfigurationError(f"{name} is no supervisor: {type(supervisor).__name__} lacks {', '.join(lacking)}")
+            raise ConfigurationError(f"{name} is not a supervisor: {type(supervisor).__name__} lacks {', '.join(lacking)}")
         return batched(supervisor)
     if name.endswith(CHECKPOINT_SUFFIX):
         path = Path(name)
@@ -121,14 +121,14 @@ __all__ = [
     "FMS",
     "FSAMS",
     "LEARNED",
-    "LOCAL_RIVALS",
+    "LOCAL_BASELINES",
     "MPCMS",
     "ON_REQUEST",
     "ORCA",
     "OWN",
     "SUPERVISORS",
     "UNLEARNED",
-    "VELOCITY_GIVERS",
+    "VELOCITY_SUPERVISORS",
     "Blend",
     "Decision",
     "DistributedLookAhead",

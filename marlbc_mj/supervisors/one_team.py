@@ -70,7 +70,7 @@ def batched(supervisor: Supervisor | OneTeamSupervisor) -> Supervisor:
         ConfigurationError: a class, or an object without ``start`` and ``decide``.
     """
     if isinstance(supervisor, type):
-        raise ConfigurationError(f"supervisor is the class {supervisor.__name__}; make one of it: {supervisor.__name__}()")
+        raise ConfigurationError(f"supervisor is the class {supervisor.__name__}; create an instance: {supervisor.__name__}()")
     lacking = [each for each in ("start", "decide") if not callable(getattr(supervisor, each, None))]
     if lacking:
         raise ConfigurationError(f"a supervisor has start and decide; {type(supervisor).__name__} lacks {', '.join(lacking)}")

@@ -25,7 +25,7 @@ from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
-from marlbc_mj.scenarios.base import YOUNG
+from marlbc_mj.scenarios.base import ADDED_LATER
 from marlbc_mj.supervisors.scripted import Schedule, Scripted, orders_at
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
@@ -68,7 +68,7 @@ def cache_key(scenario: Scenario, controller: Controller) -> str:
     """Hash of everything that affects a schedule's return, without names, descriptions and the scripted schedule."""
     bare = plain_data(replace(scenario, name="", description="", schedule=()))
     for field in fields(scenario):
-        if field.metadata == YOUNG and getattr(scenario, field.name) == field.default:
+        if field.metadata == ADDED_LATER and getattr(scenario, field.name) == field.default:
             del bare[field.name]
     return config_hash({"scenario": bare, "controller": controller})
 

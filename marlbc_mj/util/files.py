@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from marlbc_mj.util.errors import ConfigurationError, NoSpaceError
-from marlbc_mj.util.locks import held, held_alone, is_held
+from marlbc_mj.util.locks import exclusive_lock, held, is_held
 from marlbc_mj.util.provenance import plain_data
 
 PARTIAL = ".partial-"
@@ -60,7 +60,7 @@ def check_folder(out: Path, *, overwrite: bool) -> None:
     with writing(out):
         if out.is_file():
             raise ConfigurationError(f"output folder {out} is a file")
-        if out.is_dir() and not overwrite and any(not _counts_not(path.name) for path in out.iterdir()):
+        if out.is_dir() and not overwrite and any(not _is_unfinished(path.name) for path in out.iterdir()):
             raise ConfigurationError(f"output folder {out} is not empty; choose another or add --overwrite")
 
 
@@ -78,7 +78,7 @@ def alone_in(out: Path, *, overwrite: bool) -> Iterator[None]:
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    with held_alone(out, busy(out)):
+    with exclusive_lock(out, busy(out)):
         check_folder(out, overwrite=overwrite)  # another process may have filled it in the meantime
         try:
             yield
@@ -93,7 +93,7 @@ def busy(out: Path) -> str:
     return f"{out} is being written by another process; wait for it or choose another folder"
 
 
-def _counts_not(name: str) -> bool:
+def _is_unfinished(name: str) -> bool:
     """Whether a name in an output folder belongs to an unfinished output of this program."""
     return PARTIAL in name or name == JOBS_FOLDER
 

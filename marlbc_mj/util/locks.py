@@ -52,7 +52,7 @@ def is_held(path: Path) -> bool:
 
 
 @contextmanager
-def held_alone(path: Path, otherwise: str) -> Iterator[None]:
+def exclusive_lock(path: Path, otherwise: str) -> Iterator[None]:
     """Lock a folder, or a file, which is created if missing, during the block; does nothing on systems without locks.
 
     Raises:

@@ -78,7 +78,7 @@ def load_module(path: Path) -> ModuleType:
         return known
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
-        raise ConfigurationError(f"{path} is no Python file")
+        raise ConfigurationError(f"{path} is not a Python file")
     module = importlib.util.module_from_spec(spec)
     vars(module)["__marlbc_stamp__"] = stamp
     sys.modules[name] = module

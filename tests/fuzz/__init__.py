@@ -1,1 +1,1 @@
-"""Wrong input by the thousand: ``python tests/fuzz``. Each case is one command line, run in a child process with limits."""
+"""Fuzzing with thousands of wrong inputs: ``python tests/fuzz``. Each case is a command line, run in a limited child process."""

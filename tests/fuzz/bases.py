@@ -1,4 +1,4 @@
-"""Whole files to be damaged, made by the program itself; and the compiled code that all cases share, loaded once."""
+"""Makes the valid files that cases damage, with the program itself, and so loads once the compiled code that all cases share."""
 
 import itertools
 import os
@@ -20,13 +20,13 @@ TRAIN = "train marlms --budget 600 --set worlds=2 hidden=4 capacity=256 batch=8 
 
 
 def quietly(folder: Path, *argv: str) -> None:
-    """Run a command whose output nobody needs."""
+    """Run a command and send its output to a file."""
     with open(folder / "said", "a") as said, redirect_stdout(said), redirect_stderr(said):
         main([*argv])
 
 
 def make_bases(folder: Path, bait: Path, kinds: tuple[str, ...]) -> Bases:
-    """Whole files of the kinds of input that need them."""
+    """Make the valid files that the given kinds of input need."""
     folder.mkdir(parents=True)
     write_policy(folder / "p.safetensors", small_policy(), {"signature": signature(paper(), "extended", "commands", 10)})
     logs = [flown(folder, "plain", "run", "paper"), flown(folder, "pd", "run", "paper", "--controller", "pd")]
@@ -40,7 +40,7 @@ def make_bases(folder: Path, bait: Path, kinds: tuple[str, ...]) -> Bases:
     if {"damaged", "wrong"} & set(kinds):
         from marlbc_mj.recording.gl import choose_gl
 
-        choose_gl()  # tried once, for all
+        choose_gl()  # tried once for all cases
         logs.append(flown(folder, "shield", "run", "paper", "--shield", "--supervisor", "layered"))
         logs.append(flown(folder, "pose", "run", "robot_gate", "--robot", "crazyflie", "--controller", "pd"))
     if "toml" in kinds:
@@ -50,14 +50,14 @@ def make_bases(folder: Path, bait: Path, kinds: tuple[str, ...]) -> Bases:
 
 
 def flown(folder: Path, name: str, *argv: str) -> bytes:
-    """The log of half a second."""
+    """The log of an episode of half a second."""
     quietly(folder, *argv, *QUICK, "--out", str(folder / name))
     (log,) = (folder / name).rglob("*.mcap")
     return log.read_bytes()
 
 
 def small_policy() -> Policy:
-    """A policy that decides something."""
+    """A small policy with random weights."""
     rng, size = np.random.default_rng(0), make_state("extended", paper()).size
     sizes = [size, 3, 9]
     weights = tuple(rng.normal(size=(4, a, b)).astype(np.float32) for a, b in itertools.pairwise(sizes))

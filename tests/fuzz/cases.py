@@ -1,4 +1,4 @@
-"""What a case is, and the numbers and texts that all kinds of input are damaged with."""
+"""The type of a case, and the numbers, texts and byte changes that damage all kinds of input."""
 
 from collections.abc import Callable
 from random import Random
@@ -6,24 +6,24 @@ from typing import NamedTuple
 
 
 class Case(NamedTuple):
-    """One command line with the files that it finds in its folder."""
+    """A command line and the files in its working folder."""
 
     argv: list[str]
     files: dict[str, bytes]
-    refused: bool = False  # whether exit status 0 would be a fault: something damaged was taken for whole
+    refused: bool = False  # whether exit status 0 would be a fault: the program would have accepted damaged input
 
 
 class Bases(NamedTuple):
-    """Whole files that are damaged, and files that nobody may open."""
+    """Valid files for cases to damage, and the folder of files that no command may open."""
 
     logs: list[bytes]
     policy: bytes  # a small checkpoint
     run: dict[str, bytes]  # files of a training run, by name
-    bait: str  # folder outside every case's folder
+    bait: str  # path of a folder outside every case's folder
 
 
 Make = Callable[[Random, Bases], Case]
-"""Makes the case of one random stream."""
+"""Makes a case from a random stream."""
 
 INTEGERS = ("0", "1", "-1", "2", "3", "7", "1000", "2147483648", "-2147483649", "9223372036854775808", "1" + "0" * 30)
 FLOATS = (
@@ -52,12 +52,12 @@ TEXTS = (
 
 
 def pick(rng: Random, *pools: tuple[str, ...]) -> str:
-    """A member of one of several pools, each as likely as the others."""
+    """A random member of one of several equally likely pools."""
     return rng.choice(rng.choice(pools))
 
 
 def damaged(rng: Random, content: bytes) -> bytes:
-    """Bytes with some of them flipped, cut, doubled, zeroed, moved or made up."""
+    """The content with some bytes flipped, cut, doubled, zeroed, replaced at random or inserted."""
     data = bytearray(content)
     for _ in range(rng.choice((1, 1, 1, 2, 5))):
         if not data:

@@ -1,4 +1,4 @@
-"""Checkpoints of policies and saved training runs: damaged bytes, and wrong content under a digest that is right."""
+"""Checkpoints of policies and saved training runs: damaged bytes, and wrong content under a correct digest."""
 
 import json
 import struct
@@ -18,7 +18,7 @@ POLICY, RUN = "p.safetensors", "run/resume.safetensors"
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """An episode or an export with the policy, or a run that goes on."""
+    """A case that flies or exports the policy, or resumes a training run."""
     resumed = rng.random() < 0.35
     content = bases.run[RUN] if resumed else bases.policy
     name, files = (RUN, dict(bases.run)) if resumed else (POLICY, {})
@@ -41,7 +41,7 @@ def using(rng: Random) -> list[str]:
 
 
 def flipped(rng: Random, content: bytes) -> bytes:
-    """One bit is another; more often one of the header than the sizes say."""
+    """The content with one bit flipped, in the header more often than its share of the bytes."""
     (header,) = struct.unpack("<Q", content[:8])
     place = rng.randrange(rng.choice((8 + header, len(content))))
     data = bytearray(content)
@@ -50,7 +50,7 @@ def flipped(rng: Random, content: bytes) -> bytes:
 
 
 def rewritten(rng: Random, content: bytes) -> bytes:
-    """The checkpoint with other arrays or another description, signed anew."""
+    """The checkpoint with changed arrays or a changed description, and its digest computed anew."""
     (header,) = struct.unpack("<Q", content[:8])
     description = json.loads(json.loads(content[8 : 8 + header])["__metadata__"]["marlbc_mj"])
     arrays = {name: np.array(array) for name, array in load(content).items()}
@@ -68,7 +68,7 @@ def rewritten(rng: Random, content: bytes) -> bytes:
 
 
 def reshape(rng: Random, arrays: dict[str, Any]) -> None:
-    """Change, exchange or remove one array."""
+    """Change, replace, remove or duplicate one array."""
     if not arrays:
         return
     name, other = rng.choice(sorted(arrays)), rng.choice(sorted(arrays))

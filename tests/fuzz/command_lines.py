@@ -63,19 +63,19 @@ SHORT: tuple[tuple[str, ...], ...] = (
     ("list",),
     (),
 )
-"""Commands that take moments."""
+"""Commands that finish within moments."""
 LONG = (
     *("duration", "seeds", "layouts", "searched", "budget", "rounds", "workers", "threads", "agents", "width", "height", "fps"),
     *("substep", "samples"),
 )
-"""Options with which a command may rightly take minutes."""
+"""Options that may legitimately make a command take minutes."""
 REFUSED = ("0", "-1", "nan", "inf", "1e300", "9223372036854775808", "1" + "0" * 30, "x", "", "0.3", "1e-320")
-"""Values that no such option may take, or that cost nothing."""
+"""Values of such options that are invalid or cost no time."""
 SPARED = (
     *("perf", "scale", "ablation", "calibrate", "oracle", "gate", "view", "study"),
     *("suite", "safety", "communication", "marlms-general"),
 )
-"""Commands that take minutes once nothing is wrong with them: only parts are taken away or made wrong."""
+"""Commands that take minutes when they are valid: no change may make them valid."""
 PATHS = (
     *(
         "cell.toml",
@@ -166,7 +166,7 @@ def fails():
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """A command line with a few things wrong."""
+    """A command line with up to five random changes."""
     argv = list(rng.choice(SHORT))
     for _ in range(rng.choice((0, 1, 1, 2, 2, 3, 5))):
         change(rng, argv)
@@ -174,7 +174,7 @@ def make(rng: Random, bases: Bases) -> Case:
 
 
 def surroundings(rng: Random, bases: Bases) -> dict[str, bytes]:
-    """Files to name on a command line."""
+    """Files that a command line may name."""
     whole = bases.logs[0]
     return {
         "cell.toml": b'family = "open"\nagents = 3\nduration = 1.0\n',
@@ -192,7 +192,7 @@ def surroundings(rng: Random, bases: Bases) -> dict[str, bytes]:
 
 
 def change(rng: Random, argv: list[str]) -> None:
-    """One change; to a command that would take long, none that completes it."""
+    """Make one change, but none that could turn a command in ``SPARED`` into a valid one."""
     at = rng.randrange(len(argv) + 1)
     spared = any(word in SPARED for word in argv)
     match rng.randrange(10):
@@ -213,12 +213,12 @@ def change(rng: Random, argv: list[str]) -> None:
 
 
 def is_long(argv: list[str], at: int) -> bool:
-    """Whether a word is the value of an option that makes a command long."""
+    """Whether a word is the value of an option in ``LONG``."""
     return at > 0 and argv[at - 1].lstrip("-") in LONG
 
 
 def an_option(rng: Random, argv: list[str]) -> list[str]:
-    """An option, more often one of the command itself, with a value."""
+    """An option with up to two values, in most cases one of the command's own."""
     name = rng.choice(options(argv[0]) if rng.random() < 0.9 else options(""))
     bare = name.lstrip("-")
     if bare in LONG:
@@ -250,7 +250,7 @@ CHOICES = (
 
 @cache
 def options(command: str) -> tuple[str, ...]:
-    """Options of a command, with those of its actions; of all commands for one that is none."""
+    """Options of a command and its actions; those of all commands if the word is no command."""
     kind: Any = subcommands_of(Command).get(command, Command)
     hints = get_type_hints(kind, include_extras=True) if is_dataclass(kind) else {}
     action = get_args(hints["action"])[0] if "action" in hints else kind

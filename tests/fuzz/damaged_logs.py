@@ -9,7 +9,7 @@ OUTPUTS = ("out.csv", "out.npz", "out.rrd", "out.txt")
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """Something that reads the log."""
+    """A case in which a command reads the damaged log."""
     content = rng.choice(bases.logs)
     content = resized(rng, content) if rng.random() < 0.2 else damaged(rng, content)
     return Case(reading(rng), {"a.mcap": content})
@@ -30,7 +30,7 @@ def reading(rng: Random) -> list[str]:
 
 
 def resized(rng: Random, content: bytes) -> bytes:
-    """The log with one record's length, or a number in it, replaced by a wrong one."""
+    """The log with one record's length, or a number in the record, replaced by another."""
     starts, at = [], 8
     while at + 9 <= len(content) - 8:
         starts.append(at)

@@ -1,4 +1,4 @@
-"""The command line of the fuzzing: runs cases, prints a table, keeps what failed."""
+"""Command line of the fuzzer: runs cases, prints a table and keeps the cases that failed."""
 
 import argparse
 import json
@@ -20,7 +20,7 @@ class Kind(NamedTuple):
     """One kind of input."""
 
     make: Make
-    count: int  # cases of a whole run
+    count: int  # cases in a full run
 
 
 KINDS = {
@@ -36,7 +36,7 @@ HEAD = ("kind", "cases", "exit 0", "1", "2", "3", *FAULTS, "most MiB", "most CPU
 
 
 def main() -> int:
-    """Number of kinds with a fault."""
+    """Run the fuzzer and return the number of kinds of input with a fault."""
     arguments = parse()
     kinds = tuple(arguments.only or KINDS)
     out = Path(arguments.out or tempfile.mkdtemp(prefix="fuzz-")).resolve()
@@ -55,7 +55,7 @@ def main() -> int:
 
 
 def parse() -> argparse.Namespace:
-    """What the command line says."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(prog="python tests/fuzz", description="Wrong input by the thousand.")
     parser.add_argument("--only", nargs="+", choices=KINDS, help="kinds of input; all by default")
     parser.add_argument("--count", type=int, help="cases of each kind; 8100 in all by default")
@@ -68,7 +68,10 @@ def parse() -> argparse.Namespace:
 def run_kind(
     name: str, arguments: argparse.Namespace, out: Path, watched: tuple[Watch, Bait], bases: Bases
 ) -> tuple[list[str], bool]:
-    """Cells of a kind's row, and whether it has a fault; the row so far is in a file, for whoever stops it."""
+    """Run the cases of a kind; return the cells of its row and whether a case failed.
+
+    The row so far is kept in a file, so that it survives an interruption.
+    """
     row: list[str] = []
     statuses, faults, memory, cpu = Counter[int](), Counter[str](), 0, 0.0
     count = KINDS[name].count if arguments.count is None else arguments.count
@@ -89,7 +92,7 @@ def run_kind(
 
 
 def keep(folder: Path, case: Case, outcome: Outcome, found: list[str]) -> None:
-    """Move a case that failed to where it is looked at."""
+    """Move the folder of a failed case to ``failing`` and write ``case.json`` into it."""
     to = folder.parents[1] / "failing" / folder.name
     shutil.rmtree(to, ignore_errors=True)
     to.parent.mkdir(exist_ok=True)
@@ -98,5 +101,5 @@ def keep(folder: Path, case: Case, outcome: Outcome, found: list[str]) -> None:
 
 
 def remove(folder: Path, case: Case, outcome: Outcome, found: list[str]) -> None:
-    """Remove a case that went well."""
+    """Remove the folder of a case without a fault."""
     shutil.rmtree(folder, ignore_errors=True)

@@ -1,4 +1,4 @@
-"""One case in a forked child: its folder, its limits, and what became of it."""
+"""Runs one case in a forked child: its folder, its limits and its outcome."""
 
 import os
 import resource
@@ -18,26 +18,26 @@ from marlbc_mj.cli import main
 from .cases import Case
 from .outside import Bait, Watch
 
-MOST_CPU, MOST_WALL = 8.0, 60.0  # seconds of a processor; of a clock, for a case that waits for something
+MOST_CPU, MOST_WALL = 8.0, 60.0  # [s] of processor time; of elapsed time, for a case that waits for something
 MOST_MEMORY = 2 * 2**30  # bytes
-ADDRESS_SPACE = 4 * 2**30  # bytes beyond what the parent has: torch alone reserves more than it uses
+ADDRESS_SPACE = 4 * 2**30  # bytes beyond the parent's address space: torch alone reserves more than it uses
 EXIT_TRACEBACK = 70
 TRACEBACK = "Traceback (most recent call last)"
 
 
 class Outcome(NamedTuple):
-    """What became of a case."""
+    """Outcome of a case."""
 
-    status: int  # of the process; negative: the signal that ended it
-    said: str  # on standard error
-    outside: list[str]  # files opened where nobody should
-    memory: int  # largest resident set, of it and of processes that it waited for [bytes]
+    status: int  # exit status of the process; if negative, the signal that ended it
+    said: str  # text on standard error
+    outside: list[str]  # files opened in forbidden places
+    memory: int  # largest resident set of the process and of children that it waited for [bytes]
     cpu: float  # [s]
     hung: bool
 
     def faults(self, case: Case) -> list[str]:
-        """What is wrong with it, in words."""
-        checked = case.argv[:2] == ["robot", "check"]  # whose status 1 says that a robot failed a check
+        """Names of the faults found."""
+        checked = case.argv[:2] == ["robot", "check"]  # exits with status 1 if a robot failed a check
         there = {
             "hang": self.hung or self.cpu > MOST_CPU,
             "crash": self.status < 0 and not self.hung,
@@ -76,7 +76,7 @@ def run(case: Case, folder: Path, watch: Watch, bait: Bait) -> Outcome:
 
 
 def cpu_of(process: int) -> float:
-    """Seconds of a processor that a process and those that it waited for have used."""
+    """Processor time used by a process and the children that it waited for [s]."""
     with suppress(OSError, IndexError):
         fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
         return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
@@ -84,7 +84,7 @@ def cpu_of(process: int) -> float:
 
 
 def lay_out(case: Case, folder: Path) -> None:
-    """The case's files, and some that are no files."""
+    """Create the case's folder: its files, and pipes, links and folders."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     for name, content in case.files.items():
@@ -100,7 +100,7 @@ def lay_out(case: Case, folder: Path) -> None:
 
 
 def _child(case: Case, folder: Path, watch: Watch) -> None:
-    """The command, and the end of this process."""
+    """Run the command and end this process."""
     status = EXIT_TRACEBACK
     try:
         _enter(case, folder, watch)
@@ -122,7 +122,7 @@ def _child(case: Case, folder: Path, watch: Watch) -> None:
 
 
 def _enter(case: Case, folder: Path, watch: Watch) -> None:
-    """Limits, folder, output and environment of a case."""
+    """Set the limits, folder, output and environment of a case."""
     os.setsid()
     for number, name in ((1, "stdout"), (2, "stderr")):
         descriptor = os.open(folder / name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600)
@@ -133,7 +133,7 @@ def _enter(case: Case, folder: Path, watch: Watch) -> None:
     os.chdir(folder)
     (folder / "tmp").mkdir()
     os.environ.update(HOME=str(folder), TMPDIR=str(folder / "tmp"))
-    tempfile.tempdir = None  # or the parent's place for temporary files would be kept
+    tempfile.tempdir = None  # else the parent's cached temporary folder would be used
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + ADDRESS_SPACE, resource.RLIM_INFINITY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

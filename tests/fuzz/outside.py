@@ -1,4 +1,4 @@
-"""Who opens files where nobody should: Python's own audit events, and the kernel's of a folder with bait."""
+"""Detects files opened in forbidden places: by Python's audit events, and by the kernel's events on a folder of bait files."""
 
 import ctypes
 import os
@@ -11,7 +11,7 @@ SYSTEM = (
     *("/proc", "/sys", "/dev/null", "/dev/urandom", "/dev/full", "/dev/shm", "/usr", "/lib", "/lib64"),
     *("/etc/localtime", "/etc/os-release", "/etc/mime.types", "/etc/fonts", "/var/cache/fontconfig"),
 )
-"""What any program may open."""
+"""Paths that any program may open."""
 ROOT = Path(__file__).resolve().parents[2]
 INSTALLED = (
     *(sys.prefix, sys.base_prefix),
@@ -21,7 +21,7 @@ INSTALLED = (
 
 
 class Watch:
-    """Notes files that this process opens outside some folders, once it is switched on."""
+    """Records the files that this process opens outside the allowed paths, once it is switched on."""
 
     def __init__(self) -> None:
         self.allowed: tuple[str, ...] = ()
@@ -29,7 +29,7 @@ class Watch:
         sys.addaudithook(self._hook)
 
     def start(self, allowed: list[str]) -> None:
-        """Switch on; ``allowed`` are folders and files, besides the installation and the system's own."""
+        """Switch on; ``allowed`` lists folders and files, besides those of the installation and the system."""
         self.allowed = tuple(os.path.realpath(each) for each in [*allowed, *INSTALLED]) + SYSTEM
 
     def _hook(self, event: str, arguments: tuple[object, ...]) -> None:
@@ -41,7 +41,7 @@ class Watch:
 
 
 class Bait:
-    """A folder whose files the kernel watches: opened by whatever library or child process, it is noticed."""
+    """A folder of files that the kernel watches, whichever library or child process opens them."""
 
     def __init__(self, folder: Path) -> None:
         folder.mkdir(parents=True)
@@ -53,7 +53,7 @@ class Bait:
             raise OSError(ctypes.get_errno(), "inotify")
 
     def taken(self) -> list[str]:
-        """Names that have been opened since the last call."""
+        """Names of the files opened since the last call."""
         try:
             data = os.read(self.descriptor, 65536)
         except BlockingIOError:
@@ -61,7 +61,7 @@ class Bait:
         names, at = [], 0
         while at < len(data):
             _, mask, _, length = struct.unpack_from("iIII", data, at)
-            if not mask & IN_ISDIR:  # whoever lists the folder, another program for example, reads none of its files
+            if not mask & IN_ISDIR:  # listing the folder, as other programs may do, reads no file
                 names.append(data[at + 16 : at + 16 + length].rstrip(b"\0").decode())
             at += 16 + length
         return names

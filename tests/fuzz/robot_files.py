@@ -1,4 +1,4 @@
-"""MJCF of robots: with wrong numbers, names and elements, with files of others, and with damaged text."""
+"""Robot MJCFs with wrong numbers, names and elements, with references to forbidden files, and with damaged text."""
 
 import copy
 from random import Random
@@ -167,7 +167,7 @@ INSIDE = "cart.xml"
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """A short run with the robot, or its checklist."""
+    """A case that flies the robot briefly, or checks it."""
     content = text(rng, bases.bait).encode(errors="replace")
     if rng.random() < 0.1:
         content = damaged(rng, content)
@@ -189,7 +189,7 @@ def text(rng: Random, bait: str) -> str:
 
 
 def change(rng: Random, root: ElementTree.Element, bait: str) -> None:
-    """One change anywhere."""
+    """Change one random place of the tree."""
     elements = list(root.iter())
     one, other = rng.choice(elements), rng.choice(elements)
     match rng.randrange(9):

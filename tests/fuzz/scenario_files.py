@@ -1,4 +1,4 @@
-"""Scenario files: whole families of missions with wrong values, keys and tables, and with damaged text."""
+"""Scenario files: valid families of missions with wrong values, keys and tables, and with damaged text."""
 
 from dataclasses import fields
 from random import Random
@@ -38,7 +38,7 @@ CONTROLLERS = ("pd", "pd", "pd", "lqr", "sorlc")
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """A run or an evaluation of one file."""
+    """A case that runs one scenario file."""
     content = text(rng).encode(errors="surrogatepass")
     if rng.random() < 0.15:
         content = damaged(rng, content)
@@ -72,7 +72,7 @@ def value(rng: Random) -> str:
 
 
 PLAUSIBLE = ("0.1", "0.3", "0.02", "0.001", "4", "5", "8", "12", "40", "100", "256", "257", "1.5", "3.0", "6.0", "20.0", "60.0")
-"""Numbers that many fields may have."""
+"""Numbers that many fields accept."""
 
 
 def tables(rng: Random) -> list[str]:

@@ -1,4 +1,4 @@
-"""Logs that are well formed, with valid checksums, and say what no episode leaves."""
+"""Well-formed logs with valid checksums and content that no episode writes."""
 
 import io
 import json
@@ -36,7 +36,7 @@ METADATA = (
 
 
 class Parts(NamedTuple):
-    """What a log is made of."""
+    """Parts of a log."""
 
     channels: dict[str, tuple[Any, Any]]  # schema and channel by topic
     messages: list[tuple[str, int, bytes]]  # topic, time, data
@@ -45,7 +45,7 @@ class Parts(NamedTuple):
 
 
 def make(rng: Random, bases: Bases) -> Case:
-    """Something that reads the log."""
+    """A case in which a command reads the changed log."""
     parts = taken_apart(rng.choice(bases.logs))
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
         parts = change(rng, parts, bases.bait)
@@ -54,7 +54,7 @@ def make(rng: Random, bases: Bases) -> Case:
 
 @cache
 def taken_apart(content: bytes) -> Parts:
-    """The parts of a whole log."""
+    """The parts of a valid log."""
     read = make_reader(io.BytesIO(content))
     found = [(schema, channel, message) for schema, channel, message in read.iter_messages()]
     return Parts(
@@ -66,7 +66,7 @@ def taken_apart(content: bytes) -> Parts:
 
 
 def put_together(rng: Random, parts: Parts) -> bytes:
-    """The log of the parts, with checksums that are right."""
+    """The log made of the parts, with valid checksums."""
     with io.BytesIO() as stream:
         compression = rng.choice((CompressionType.ZSTD, CompressionType.LZ4, CompressionType.NONE))
         writer = Writer(stream, compression=compression, chunk_size=rng.choice((1000, 2**20)))
@@ -88,7 +88,7 @@ def put_together(rng: Random, parts: Parts) -> bytes:
 
 
 def change(rng: Random, parts: Parts, bait: str) -> Parts:
-    """One change."""
+    """The parts with one random change."""
     match rng.randrange(10):
         case 0 | 1 | 2 | 3 | 4:
             return parts._replace(messages=reworded(rng, parts.messages))
@@ -101,7 +101,7 @@ def change(rng: Random, parts: Parts, bait: str) -> Parts:
 
 
 def reworded(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[str, int, bytes]]:
-    """Messages of one topic, or one of them, with something replaced."""
+    """The messages, with one part replaced in all or about a tenth of those of one topic."""
     topics = sorted({topic for topic, _, data in messages if data.startswith(b"{")})
     topic = rng.choice(topics) if topics else ""
     share, seed = rng.choice((1.0, 0.1)), rng.random()
@@ -118,7 +118,7 @@ def reworded(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[
 
 
 def replaced(rng: Random, value: Any) -> Any:
-    """JSON data with one part anywhere in it replaced, removed or nested deeply."""
+    """JSON data with one random part replaced, removed or nested deeply."""
     if isinstance(value, dict) and value and rng.random() < 0.9:
         name = rng.choice(sorted(value))
         if rng.random() < 0.1:
@@ -137,7 +137,7 @@ def replaced(rng: Random, value: Any) -> Any:
 
 
 def reordered(rng: Random, messages: list[tuple[str, int, bytes]]) -> list[tuple[str, int, bytes]]:
-    """Messages shuffled, at other times, doubled, or without those of a topic."""
+    """The messages shuffled, all at one time, or with those of a topic removed or doubled; or no messages."""
     topic = rng.choice(messages)[0] if messages else ""
     match rng.randrange(5):
         case 0:
@@ -161,7 +161,7 @@ def redescribed(rng: Random, fields: dict[str, str]) -> dict[str, str]:
 
 
 def remodelled(rng: Random, attachments: list[tuple[str, str, bytes]], bait: str) -> list[tuple[str, str, bytes]]:
-    """Attachments with another model, or without one of them."""
+    """Attachments with another model, or shuffled with one removed."""
     if rng.random() < 0.2:
         return rng.sample(attachments, len(attachments) - 1) if attachments else []
     model = robot_files.text(rng, bait).encode(errors="replace")

@@ -1,4 +1,4 @@
-"""The Stretch's base: two wheels with motors on their sum and difference, and bearings that brake, led by a point ahead."""
+"""The Stretch's base, led by a point ahead of its axle: motors drive the wheels' sum and difference, and bearings brake."""
 
 from pathlib import Path
 
@@ -17,7 +17,7 @@ _STATE = ("heading", "speed", "turn_rate", "braking", "twisting", "saturated")
 
 @laws.drive(gains=_GAINS, state=_STATE)
 def stretch_drive(gains, state, qpos, qvel, force, h, ctrl_out):
-    """Force and moment for p'' = F / m of the point ahead, and what the bearings take; wheels turn backwards in the file."""
+    """Force and moment for p'' = F / m of the leading point, plus the bearings' torque; the MJCF's wheels turn backwards."""
     t = heading(qpos[3:7])
     state.heading, state.turn_rate = t, qvel[5]
     state.speed = np.cos(t) * qvel[0] + np.sin(t) * qvel[1]
@@ -33,7 +33,7 @@ def stretch_drive(gains, state, qpos, qvel, force, h, ctrl_out):
 
 @laws.reading(gains=_GAINS, state=_STATE)
 def stretch_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
-    """p, v of the point ahead; force = m p'' for what motors and bearings gave, at the motion that the drive saw."""
+    """p and v of the leading point; force = m p'' from the motors' and bearings' torques, for the motion that the drive saw."""
     t, w = heading(qpos[3:7]), qvel[5]
     p_out[0], p_out[1] = qpos[0] + gains.ahead * np.cos(t), qpos[1] + gains.ahead * np.sin(t)
     v_out[0], v_out[1] = qvel[0] - gains.ahead * w * np.sin(t), qvel[1] + gains.ahead * w * np.cos(t)
@@ -46,7 +46,7 @@ def stretch_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, forc
 
 
 def robot() -> Robot:
-    """Inertias are read from the MJCF; spinning wheels add to mass and turning inertia."""
+    """The robot, with inertias read from the MJCF; spinning wheels add to mass and turning inertia."""
     own = inertia(mujoco.MjSpec.from_file(str(MJCF)))
     mass, turn = own.mass + 2.0 * own.wheel / WHEEL**2, own.turn + 2.0 * own.wheel * (HALF_TRACK / WHEEL) ** 2
     gains = {"wheel": WHEEL, "half_track": HALF_TRACK, "ahead": AHEAD, "brake": BRAKE, "gear": GEAR, "mass": mass}
@@ -63,7 +63,7 @@ def robot() -> Robot:
         report=("saturated",),
         mass=mass,
         force_limit=25.0,
-        speed_limit=0.12,  # at which the bearings take half of what the motors give
+        speed_limit=0.12,  # at which the bearings take half of the motors' torque
         acceleration_limit=0.15,
         gains=(9.0, 6.0),
         length=0.6,

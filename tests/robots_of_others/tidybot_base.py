@@ -1,4 +1,4 @@
-"""The TidyBot base: position servos on its slides, whose law is known and so can be solved for the control of a wanted force."""
+"""The TidyBot base: its slides have position servos of known law, which is solved for the control that gives a wanted force."""
 
 from pathlib import Path
 
@@ -19,7 +19,7 @@ def tidybot_drive(gains, state, qpos, qvel, force, h, ctrl_out):
 
 @laws.reading(gains=_GAINS)
 def tidybot_reading(gains, state, qpos, qvel, actuator_force, p_out, v_out, force_out):
-    """Place, velocity and servo forces of the slides."""
+    """Position, velocity and servo force of each slide."""
     for axis in range(2):
         p_out[axis], v_out[axis], force_out[axis] = qpos[axis], qvel[axis], actuator_force[axis]
 
@@ -35,7 +35,7 @@ ROBOT = Robot(
     reading=tidybot_reading,
     params={"stiffness": STIFFNESS, "damping": DAMPING},
     mass=60.0,
-    force_limit=120.0,  # chosen: the file limits neither control nor force
+    force_limit=120.0,  # chosen freely: the file limits neither control nor force
     speed_limit=1.0,
     acceleration_limit=1.0,
     gains=(36.0, 12.0),

@@ -121,7 +121,7 @@ class PPOTrainer(GeneralTrainer):
             order = torch.from_numpy(self.rng.permutation(len(whole.state))).to(whole.state.device)
             for rows in order.tensor_split(ppo.minibatches):
                 self.error = self.learner.descend(*self.learner.objective(whole.part(rows)), self.learning_rate)
-        self.refuse_nonsense()
+        self.check_finite()
 
 
 def with_team(rows: np.ndarray, sizes: np.ndarray) -> np.ndarray:

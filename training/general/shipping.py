@@ -192,7 +192,7 @@ def _curve_cells(row: dict[str, str], families: list[str]) -> tuple[str, ...]:
 
 def training_command(train: dict[str, Any]) -> str:
     """The command for a training with these settings: ``--set`` lists those that differ from this version's defaults."""
-    return " ".join([f"marlbc train {GENERAL} --seed {train['seed']}", *changed_settings(train, GeneralConfig(), said={"seed"})])
+    return " ".join([f"marlbc train {GENERAL} --seed {train['seed']}", *changed_settings(train, GeneralConfig(), given={"seed"})])
 
 
 def _command(run: dict[str, Any]) -> str:

@@ -168,9 +168,9 @@ class GeneralTrainer:
         for _ in range(config.updates):
             batch = self.replay.sample(config.batch, config.n_step, config.gamma, self.rng)
             self.error = self.learner.update(batch, self.learning_rate)
-        self.refuse_nonsense()
+        self.check_finite()
 
-    def refuse_nonsense(self) -> None:
+    def check_finite(self) -> None:
         """Check that the last update's error is finite.
 
         Raises:

@@ -93,7 +93,7 @@ def attempt(work: Work[Any, Any], task: Task) -> Outcome:
 
 
 @dataclass
-class Ears:
+class EngineCallbacks:
     """Callbacks by which an engine informs the study's process, besides the results that it yields."""
 
     progress: Progress = silent
@@ -110,7 +110,7 @@ class Ears:
 class Engine(Protocol):
     """Interface of engines, which run the jobs of a study."""
 
-    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         """Yield the index and the result of each job as it ends; closing the generator ends everything that it started.
 
         A job whose worker dies is tried again, up to :data:`MOST_TRIES` tries in total.

@@ -13,7 +13,7 @@ from multiprocessing.queues import SimpleQueue
 from multiprocessing.synchronize import Event
 from typing import Any, NamedTuple
 
-from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Task, Work
+from marlbc_mj.studies.engines.base import MOST_TRIES, EngineCallbacks, Task, Work
 from marlbc_mj.studies.protocol import JobT, ResultT, Stopped
 from marlbc_mj.util.errors import SimulationError
 from marlbc_mj.util.progress import Progress
@@ -26,7 +26,7 @@ DIED = "a worker process died (out of memory?)"
 class ThisProcess:
     """Engine that runs one job after another. A stopped job yields no result; later ones are still tried, as some may be done."""
 
-    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         for task in tasks:
             try:
                 yield task.place, work.do(task, ears.progress, ears.stopping)
@@ -42,7 +42,7 @@ class Processes:
     def __init__(self, workers: int) -> None:
         self.workers = workers
 
-    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         left = {task.place: task for task in tasks}
         tries = 1
         while left:
@@ -55,7 +55,7 @@ class Processes:
             except BrokenProcessPool as error:
                 if ears.stop is not None:
                     if not ears.stopping():
-                        raise SimulationError(f"{DIED}; the same command goes on") from error
+                        raise SimulationError(f"{DIED}; repeat the command to resume") from error
                     return
                 if tries == MOST_TRIES:
                     raise SimulationError(DIED) from error
@@ -63,7 +63,9 @@ class Processes:
                 ears.retried(DIED)
 
 
-def _pooled(work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears, workers: int) -> Generator[tuple[int, ResultT]]:
+def _pooled(
+    work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks, workers: int
+) -> Generator[tuple[int, ResultT]]:
     context = get_context("spawn")
     stopping, told = context.Event(), context.SimpleQueue()
     with (

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from marlbc_mj.studies.engines import guard
-from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
+from marlbc_mj.studies.engines.base import MOST_TRIES, EngineCallbacks, Outcome, Task, Work, attempt
 from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
 from marlbc_mj.util.text import one_line
@@ -45,7 +45,7 @@ class RayTasks:
         except ImportError as error:
             raise ConfigurationError("the engine ray needs Ray: pip install 'marlbc-mj[ray]'") from error
 
-    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None:
             raise ConfigurationError("jobs that save themselves run on this machine only; leave out --engine ray")
         with nullcontext() if os.environ.get(ADDRESS) else _guarded(), self._connected():

@@ -19,7 +19,7 @@ from time import monotonic, sleep
 from typing import Any, NamedTuple
 
 from marlbc_mj.studies import codec
-from marlbc_mj.studies.engines.base import MOST_TRIES, Ears, Outcome, Task, Work, attempt
+from marlbc_mj.studies.engines.base import MOST_TRIES, EngineCallbacks, Outcome, Task, Work, attempt
 from marlbc_mj.studies.packs import PACK_SUFFIX, PackWriter, entries
 from marlbc_mj.studies.protocol import JobT, ResultT
 from marlbc_mj.util.errors import ConfigurationError, SimulationError
@@ -75,7 +75,7 @@ class SlurmArray:
             raise ConfigurationError("no SLURM here: there is no command sbatch")
         self._jobs: list[Any] = []  # submitit jobs of the last array
 
-    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None or work.scratch is None:
             raise ConfigurationError("the engine slurm needs an output folder, and jobs that do not save themselves")
         with writing(work.scratch):
@@ -90,7 +90,7 @@ class SlurmArray:
             self._cancel(work.scratch)
         shutil.rmtree(work.scratch, ignore_errors=True)
 
-    def _rounds(self, work: Work[JobT, ResultT], array: "_Array", ears: Ears) -> Generator[tuple[int, ResultT]]:
+    def _rounds(self, work: Work[JobT, ResultT], array: "_Array", ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         """Submit an array, and further ones if tasks end without all of their results."""
         for tries in range(MOST_TRIES):
             if not array.left:
@@ -120,7 +120,7 @@ class SlurmArray:
             with executor.batch():
                 jobs = [executor.submit(share) for share in shares]
         except (self.submitit.core.utils.FailedJobError, OSError, subprocess.SubprocessError) as error:
-            raise ConfigurationError(f"SLURM takes no jobs: {one_line(str(error)[-300:])}") from error
+            raise ConfigurationError(f"SLURM rejected the jobs: {one_line(str(error)[-300:])}") from error
         with (scratch / _ARRAYS).open("a") as file:
             file.writelines(f"{name}\n" for name in dict.fromkeys(str(job.job_id).split("_")[0] for job in jobs))
         self._jobs = jobs

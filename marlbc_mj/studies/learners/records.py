@@ -129,7 +129,7 @@ def read_csv(path: Path, columns: Sequence[str]) -> list[CsvLine]:
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
     if not lines or any(line.get(column) is None for line in lines for column in columns):
-        raise ConfigurationError(f"{path} is no file of a study: it needs lines with columns {', '.join(columns)}")
+        raise ConfigurationError(f"{path} is not a study file: it needs lines with columns {', '.join(columns)}")
     return lines
 
 
@@ -146,7 +146,7 @@ def read_study(folder: Path) -> tuple[list[CsvLine], list[CsvLine]]:
             raise unknown("variant", line["variant"], VARIANTS)
         texts = [text for key, text in line.items() if key not in ("variant", "failure")]
         if not all(_is_number(part) for text in texts for part in text.split("/") if part):
-            raise ConfigurationError(f"a line of {folder} is no record of a study: {', '.join(line.values())}")
+            raise ConfigurationError(f"a line of {folder} is not a record of a study: {', '.join(line.values())}")
     return rows, curves
 
 

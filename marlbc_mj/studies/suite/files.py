@@ -89,7 +89,7 @@ def read_suite(folder: Path) -> SuiteResults:
     except OSError as error:
         raise ConfigurationError(f"{folder} holds no results of the suite: cannot read {path}: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigurationError(f"{path} is no file of the suite") from error
+        raise ConfigurationError(f"{path} is not a file of the suite") from error
     if missing:
         raise ConfigurationError(f"{path} lacks {', '.join(missing)}")
     if form != FORM:

@@ -62,10 +62,10 @@ class SuiteStudy:
         tables = write_leaderboard(gathered.groups, gathered.facts, track_summaries(), out)
         document = {"facts": gathered.facts, "tables": list(map(table_document, tables))}
         text = "\n".join(map(to_markdown, leading_tables(tables)))
-        return Report(text, document, (*problems, *_strangeness(gathered)))
+        return Report(text, document, (*problems, *_other_code_versions(gathered)))
 
 
-def _strangeness(results: SuiteResults) -> list[str]:
+def _other_code_versions(results: SuiteResults) -> list[str]:
     """One line for every other version of the code that made some of the results."""
     codes = dict.fromkeys(str(facts["code"]) for facts in (results.facts, *results.facts.get("beside", ())))
     return [f"rows are of other code ({code}) than this ({code_version()})" for code in codes if code != code_version()]
