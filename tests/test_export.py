@@ -100,7 +100,7 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
 
 @pytest.mark.parametrize("flown", [{"dwell": 1, "deadline": 0.0}, {"dwell": 3, "deadline": 1.0}])
 def test_the_general_policy_is_exported_as_it_decides(flown, tmp_path):
-    """One graph for every team size, for one network and for a mean of five; some agents have not heard others, some are alone."""
+    """One graph for every team size, of one network and of a mean; some agents have not heard others, some are alone."""
     policy = read_general(shipped("marlms-general"))[0]._replace(**flown)
     if policy.dwell == 1:
         weights, biases = ([layer[:1] for layer in layers] for layers in (policy.network.weights, policy.network.biases))
