@@ -208,7 +208,7 @@ def test_a_document_holds_numbers_by_name(capsys: pytest.CaptureFixture[str]) ->
 
     rows = {"rows": [Row(np.bool_(True), np.array([1.5, np.inf])), Row(np.int64(3), Refusal("a", "b"))]}
     ReportOptions(json=True).report("text", rows)
-    first, second = {"passed": True, "values": [1.5, None]}, {"passed": 3, "values": {"said": "a", "command": "b"}}
+    first, second = {"passed": True, "values": [1.5, None]}, {"passed": 3, "values": {"message": "a", "command": "b"}}
     assert json.loads(capsys.readouterr().out) == {"rows": [first, second]}
     ReportOptions(quiet=True).report("text", rows)
     assert capsys.readouterr().out == ""

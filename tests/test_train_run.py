@@ -48,7 +48,7 @@ FEW = {"worlds": 32, "capacity": 1_750}  # with a warm-up as short
 
 
 def small(**changes) -> TrainConfig:
-    return make_config("fast", **{**SMALL, "budget": 12_000, "evaluate_every": 6_000, **changes})
+    return make_config("fast", **{**SMALL, "budget": 16_000, "evaluate_every": 8_000, **changes})
 
 
 def equal(a, b):
@@ -140,7 +140,7 @@ def test_a_run_leaves_what_the_design_fixes(finished):
     assert list(rows[0]) == [
         "wall_s", "mission_steps", "return", *(f"switches_{i}" for i in range(1, 5)), "violation_time", "clearance_min"
     ]  # fmt: skip
-    assert [float(r["mission_steps"]) for r in rows][-1] >= 12_000
+    assert [float(r["mission_steps"]) for r in rows][-1] >= 16_000
     config = json.loads((finished / "config.json").read_text())
     assert config["train"]["seed"] == 0 and "torch" in config["versions"]
     assert {p.name for p in (finished / "checkpoint").iterdir()} == {
@@ -163,8 +163,8 @@ def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     """kill -9 at any moment while it learns: what was saved last is enough to end with the same networks, to the bit."""
     settings = [f"{k}={','.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in SMALL.items() if k != "threads"]
     folder = tmp_path / "run"
-    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "12000"]
-    command += ["--set", *settings, "evaluate_every=6000", "save_every=0.3"]
+    command = [sys.executable, "-m", "marlbc_mj", "train", "--out", str(folder), "--threads", "1", "--budget", "16000"]
+    command += ["--set", *settings, "evaluate_every=8000", "save_every=0.3"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def updates():
@@ -176,7 +176,7 @@ def test_kill_and_resume_equals_the_uninterrupted_run(finished, tmp_path):
     process.kill()
     assert process.wait() == -signal.SIGKILL
     saved = read_arrays(folder / RESUME)[1]["scalars"]
-    assert saved["updates"] > 0 and saved["steps"] < 12_000
+    assert saved["updates"] > 0 and saved["steps"] < 16_000
     config = json.loads((folder / "config.json").read_text())
     resume(folder)
     assert json.loads((folder / "config.json").read_text()) == config and not list(folder.rglob("*partial*"))
@@ -432,7 +432,7 @@ DAMAGED_RUNS = {
     "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
     "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
     "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
-    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 12000 instead of 7"),
+    "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 16000 instead of 7"),
 }
 
 

@@ -137,7 +137,7 @@ class Names:
                 raise ConfigurationError(f"law {owner.law!r} has no {owner.word} named {name!r}; its names: {there}")
         missing = [name for name in self.names if name not in given]
         if complete and missing:
-            raise ConfigurationError(f"law {owner.law!r} is not given its {owner.word} {missing[0]!r}; its names: {there}")
+            raise ConfigurationError(f"law {owner.law!r} lacks the {owner.word} {missing[0]!r}; its names: {there}")
 
 
 def _setter(name: str) -> Callable[[Any, Any], None]:

@@ -26,12 +26,8 @@ _GAINS = (
     "offset",  # m d, d from the axle to the center of mass [kg m]
     "torque_limit",  # [N m]
 )
-_STATE = (
-    "heading",
-    "speed",
-    "turn_rate",
-    "saturated",
-)  # t [rad], u [m/s], w [rad/s], substeps with a torque at its limit (each wheel counts 0.5)
+# t [rad], u [m/s], w [rad/s], substeps at the torque limit (each wheel counts 0.5)
+_STATE = ("heading", "speed", "turn_rate", "saturated")
 
 
 @laws.drive(gains=_GAINS, state=_STATE)
