@@ -156,7 +156,7 @@ def _has_layout(scenario: Scenario, seed: int, world: int = 0) -> bool:
     return True
 
 
-def test_what_cannot_run_at_all_is_said_of_every_draw() -> None:
+def test_an_invalid_setting_fails_every_draw() -> None:
     """Two causes: a substep that is too long for the controller, and a supervisor without a schedule."""
     coarse = evaluate_batch(paper(duration=0.5, substep=0.025), (0, 1), "scripted", "pd")
     assert all("25 ms" in str(run.failure) and run.instance is None for run in coarse)

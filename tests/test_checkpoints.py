@@ -161,7 +161,7 @@ def test_what_a_policy_depends_on_must_be_the_same(changes, name, tmp_path):
     assert name in refusal(lambda: learned.start(replace(paper(), **changes), 1))
 
 
-def test_what_a_policy_copes_with_is_free(tmp_path):
+def test_policy_accepts_scenario_changes(tmp_path):
     """Obstacles, starts, drag and duration may differ from those of training."""
     write_policy(tmp_path / "p.safetensors", policy_of(), signed())
     learned = Learned.load(tmp_path / "p.safetensors")

@@ -35,7 +35,7 @@ def shell(line: str, **environment: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no such shell")
 @pytest.mark.parametrize("arguments", ["list", "--help", "bench --help", "run --help"])
-def test_a_reader_that_stops_early_hears_nothing(arguments):
+def test_closed_pipe_is_silent(arguments):
     done = shell(f"marlbc {arguments} | head -1; exit ${{PIPESTATUS[0]}}")
     assert done.stdout.strip() and done.stderr == "" and done.returncode in (0, 141)
     assert shell(f"marlbc {arguments} | true").stderr == ""

@@ -615,7 +615,7 @@ def test_a_scenario_without_avoidance_runs():
 
 
 @pytest.mark.parametrize(("worlds", "threads"), [(1, 1), (3, 2)])
-def test_a_rollout_is_its_steps(worlds, threads):
+def test_rollout_equals_single_steps(worlds, threads):
     """A rollout over given orders equals as many single steps in states and returns, to the last bit."""
     scenario = paper(duration=3.0, perturbation=Perturbation(start_spread=1.0))
     orders = np.random.default_rng(5).integers(0, 6, (60, worlds, 4))

@@ -131,7 +131,7 @@ def test_a_feature_that_never_happens_draws_no_number():
 
 @given(st.integers(0, 3), st.integers(0, 3), st.sampled_from([-1, 4, 2**40, -(2**40)]))
 @settings(max_examples=20)
-def test_actions_that_are_none_are_named(world, agent, value):
+def test_invalid_actions_are_refused(world, agent, value):
     """Any index outside the action set is refused, in any world and agent, before a world has moved."""
     batch = FormationBatch(paper(duration=1.0), worlds=4)
     actions = np.zeros((4, 4), dtype=np.int64)

@@ -49,7 +49,7 @@ def field(**changes):
     return make_scenario("field", composition="set-based", **changes)
 
 
-def test_who_hears_nothing_decides_by_itself() -> None:
+def test_isolated_agent_ignores_messages() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(1, 3, inputs.FEATURES)).astype(np.float32)
     age = np.where(np.eye(3, dtype=bool), 0.0, np.inf)[None]

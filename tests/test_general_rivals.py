@@ -130,7 +130,7 @@ def test_a_rollout_is_assessed_with_the_critics_values() -> None:
     assert found.state.shape == (60, INPUTS) and found.view.shape == (60, 2 * INPUTS)
 
 
-def test_mappo_prefers_what_paid() -> None:
+def test_mappo_learns_the_rewarded_action() -> None:
     """After rollouts in which only the second action is rewarded, actors prefer it in over 95 % of the states."""
     trainer = PPOTrainer(replace(SMALL, learner="mappo", learning_rate=5e-3, ppo=PPO(rollout=8, epochs=3, minibatches=2)))
     rng, rows = np.random.default_rng(0), trainer.replay.arrays

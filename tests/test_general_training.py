@@ -101,7 +101,7 @@ def test_an_ablation_hides_inputs_from_the_network() -> None:
 
 
 @pytest.mark.slow
-def test_training_is_its_seed(tmp_path: Path) -> None:
+def test_training_is_reproducible(tmp_path: Path) -> None:
     """Two runs with one seed give the same network, and another seed gives another; eval.csv has the scores."""
     runs = {name: replace(SMALL, seed=seed, evaluate_every=200) for name, seed in (("a", 1), ("b", 1), ("c", 2))}
     for name, config in runs.items():

@@ -28,7 +28,7 @@ class FirstResult(random.Random):
         return low
 
 
-def test_what_is_wrong_is_seen(tmp_path: Path) -> None:
+def test_planted_faults_are_found(tmp_path: Path) -> None:
     """Faults are a torn file, an empty file, a different number and an extra file; times may differ."""
     whole, other = tmp_path / "whole", tmp_path / "other"
     for folder, text in ((whole, '{"a": 1, "wall_s": 2}'), (other, '{"a": 1, "wall_s": 3}')):

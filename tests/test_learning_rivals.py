@@ -360,7 +360,7 @@ def test_returns_are_normalised_and_back():
     assert np.allclose(scale.undo(scale(values)), values)
 
 
-def test_mappo_prefers_what_paid():
+def test_mappo_learns_the_rewarded_action():
     """After rollouts in which only action 2 is rewarded, actors prefer it in over 95 % of the states."""
     trainer = MAPPO(small("mappo", ppo=PPO(rollout=8, epochs=3, minibatches=2)))
     rng = np.random.default_rng(0)

@@ -206,7 +206,7 @@ def test_settings_of_looking_ahead_are_checked(setting):
 
 
 @pytest.mark.parametrize("name", LOCAL_BASELINES)
-def test_teams_among_moving_obstacles_are_told_what_they_are_told_alone(name):
+def test_decisions_among_moving_obstacles_do_not_depend_on_the_batch(name):
     """Three layouts in one World end as each does in its own World, to the last bit; so does a repetition."""
     scenario = make_scenario("traffic", duration=6.0)
     world = World(scenario, worlds=3)

@@ -34,7 +34,7 @@ def traffic(**changes):
 
 
 @given(MOTION, st.floats(0, 100), NUMBER, NUMBER)
-def test_the_law_is_its_closed_form_and_its_velocity_the_derivative(motion, t, x, y):
+def test_motion_matches_its_closed_form(motion, t, x, y):
     """o(t) = anchor + v t + a sin(2 pi t / period + phase)."""
     anchors, rows = np.array([[x, y, 1.5]]), motion_array((motion,))
     place = np.empty((1, MOVING))
@@ -189,7 +189,7 @@ def test_an_obstacle_that_begins_on_a_start_is_refused():
     make_scenario("paper", obstacles=(Obstacle(-2, 8, 1),), motions=(swing,), disturbance=LinearDrag())
 
 
-def test_what_knows_only_obstacles_at_rest_says_so():
+def test_oracle_refuses_moving_obstacles():
     """The oracle's search refuses moving obstacles."""
     from marlbc_mj.supervisors.oracle import search
 

@@ -148,7 +148,7 @@ def test_a_wrong_word_is_answered_with_the_nearest_right_one(line: str, capsys: 
     assert said.startswith("marlbc: ") and WRONG_WORDS[line] in said and said.count("\n") == 1
 
 
-def test_nothing_heavy_is_imported_for_that() -> None:
+def test_messages_import_nothing_heavy() -> None:
     """A process reports wrong words and prints help and lists without importing NumPy, Numba, MuJoCo or torch."""
     lines = [*(line.split() for line in WRONG_WORDS), ["--help"], ["bench", "--help"], ["list"], ["list", "robots"]]
     done = subprocess.run([sys.executable, "-c", HEAVY, json.dumps(lines)], capture_output=True, text=True, check=True)

@@ -36,7 +36,7 @@ def test_commands_exist() -> None:
         assert f"\n{target}:" in makefile, target
 
 
-def test_it_is_short_enough_to_be_read() -> None:
+def test_readme_length_and_links() -> None:
     """It has at most 900 words, read in five minutes, and the files that it links to exist."""
     text = README.read_text()
     assert len(text.split()) <= 900

@@ -82,7 +82,7 @@ def test_numbers_of_numpy_dataclasses_and_paths_come_back() -> None:
 
 
 @pytest.mark.parametrize("value", [print, object(), {1, 2}, np.array([None]), lambda: 0, type])
-def test_what_is_no_data_is_refused(value: object) -> None:
+def test_codec_refuses_what_is_not_data(value: object) -> None:
     with pytest.raises(ConfigurationError, match="cannot be stored"):
         codec.to_bytes([value])
 

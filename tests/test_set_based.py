@@ -144,7 +144,7 @@ def test_any_wish_can_be_braked(seed):
 
 
 @given(st.floats(1e-6, 20.0), st.floats(0.5, 10.0), st.floats(0.02, 0.2))
-def test_ways_to_rest_are_nested(speed, braking, duration):
+def test_stopping_paths_are_nested(speed, braking, duration):
     """L(s) >= s T + L(s - A T): after a mission step of braking, the rest was foreseen; and L is the way that braking takes."""
     barrier = BRAKING._replace(braking=braking, duration=duration)
     left, made = speed, 0.0

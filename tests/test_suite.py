@@ -152,7 +152,7 @@ def test_a_page_from_files_is_the_same_page(flown: Path, tmp_path: Path) -> None
     assert (tmp_path / "page" / "families.csv").read_bytes() == (flown / "families.csv").read_bytes()
 
 
-def test_rows_stand_beside_others(flown: Path, tmp_path: Path) -> None:
+def test_new_rows_merge_with_others(flown: Path, tmp_path: Path) -> None:
     """Methods that are flown again replace their old rows."""
     main([*FLY, "--supervisors", "lookahead", "fixed", "--from", str(flown), "--out", str(tmp_path / "more")])
     merged = read_suite(tmp_path / "more")

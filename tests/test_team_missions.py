@@ -49,7 +49,7 @@ def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
     assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, COLUMN_ACTION]
 
 
-def test_shut_out_is_far_from_both_slots_with_both_ways_blocked() -> None:
+def test_shut_out_conditions() -> None:
     inputs = np.zeros((1, 4, INPUTS))
     inputs[..., LANES:WAYS] = -1.0
     inputs[..., [WAYS + 1, WAYS + 3]] = 0.99
@@ -92,7 +92,7 @@ def test_a_mission_is_over_at_its_end_and_who_is_late_pays() -> None:
 
 
 @pytest.mark.parametrize("approach", ["straight", "line"])
-def test_who_is_late_finds_the_opening_along_its_line(approach: str) -> None:
+def test_late_agents_pass_along_their_lines(approach: str) -> None:
     """Once the column has passed an opening, agents before the walls beside it stay if they approach straight, not by lines."""
     scenario = team_mission("gates", "line", 6, composition="set-based", substep=0.01, column_approach=approach, gates=1)
     world = World(scenario, make_controller("pd"))

@@ -54,7 +54,7 @@ def assert_teams_are_alone(supervisor: Supervisor, world: World, steps: int) -> 
 
 
 @pytest.mark.parametrize("name", [name for name in QUICK if name != "oracle-schedule"])
-def test_teams_of_one_world_are_told_what_they_are_told_alone(name):
+def test_decisions_do_not_depend_on_the_batch(name):
     """Three draws run for 25 s, past the first point, or for 8 s if decisions are slow."""
     duration = 8.0 if name in ("mpcms", "rollout") else 25.0
     world = World(paper(perturbation=AROUND, duration=duration, **NEEDS.get(name, {})), worlds=3)
@@ -74,7 +74,7 @@ def test_teams_may_be_at_different_steps_of_the_mission(name):
 
 
 @pytest.mark.parametrize("name", ["fsams", "fms", "layered", "mpcms"])
-def test_teams_that_give_way_are_told_what_they_are_told_alone(name):
+def test_decisions_of_teams_that_give_way_do_not_depend_on_the_batch(name):
     """This covers agent avoidance, with imperfect sensors and among moving obstacles."""
     crossing = imperfect(make_scenario("exchange", agents=4))
     for scenario in (crossing, make_scenario("traffic", duration=8.0)):

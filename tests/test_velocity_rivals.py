@@ -186,7 +186,7 @@ def test_the_derivatives_in_a_barrier_are_those_of_the_distance(seed):
 
 
 @pytest.mark.parametrize("name", ["orca", "cbf-qp"])
-def test_far_from_everything_the_wish_is_granted(name):
+def test_in_free_space_the_desired_velocity_is_kept(name):
     """In formation with nothing near, the velocity is the path's and the orders are FM."""
     supervisor, observation = make_supervisor(name), World(OPEN).observe()
     memory = supervisor.start(OPEN, 1)
