@@ -1,6 +1,5 @@
 """``marlbc suite``: supervisors and controllers on a fixed set of missions, and the leaderboard."""
 
-import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,6 +17,7 @@ from marlbc_mj.cli.choices import (
 )
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.progress import note
 
 if TYPE_CHECKING:
     from marlbc_mj.studies.suite.study import SuiteStudy
@@ -82,7 +82,7 @@ class SuiteCommand:
             )
         self.output.report(done.report.text, done.report.document)
         for problem in done.report.problems:
-            print(f"marlbc: {problem}", file=sys.stderr)
+            note(problem)
         self.output.say(f"{self.out / LEADERBOARD_PAGE} shows it all")
 
     def study(self) -> "SuiteStudy":
