@@ -74,7 +74,7 @@ class FormationBatch:
     ) -> None:
         if not isinstance(interval, int | np.integer) or interval < 1 or scenario.mission_steps % interval:
             raise ConfigurationError(
-                f"a decision must hold for a number of mission steps that divides {scenario.mission_steps}, got {interval}"
+                f"a decision must last a number of mission steps that divides {scenario.mission_steps}, got {interval}"
             )
         if starts and starts.exploring and interval == scenario.mission_steps:
             raise ConfigurationError(
@@ -127,7 +127,7 @@ class FormationBatch:
         worlds = self.world.worlds
         seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed] * worlds
         if len(seeds) != worlds or any(s is not None and (not isinstance(s, int | np.integer) or s < 0) for s in seeds):
-            raise ConfigurationError(f"a seed must not be negative, and a list of them must have {worlds}, got {seed}")
+            raise ConfigurationError(f"a seed must be a non-negative whole number, or a list with {worlds} of them, got {seed}")
         chosen = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask)
         if chosen.shape != (worlds,) or chosen.dtype != np.bool_:
             raise ConfigurationError(

@@ -75,7 +75,7 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         """
         if seed is not None:
             if not isinstance(seed, int | np.integer) or seed < 0:
-                raise ConfigurationError(f"a seed must be a whole number from 0, got {seed!r}")
+                raise ConfigurationError(f"a seed must be a non-negative whole number, got {seed!r}")
             self._seeds = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
         self._state = self.batch.reset(int(self._seeds.integers(2**31)))[0]
@@ -96,7 +96,7 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         if unknown_agents:
             raise unknown("agent", unknown_agents[0], self.possible_agents)
         if missing:
-            raise ConfigurationError(f"every agent needs an action, there is none for {', '.join(missing)}")
+            raise ConfigurationError(f"every agent needs an action; missing: {', '.join(missing)}")
         outcome = self.batch.step(array_from([[actions[agent] for agent in self.possible_agents]]))
         self._state = outcome.final_state[0]
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}

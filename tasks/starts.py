@@ -36,7 +36,7 @@ class Starts:
     def __post_init__(self) -> None:
         for name in ("exploring", "focus", "turning"):
             if not 0 <= getattr(self, name) <= 1:
-                raise ConfigurationError(f"{name} is a share of starts between 0 and 1, got {getattr(self, name)}")
+                raise ConfigurationError(f"{name} must be a share of starts between 0 and 1, got {getattr(self, name)}")
         if not self.lead >= 0:
             raise ConfigurationError(f"the lead of a focused start must not be negative, got {self.lead} s")
         if not self.length > 0:

@@ -262,7 +262,7 @@ def test_json_is_one_document_and_quiet_is_silent(tmp_path: Path, capsys: pytest
     line = ["run", "paper", "--controller", "pd", *SHORT, "--seed", "3", "--out", str(tmp_path / "run")]
     main([*line, "--json"])
     said = capsys.readouterr()
-    assert said.err == "marlbc: paper draws nothing: seed 3 gives the same episode as any other\n"
+    assert said.err == "marlbc: paper has nothing random: seed 3 gives the same episode as any other seed\n"
     recorded = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert {key: json.loads(said.out)["methods"]["scripted+pd"][key] for key in recorded} == recorded
     main([*line, "--overwrite", "--quiet"])
@@ -279,7 +279,7 @@ def test_a_team_and_a_robot_of_another_kind(tmp_path: Path, capsys: pytest.Captu
     scenario, scale = options.build("field"), make_robot("omni").scale()
     assert scenario.agents == 6 and "circle" in scenario.description
     assert all(getattr(scenario, name) == value for name, value in scale.items())
-    assert "has a team of 4 of its own" in refused(["run", "--agents", "6", "--out", str(tmp_path / "run")], capsys)
+    assert "has a fixed team of 4 agents" in refused(["run", "--agents", "6", "--out", str(tmp_path / "run")], capsys)
     (tmp_path / "mine.toml").write_text('family = "open"\nrobot = "omni"\nagents = 3\n')
     from_file = make_scenario(str(tmp_path / "mine.toml"))
     assert all(getattr(from_file, name) == value for name, value in scale.items() if value != float("inf"))

@@ -222,10 +222,10 @@ def test_what_is_heard_of_a_supervisor_without_a_layer():
         ({"delay": -0.1}, "communication.delay must be non-negative and finite, got -0.1"),
         ({"delay": 0.07}, "communication.delay 0.07 s must be a whole multiple of the mission step 0.05 s"),
         ({"period": 0.01}, "communication.period 0.01 s must be a whole multiple of the mission step 0.05 s"),
-        ({"silent": (4,)}, "communication.silent: agents are 0 to 3, got 4"),
+        ({"silent": (4,)}, "communication.silent must name agents from 0 to 3, got 4"),
         ({"silent_from": float("inf")}, "communication.silent_from must be non-negative and finite"),
         ({"protocol": "gossip"}, "unknown communication.protocol 'gossip'; choose from: flooding, consensus"),
-        ({"range": 5.0}, "communication.range 5 m leaves the team in 4 parts at the start: agents 1 | 2 | 3 | 4"),
+        ({"range": 5.0}, "communication.range 5 m splits the team into 4 parts at the start: agents 1 | 2 | 3 | 4"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(settings, fragment):

@@ -228,7 +228,7 @@ def test_settings_of_the_command_line(tmp_path, capsys):
     config = json.loads((tmp_path / "a" / "config.json").read_text())["scenario"]
     assert config["communication"]["range"] == 8.0 and config["communication"]["silent"] == [1, 2]
     for setting, said in (
-        ("communication.range=2", "leaves the team in 4 parts at the start"),
+        ("communication.range=2", "splits the team into 4 parts at the start"),
         ("communication.reach=2", "unknown setting 'communication.reach'"),
         ("communication.loss=much", "setting communication.loss must be float, got 'much'"),
         ("duration=3", "unknown setting 'duration'"),

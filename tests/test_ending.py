@@ -230,7 +230,7 @@ def test_package_and_home_that_cannot_be_written(tmp_path):
     if "unshare" in done.stderr or "mount" in done.stderr:
         pytest.skip("no mounts here")
     assert done.returncode == 0 and "scripted" in done.stdout
-    assert done.stderr.startswith("marlbc: compiled code cannot be kept here") and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("marlbc: compiled code cannot be cached here") and done.stderr.count("\n") == 1
     assert "NUMBA_CACHE_DIR" in done.stderr
 
 

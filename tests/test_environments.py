@@ -201,7 +201,7 @@ def test_a_list_has_a_seed_for_every_world():
 @pytest.mark.parametrize(
     ("arguments", "fragment"),
     [
-        ({"seed": [1, 2]}, r"must have 3, got \[1, 2\]"),
+        ({"seed": [1, 2]}, r"a list with 3 of them, got \[1, 2\]"),
         ({"seed": [1, 2, -3]}, "negative"),
         ({"options": {"reset_mask": np.array([True, False])}}, r"shape \(3,\), got bool with shape \(2,\)"),
         ({"options": {"reset_mask": np.array([0, 1, 2])}}, "bool with shape"),

@@ -145,12 +145,12 @@ def test_moving_obstacles_keep_apart_and_leave_both_ends_free(seed):
 @pytest.mark.parametrize(
     ("family", "fragments"),
     [
-        (Field(gap=2.0), ("'field' cannot be flown", "gap of 2 m", "safe distance 1 m", "exceed 2 m")),
+        (Field(gap=2.0), ("'field' is infeasible", "gap of 2 m", "safe distance 1 m", "exceed 2 m")),
         (Field(obstacles=300), ("300 obstacles", "do not fit into")),
         (Field(obstacles=0), ("at least 1, got 0", "'open' has none")),
         (Field(radius=(2.0, 1.0)), ("ordered range", "(2.0, 1.0)")),
         (Field(length=12.0), ("no disc of radius 2 m fits between 5.7",)),
-        (Field(length=6.0), ("leaves nothing of a way of 6 m",)),
+        (Field(length=6.0), ("leaves no room for obstacles on a path of 6 m",)),
         (Forest(density=-1.0), ("density must be positive", "-1.0")),
         (Forest(density=0.2), ("do not fit into",)),
         (Gates(width=3.0), ("opening 3 m wide", "safe distance 1 m", "exceed 3.5 m")),
@@ -158,7 +158,7 @@ def test_moving_obstacles_keep_apart_and_leave_both_ends_free(seed):
         (Gates(gates=20), ("20 passages", "do not fit")),
         (Gates(post=0.0), ("post must be positive", "0.0")),
         (Corridor(depth=-1.0), ("depth must be non-negative", "-1.0")),
-        (TrafficFamily(swinging=9), ("swinging at most as many", "6 and 9")),
+        (TrafficFamily(swinging=9), ("swinging from 0 to obstacles", "6 and 9")),
         (TrafficFamily(obstacles=60, swinging=0), ("no room for 60 moving obstacles",)),
         (TrafficFamily(swing=(0.0, 1.0)), ("swing must be an ordered range",)),
         (Exchange(spacing=1.0), ("spacing must be at least 1.1 times the agent_distance of 2.5 m", "1 m")),
@@ -277,7 +277,7 @@ def test_the_case_study_with_changes(tmp_path, name):
         ('family = "field"\n[disturbance]\nkind = "gusts"\nsede = 3', ("key 'disturbance.sede'", "disturbance.seed")),
         ('family = "field"\n[disturbance]\nkind = "gusts"\nseed = "a"', ("disturbance.seed must be a whole number",)),
         ('family = "field"\n[perturbation]\nstart = 3', ("key 'perturbation.start'", "perturbation.start_spread")),
-        ('family = "field"\ngap = 1.0', ("cannot be flown", "gap of 1 m")),
+        ('family = "field"\ngap = 1.0', ("is infeasible", "gap of 1 m")),
         ('family = "custom"', ("missing: starts, slots, column",)),
         ('family = "custom"\nstarts = [[0, 0], [0]]\nslots = []\ncolumn = []', ("starts[1] must be a list of 2",)),
         ('family = "paper"\nobstacles = [[1]]', ("obstacles[0] must be a list [x, y, radius]", "[1]")),
@@ -342,9 +342,9 @@ def test_a_real_robot_flies_a_family_of_its_scale(name):
 def test_what_solid_obstacles_cannot_do_is_refused():
     """Solid obstacles cannot have radii that depend on the seed, and cannot move."""
     scale = make_robot("disc").scale()
-    with refusal("robot 'disc' collides with obstacles, whose radii no seed can change", "[r, r]"):
+    with refusal("robot 'disc' collides with obstacles, so their radii cannot depend on the seed", "[r, r]"):
         World(make_scenario("field", duration=1.0, **scale)).reset(5)
-    with refusal("robot 'disc' collides with obstacles, and those of scenario 'traffic' move"):
+    with refusal("robot 'disc' collides with obstacles, but those of scenario 'traffic' move"):
         World(make_scenario("traffic", **scale))
 
 

@@ -116,7 +116,7 @@ def test_the_second_of_two_jobs_is_refused_when_it_comes_to_the_name(tmp_path):
     for folder, text in zip(folders, ("first", "second"), strict=True):
         (folder / "a.json").write_text(text)
     first.__exit__(None, None, None)
-    with pytest.raises(ConfigurationError, match=r"out (is not empty|has been filled)"):
+    with pytest.raises(ConfigurationError, match=r"out (is not empty|was filled)"):
         second.__exit__(None, None, None)
     assert (tmp_path / "out" / "a.json").read_text() == "first" and [p.name for p in tmp_path.iterdir()] == ["out"]
 
@@ -131,7 +131,7 @@ def test_the_same_for_a_folder_that_was_there(tmp_path, here, monkeypatch):
     for staged, text in ((first, "first"), (second, "second")):
         (staged.__enter__() / "a.json").write_text(text)
     first.__exit__(None, None, None)
-    with pytest.raises(ConfigurationError, match="out (is not empty|has been filled)"):
+    with pytest.raises(ConfigurationError, match="out (is not empty|was filled)"):
         second.__exit__(None, None, None)
     assert (out / "a.json").read_text() == "first" and listed(out) == {"a.json"}
 
@@ -238,7 +238,7 @@ def test_a_name_that_is_taken_meanwhile_is_not_replaced(tmp_path):
     second = staged_file(tmp_path / "a.json")
     second.__enter__().write_text("second")
     (tmp_path / "a.json").write_text("first")
-    with pytest.raises(ConfigurationError, match="meanwhile"):
+    with pytest.raises(ConfigurationError, match="in the meantime"):
         second.__exit__(None, None, None)
     assert (tmp_path / "a.json").read_text() == "first" and [p.name for p in tmp_path.iterdir()] == ["a.json"]
 

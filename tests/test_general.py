@@ -192,9 +192,9 @@ def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("changes", "arrays", "said"),
     [
-        ({"layout": {"version": 0}}, {}, "trained on other inputs: its layout"),
-        ({"interval": 3.0}, {}, "trained on other inputs: its interval"),
-        ({"kind": "team"}, {}, "not hold a general policy"),
+        ({"layout": {"version": 0}}, {}, "trained on other inputs: layout"),
+        ({"interval": 3.0}, {}, "trained on other inputs: interval"),
+        ({"kind": "team"}, {}, "not a general policy"),
         ({"margin": None}, {}, "does not hold the network"),
         ({"dwell": 0}, {}, "its dwell is 0 decisions"),
         ({"deadline": -1.0}, {}, "its deadline -1.0"),

@@ -201,7 +201,7 @@ def test_behaviors_and_disturbances_that_use_undeclared_names_are_refused():
 def test_an_object_without_a_field_for_a_gain_is_refused():
     """``gains_of`` names the missing field."""
     with pytest.raises(
-        ConfigurationError, match="law 'named' has a gain 'pull', which Own has no field for; its names: limit, pull"
+        ConfigurationError, match="law 'named' has a gain 'pull', for which Own has no field; its names: limit, pull"
     ):
         laws.gains_of(Own(named, ()), limit=1.0)
 

@@ -192,7 +192,7 @@ def test_files_and_settings_name_each_agents_robot(tmp_path, capsys):
     ("changes", "words"),
     [
         ({"robots": ("disc", "disk", "omni", "omni")}, ("unknown robot 'disk'", "perhaps 'disc'")),
-        ({"robots": ("disc", "omni")}, ("robots names 2 robots for 4 agents: disc, omni",)),
+        ({"robots": ("disc", "omni")}, ("robots lists 2 robots for 4 agents: disc, omni",)),
         ({"robots": "disc"}, ("robots must be names, one per agent, got 'disc'",)),
         ({"robots": (1, 2, 3, 4)}, ("robots must be names, one per agent",)),
         ({"robot": "disc", "robots": ("omni", "disc", "omni", "disc")}, ("robot 'disc' and robots omni, disc",)),

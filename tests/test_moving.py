@@ -193,5 +193,5 @@ def test_oracle_refuses_moving_obstacles():
     """The oracle's search refuses moving obstacles."""
     from marlbc_mj.supervisors.oracle import search
 
-    with pytest.raises(ConfigurationError, match="at rest in known places; scenario 'traffic'"):
+    with pytest.raises(ConfigurationError, match="known obstacles at rest; scenario 'traffic'"):
         search(traffic())

@@ -115,7 +115,7 @@ WRONG_WORDS = {
     "video nothing.mcap": "cannot read nothing.mcap: No such file or directory",
     "run nothing.toml": "cannot read nothing.toml: No such file or directory",
     "run --supervisor nothing.py:Mine": "cannot read nothing.py: No such file or directory",
-    "safety --teams grid-nine": "a team is FORMATION-AGENTS, wedge-4 for example, got 'grid-nine'",
+    "safety --teams grid-nine": "a team must be FORMATION-AGENTS, for example wedge-4, got 'grid-nine'",
     "safety --teams wedge-4 gird-9-lines": "unknown formation 'gird'; perhaps 'grid'",
     "bench --seeds 0": "seeds must be at least 1, got 0",
     "suite --layouts=-1": "layouts must be at least 1, got -1",

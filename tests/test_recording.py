@@ -294,7 +294,7 @@ def recovered(path: Path, out: Path) -> int:
     try:
         return recover_log(path, out)
     except ConfigurationError as error:
-        if not str(error).endswith("holds no whole message, so there is nothing to recover"):
+        if not str(error).endswith("holds no complete message, so there is nothing to recover"):
             raise
         return 0
 
@@ -308,7 +308,7 @@ def test_torn_anywhere(chunked, share):
         torn, out = Path(folder) / "torn.mcap.partial", Path(folder) / "out.mcap"
         torn.write_bytes(data[: int(share * len(data))])
         for read in (read_log, log_info):
-            with pytest.raises(ConfigurationError, match=r"is truncated; `marlbc log recover .*` salvages what is whole"):
+            with pytest.raises(ConfigurationError, match=r"is truncated; `marlbc log recover .*` salvages the intact messages"):
                 read(torn)
         saved = recovered(torn, out)
         if not saved:
@@ -369,7 +369,7 @@ def test_a_file_with_nothing_to_recover_is_refused(chunked, tmp_path, capsys, ov
             main(["log", "recover", str(torn), str(out), *(["--overwrite"] if overwrite else [])])
         assert stopped.value.code == 2
         said = capsys.readouterr()
-        assert said.err == f"marlbc: {torn} holds no whole message, so there is nothing to recover\n"
+        assert said.err == f"marlbc: {torn} holds no complete message, so there is nothing to recover\n"
         assert said.out == ""
         assert sorted(p.name for p in tmp_path.iterdir()) == (["out.mcap"] if overwrite else []) + [torn.name]
         assert not overwrite or out.read_bytes() == b"precious"

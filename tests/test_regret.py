@@ -49,7 +49,7 @@ def test_shares_are_of_the_best_of_each_layout() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"missions": ("traffic",)}, "obstacles that move"),
+        ({"missions": ("traffic",)}, "has moving obstacles"),
         ({"missions": ("paper",)}, "draws no layouts"),
         ({"missions": ()}, "at least one mission"),
         ({"supervisors": ("fixes",)}, "unknown supervisor"),

@@ -337,7 +337,7 @@ BROKEN = {
     ),
     "missing": (
         HOVER.replace("<worldbody>", '<asset><mesh name="m" file="gone.obj"/></asset><worldbody>', 1),
-        "uses a file that is not there: gone.obj",
+        "uses a file that does not exist: gone.obj",
     ),
     "undriven": (HOVER, "write a Python file"),
 }

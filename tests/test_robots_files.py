@@ -202,7 +202,7 @@ def test_an_actuator_that_is_no_motor_is_refused_by_its_name(case, write):
     ("joints", "message"),
     [
         (SLIDES.replace("1 0 0", "1 1 0"), "slide joints along x and y of the world"),
-        ('<joint name="tip" axis="0 1 0"/>' + SLIDES, "joint 'tip' turns the slide joints"),
+        ('<joint name="tip" axis="0 1 0"/>' + SLIDES, "joint 'tip' comes before the slide joints"),
         ('<joint name="east" type="slide" axis="1 0 0"/>', "needs a free joint, or slide joints"),
     ],
 )
@@ -215,7 +215,7 @@ def test_a_base_that_does_not_move_along_x_and_y_is_refused(joints, message, wri
 def test_a_tendon_on_a_reversed_slide_is_refused(write):
     """Its length would change with the opposite sign."""
     name = write(cart(joints=SLIDES.replace("1 0 0", "-1 0 0"), motors=ON_TENDONS, tail=TENDONS.format("")))
-    with pytest.raises(ConfigurationError, match="'east' is in a tendon or an equality and is reversed"):
+    with pytest.raises(ConfigurationError, match="'east' is used by a tendon or an equality, so it must not be reversed"):
         World(robot_gate(name), PD(64.0, 16.0))
 
 
@@ -243,7 +243,7 @@ def test_a_carriage_on_a_rail_is_driven_but_fails_its_check(write):
     """A force along the rail moves less mass than one across it, and the check reports that a robot has one mass."""
     rail = NESTED.format(SHAPE).replace('mass="1e-6"', 'mass="1"')
     items = {item.name: item for item in checklist(write(cart(joints="", shape=rail)))}
-    assert not items["mass"].passed and items["mass"].detail == "3 kg move along x, 4 kg along y; a robot has one mass"
+    assert not items["mass"].passed and items["mass"].detail == "3 kg move along x, 4 kg along y; both masses must be equal"
 
 
 # Options ---------------------------------------------------------------------------------------------------------------------
@@ -469,7 +469,7 @@ def test_a_robot_in_python_must_not_turn_its_slides(laws_of, write):
     """A yaw before the slides turns the axes that forces and unknown dynamics are given along."""
     other = {} if laws_of is None else {f: getattr(make_robot(laws_of), f) for f in ("drive", "reading", "params", "state")}
     robot = direct(write(DRIVEN["yaw first"][0]), **({"motors": (), **other} if other else {}))
-    with pytest.raises(ConfigurationError, match="joint 'yaw' turns the slide joints"):
+    with pytest.raises(ConfigurationError, match="joint 'yaw' comes before the slide joints"):
         robot.spec()
 
 

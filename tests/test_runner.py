@@ -75,7 +75,7 @@ def test_a_dead_worker_is_an_error(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     monkeypatch.setattr("marlbc_mj.studies.engines.local.MOST_TRIES", 2)
     with pytest.raises(SimulationError, match=r"a worker process died \(out of memory\?\)$"):
         run_jobs(Squares(trouble="death"), workers=2)
-    assert "its work is repeated (1 so far)" in capsys.readouterr().err
+    assert "repeating this work (repetition 1)" in capsys.readouterr().err
     with pytest.raises(SimulationError, match="repeat the command to resume"):
         run_jobs(Squares(trouble="death"), workers=2, stop=Request())
 

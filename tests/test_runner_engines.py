@@ -144,7 +144,7 @@ def test_an_engine_that_is_not_installed(monkeypatch: pytest.MonkeyPatch, name: 
 def test_an_engine_that_is_not_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """Missing SLURM, an unknown engine and a run without workers are refused."""
     monkeypatch.setattr("shutil.which", lambda _: None)
-    with pytest.raises(ConfigurationError, match="no SLURM here: there is no command sbatch"):
+    with pytest.raises(ConfigurationError, match="SLURM is not available here: the command sbatch was not found"):
         run_jobs(Squares(), engine="slurm")
     with pytest.raises(ConfigurationError, match="unknown engine 'dask'; choose from: local, ray, slurm"):
         run_jobs(Squares(), engine="dask")

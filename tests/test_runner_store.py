@@ -232,7 +232,7 @@ def test_the_same_call_goes_on(tmp_path: Path, ran: list[int], capsys: pytest.Ca
             run_study(Halves(stop_at=stop_at, error=error), tmp_path / "out")
         said = capsys.readouterr().err
         assert [path.name for path in (tmp_path / "out").iterdir()] == [JOBS_FOLDER]
-        assert f"{stop_at} of 6 jobs are done and kept in" in stopped.value.__notes__[0] and ("going on" in said) == (
+        assert f"{stop_at} of 6 jobs are done and kept in" in stopped.value.__notes__[0] and ("resuming" in said) == (
             stop_at == 4
         )
     assert ran == [*range(6), 0, 1, 2, 3]
@@ -286,7 +286,7 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path: Path) -> None:
         run_study(Halves(), tmp_path / "mine")
     (tmp_path / "other" / JOBS_FOLDER).mkdir(parents=True)
     (tmp_path / "other" / JOBS_FOLDER / "run.json").write_text('{"schema": 99}')
-    with pytest.raises(ConfigurationError, match=r"run.json is of another version of marlbc, or of something else"):
+    with pytest.raises(ConfigurationError, match=r"run.json was written by another version of marlbc or by another program"):
         run_study(Halves(), tmp_path / "other")
 
 
@@ -319,7 +319,7 @@ def test_what_is_of_no_use_is_said_and_kept(
         for module in (runner, runner.Addresses.__init__.__globals__):
             monkeypatch.setitem(module if isinstance(module, dict) else vars(module), "code_version", lambda: "marlbc-mj 9")
     kept = files(tmp_path / "out")
-    with pytest.raises(ConfigurationError, match=f"unfinished run, 3 results of {what}.*nothing can be used"):
+    with pytest.raises(ConfigurationError, match=f"unfinished run with 3 results of {what}.*none of which can be used"):
         run_study(Halves(scale=scale), tmp_path / "out")
     assert files(tmp_path / "out") == kept
     ran.clear()

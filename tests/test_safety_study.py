@@ -104,7 +104,7 @@ def test_the_command_writes_tables_and_all_numbers(tmp_path: Path, capsys: pytes
     names = ["fixed", "scripted", "orca"]
     main(["safety", "field", "--supervisors", *names, "--compositions", "set-based", "--layouts", "1", "--out", str(out)])
     said = capsys.readouterr().out
-    assert "| Fixed priority | set-based | yes | 1 |" in said and "Not flown: Schedule: scenario 'field' has no schedule" in said
+    assert "| Fixed priority | set-based | yes | 1 |" in said and "Not run: Schedule: scenario 'field' has no schedule" in said
     with (out / "safety.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [(row["supervisor"], row["composition"], row["shield"]) for row in rows] == [

@@ -280,7 +280,10 @@ def test_groups_are_shown_only_where_two_can_be_compared(results: SeedResults, f
         (lambda: run_seeds(paper(), ("scripted", "scripted"), ("pd",), (0,)), "named twice"),
         (lambda: run_seeds(paper(), ("nobody",), ("pd",), (0,)), "unknown supervisor 'nobody'; choose from: scripted"),
         (lambda: run_seeds(paper(), ("scripted",), ("nothing",), (0,)), "unknown controller 'nothing'"),
-        (lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), reference="a+b"), "'a\\+b' is not run; choose from: scripted"),
+        (
+            lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), reference="a+b"),
+            "'a\\+b' is not among the methods; choose from: scripted",
+        ),
         (lambda: run_seeds(paper(), ("scripted",), ("pd",), (0,), workers=0), "workers must be at least 1, got 0"),
     ],
 )

@@ -71,7 +71,7 @@ def test_a_table_fills_every_kind_of_field():
         ({"count": 1.0}, "count must be a whole number, got 1.0"),
         ({"count": True}, "count must be a whole number, got True"),
         ({"count": 1, "flag": 1}, "flag must be true or false, got 1"),
-        ({"count": 1, "name": 1}, "name must be a text, got 1"),
+        ({"count": 1, "name": 1}, "name must be a string, got 1"),
         ({"count": 1, "kind": "c"}, "unknown kind 'c'; choose from: a, b"),
         ({"count": 1, "kind": ["a"]}, "unknown kind ['a']; choose from: a, b"),
         ({"count": 1, "length": math.inf}, "length must be finite, got inf"),

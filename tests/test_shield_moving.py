@@ -68,10 +68,10 @@ def test_in_traffic_whoever_comes_too_near_was_counted_before():
 @pytest.mark.parametrize(
     ("shield", "said"),
     [
-        (Shield(obstacle_speed=0.1), r"obstacle \d has up to .* m/s, more than obstacle_speed = 0.1 m/s"),
+        (Shield(obstacle_speed=0.1), r"obstacle \d reaches .* m/s, more than obstacle_speed = 0.1 m/s"),
         (Shield(obstacle_acceleration=1e-4), r"m/s\^2, more than obstacle_acceleration = 0.0001 m/s\^2"),
         (Shield(obstacle_acceleration=150.0), r"leave .* N of the force limit of 200 N"),
-        (Shield(level="reference", tube=0.1), "a shield of references keeps clear of obstacles at rest only"),
+        (Shield(level="reference", tube=0.1), "a shield of references supports only obstacles at rest"),
     ],
 )
 def test_motions_that_are_not_assumed_are_refused(shield, said):

@@ -80,7 +80,7 @@ def test_networks_that_are_off_have_the_tube_of_their_gains():
         (limited(force_limit=6.0), PD(), Shield(level="reference"), "more than the force limit of 6 N"),
         (corridor(), PD(), Shield(level="reference"), "limited acceleration, got 'virtual' and inf"),
         (limited(reference="actual"), PD(), Shield(tube=0.1), "got 'actual' and 4"),
-        (limited(), PD(), Shield(tube=0.1, latency=0.05), "messages may be late in a shield of forces only"),
+        (limited(), PD(), Shield(tube=0.1, latency=0.05), "messages may be late only in a shield of forces"),
         (limited(), PD(), Shield(tube=3.0), "starts at a clearance of 2.831 m"),
         (make_scenario("robot_gate", robot="diff_drive"), LQR(), True, "gains .* but LQR has"),
     ],
@@ -95,5 +95,5 @@ def test_a_robot_that_nobody_measured_is_told_what_is_missing(monkeypatch):
     """The error names both missing numbers and how to get them."""
     unknown = replace(make_robot("diff_drive"), name="unmeasured", tube=None)
     monkeypatch.setitem(ROBOTS, unknown.name, (lambda: unknown, ""))
-    with pytest.raises(ConfigurationError, match="force_error is missing.*so is its tube.*shield_robots ROBOT"):
+    with pytest.raises(ConfigurationError, match="lacks force_error.*and tube.*shield_robots ROBOT"):
         World(make_scenario("robot_gate", robot=unknown.name), PD(), shield=True)

@@ -80,5 +80,5 @@ def test_a_team_without_room_is_passed_over(capsys):
     """The report gives the reason; other teams are flown."""
     report_missions(["--missions", "1", "--seconds", "0.5", "--agents", "64,2", "--families", "corridor"])
     said = capsys.readouterr().out
-    assert "corridor, 64 agents, not flown: scenario 'corridor' cannot be flown" in said
+    assert "corridor, 64 agents, not run: scenario 'corridor' is infeasible" in said
     assert "| corridor | 2 | 1 | 0 | 0 |" in said

@@ -67,7 +67,7 @@ def test_only_common_layouts_are_compared() -> None:
     more, less = flown(A, "one", [True, False, False]), flown(B, "one", [True])
     assert {row.rank.value for row in rank_methods([more, less])} == {1.5}
     other = MissionRuns("t", "one", B, (run(7, True),))
-    with pytest.raises(ConfigurationError, match="no layout of one was flown by all methods"):
+    with pytest.raises(ConfigurationError, match="no layout of one was run with all methods"):
         rank_methods([more, other])
 
 

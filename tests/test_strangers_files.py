@@ -314,7 +314,7 @@ def test_a_bomb_is_not_opened(tmp_path, compress, kind, honest, monkeypatch):
 
 def test_chunks_together_have_a_limit_too(log, monkeypatch):
     monkeypatch.setattr(mcap_file, "MOST_UNPACKED", 1000)
-    with pytest.raises(ConfigurationError, match="larger than 1000 bytes together"):
+    with pytest.raises(ConfigurationError, match="unpack to more than 1000 bytes"):
         read_log(log)
 
 

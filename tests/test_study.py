@@ -150,7 +150,7 @@ def test_an_interrupted_run_goes_on(finished: Path, tmp_path: Path, monkeypatch:
     with monkeypatch.context() as patch:
         patch.setattr(run, "train", None)
         assert train_job(job, listening(said)).how == "finished"
-    assert said[0] == "marlms seed 0: goes on" and not (job.folder / RESUME).exists()
+    assert said[0] == "marlms seed 0: resumes" and not (job.folder / RESUME).exists()
     one, other = ([{**e, "wall_s": ""} for e in evaluations(out / "marlms" / "0")] for out in (finished, tmp_path))
     assert len(one) == 2 and one == other
 
@@ -224,7 +224,7 @@ def test_a_stopped_study_says_how_to_go_on(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(SystemExit) as stopped:
         main(["study", "--out", str(tmp_path)])
     assert stopped.value.code == 128 + signal.SIGTERM
-    assert capsys.readouterr().err == "marlbc: stopped, and every run saved; repeat the command to resume\n"
+    assert capsys.readouterr().err == "marlbc: stopped; every run is saved; repeat the command to resume\n"
 
 
 def test_every_variant_is_what_its_name_says(tmp_path: Path) -> None:

@@ -163,8 +163,8 @@ def test_new_rows_merge_with_others(flown: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"suite": {"version": "v0", "hash": "0" * 64}}, "is of suite v0 000000000000, this code's is v1"),
-        ({"form": 99}, "has form 99, this code reads form 1"),
+        ({"suite": {"version": "v0", "hash": "0" * 64}}, "belongs to suite v0 000000000000, this code has v1"),
+        ({"form": 99}, "has format 99, but this code reads format 1"),
         ({"suite": 3}, "is not a file of the suite"),
     ],
 )
@@ -185,7 +185,7 @@ def test_rows_of_other_code_are_named(flown: Path, tmp_path: Path, capsys) -> No
     (tmp_path / "suite.json").write_text(json.dumps({**content, "code": "older"}))
     main(["suite", "--page", "--from", str(tmp_path), "--out", str(tmp_path / "out")])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "rows are of other code (older) than this" in line
+    assert "some rows come from other code (older) than this" in line
     assert (tmp_path / "out" / LEADERBOARD_PAGE).exists()
 
 

@@ -238,7 +238,7 @@ def test_a_decision_for_one_team_is_none_for_many():
     observation = World(PAPER, worlds=2).observe()
     observation.step[1] = 5
     mixed = batched(Says(np.full(4, FM), Blend(np.full(4, FM), np.zeros((4, 2)))))
-    with pytest.raises(ConfigurationError, match="velocities for some teams and orders alone for others"):
+    with pytest.raises(ConfigurationError, match="velocities for some teams and only orders for others"):
         mixed.decide(observation, mixed.start(PAPER, 2))
 
 

@@ -264,7 +264,7 @@ def test_runs_have_folders_of_their_own(arguments, folder, monkeypatch, capsys):
         (["train", "--budget", "0"], ["budget", "0"]),
         (["train", "--resume", "nowhere"], ["nowhere", RESUME]),
         (["train", "--device", "cuda"], ["cuda"]),
-        (["train", "--set", "copies=2147483648"], ["copies", "more memory than there is"]),
+        (["train", "--set", "copies=2147483648"], ["copies", "more memory than is available"]),
         (
             ["train", "--resume", "x", "--budget", "9", "--threads", "1", "--device", "cpu", "--set", "gamma=0.9", "--out", "y"],
             ["--resume", "--budget, --threads, --device, --set", "--out"],
@@ -429,8 +429,8 @@ DAMAGED_RUNS = {
     "no versions": (lambda a, d: (a, without(d, "versions")), "not a saved run: its description has no versions"),
     "table": (lambda a, d: (a, put(d, [{"return": "high"}], "curve")), "tables are damaged"),
     "revision": (lambda a, d: (a, put(d, "0123456789ab", "git_revision")), "revision 0123456789ab"),
-    "setting": (lambda a, d: (a, without(d, "train", "gamma")), "do not both have gamma"),
-    "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "do not both have shaping.dwell"),
+    "setting": (lambda a, d: (a, without(d, "train", "gamma")), "settings differ in gamma"),
+    "inner setting": (lambda a, d: (a, without(d, "train", "shaping", "dwell")), "settings differ in shaping.dwell"),
     "new setting": (lambda a, d: (a, put(d, 1.0, "train", "courage")), "courage"),
     "other setting": (lambda a, d: (a, put(d, 7, "train", "budget")), "budget 16000 instead of 7"),
 }

@@ -107,17 +107,17 @@ def test_a_class_in_place_of_what_it_makes():
 SETTINGS = {
     "a team": (
         lambda: paper(agents=6),
-        "scenario 'paper' has a team of 4 of its own, and agents cannot be set; families such as",
+        "scenario 'paper' has a fixed team of 4 agents; only families such as",
     ),
-    "a team by name": (lambda: make_scenario("cruise", agents=6), "scenario 'cruise' has a team of 4 of its own"),
+    "a team by name": (lambda: make_scenario("cruise", agents=6), "scenario 'cruise' has a fixed team of 4 agents"),
     "no field": (lambda: paper(durration=6), "unknown field of a scenario 'durration'; perhaps 'duration'; choose from: name"),
     "a text": (lambda: paper(duration="6"), "scenario 'paper': duration must be a number, got '6'"),
     "a word": (lambda: make_scenario("field", agents="four"), "scenario 'field': agents must be a whole number, got 'four'"),
     "true": (lambda: paper(mass=True), "scenario 'paper': mass must be a number, got True"),
     "starts": (lambda: paper(starts="x"), "scenario 'paper': starts must be numbers, got 'x'"),
     "a name": (lambda: paper(disturbance="wind"), "scenario 'paper': disturbance must be a Disturbance, got 'wind'"),
-    "no name": (lambda: make_supervisor(None), "a name must be a text, got NoneType"),
-    "an object": (lambda: make_controller(PD()), "a name must be a text, got PD"),
+    "no name": (lambda: make_supervisor(None), "a name must be a string, got NoneType"),
+    "an object": (lambda: make_controller(PD()), "a name must be a string, got PD"),
     "no episode": (lambda: measure(None), "measure takes a Trajectory or what read_log returns, got NoneType"),
 }
 

@@ -103,7 +103,7 @@ def test_animations_repeat_for_ever_and_show_the_frames(log: EpisodeLog, tmp_pat
 )
 def test_a_wrong_size_is_named(text: str) -> None:
     """The error shows an example of a size."""
-    with pytest.raises(ConfigurationError, match=f"size must be two even numbers .*, 1280x720 for example; got '?{text}"):
+    with pytest.raises(ConfigurationError, match=f"size must be two even numbers .*, for example 1280x720; got '?{text}"):
         parse_size(text)
     assert parse_size("640X360") == (640, 360)
 
@@ -201,7 +201,7 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"size": (321, 180)}, "size must be two even numbers of pixels from 64 to 4096, 1280x720 for example; got 321x180"),
+        ({"size": (321, 180)}, "size must be two even numbers of pixels from 64 to 4096, for example 1280x720; got 321x180"),
         ({"size": (320, 20)}, "size must be"),
         ({"samples": 17}, "samples must be from 0 to 16"),
         ({"camera": "moon"}, "unknown camera 'moon'; choose from: track, close, agent1, wide, at:X,Y,R, top, agent2,"),
@@ -211,8 +211,8 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
         ({"camera": "at:nan,2,1"}, "must be at:X,Y,R"),
         ({"speed": 0.0}, "speed must be positive"),
         ({"fps": -1}, "fps must be positive"),
-        ({"start": 50.0, "end": 40.0}, "leave nothing"),
-        ({"start": 200.0}, "leave nothing"),
+        ({"start": 50.0, "end": 40.0}, "nothing of the log"),
+        ({"start": 200.0}, "nothing of the log"),
     ],
 )
 def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -144,7 +144,7 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check(self)
         if self.method in METHODS and self.learner != METHODS[self.method][0].get("learner", self.learner):
-            raise ConfigurationError(f"method {self.method} fixes the learner, got {self.learner}")
+            raise ConfigurationError(f"method {self.method} has a fixed learner, which cannot be {self.learner}")
         self._check_risks()
         if self.rows <= self.n_step:
             raise ConfigurationError(

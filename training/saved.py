@@ -59,7 +59,7 @@ def check_origin(path: Path, description: Mapping[str, Any], kinds: Mapping[str,
     for name, (there, now) in pairs.items():
         if there != now:
             raise ConfigurationError(
-                f"{path} was saved with {name} {there}, here is {now}; a run resumes only under the same versions"
+                f"{path} was saved with {name} {there}, but {now} is in use; a run resumes only with the same versions"
             )
 
 
@@ -77,7 +77,7 @@ def saved_config(path: Path, train: dict[str, Any], kind: type[Configuration]) -
     config, found = config_from_json(train, kind), flat_settings(train)
     odd = sorted(found.keys() ^ flat_settings(plain_data(config)).keys())
     if odd:
-        raise ConfigurationError(f"{path} was saved by another version: it and this one do not both have {', '.join(odd)}")
+        raise ConfigurationError(f"{path} was saved by another version, whose settings differ in {', '.join(odd)}")
     beside = path.with_name(CONFIG_FILE)
     try:
         said = flat_settings(json.loads(beside.read_text())["train"])
@@ -86,7 +86,7 @@ def saved_config(path: Path, train: dict[str, Any], kind: type[Configuration]) -
     odd = sorted(name for name in found.keys() | said.keys() if found.get(name) != said.get(name))
     if odd:
         differences = ", ".join(f"{name} {said.get(name)} instead of {found.get(name)}" for name in odd)
-        raise ConfigurationError(f"{beside} is not of the run that was saved in {path.name}: it says {differences}")
+        raise ConfigurationError(f"{beside} does not belong to the run saved in {path.name}: it has {differences}")
     return config
 
 
@@ -105,7 +105,7 @@ def saved_rows(path: Path, rows: list[Any], columns: Iterable[str]) -> list[dict
         found = [{str(name): float(value) for name, value in row.items()} for row in rows]
         names = set(found[0])
         if not names.issuperset(columns) or any(set(row) != names for row in found):
-            raise ValueError(f"their columns are not the same, or not {', '.join(columns)} and others")
+            raise ValueError(f"their rows must all have the same columns, including {', '.join(columns)}")
     except (ArithmeticError, AttributeError, IndexError, TypeError, ValueError) as error:
         raise ConfigurationError(f"{path} is not a saved run: its tables are damaged, {error}") from error
     return found

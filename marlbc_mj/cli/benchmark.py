@@ -78,7 +78,7 @@ class BenchCommand:
             self._run_once()
         else:
             self._run_draws()
-        self.output.say(f"{self.out / 'index.html'} shows it all")
+        self.output.say(f"{self.out / 'index.html'} shows all results")
 
     def _run_once(self) -> None:
         """Run one episode of every method; as each ends, print a line and add it to the page."""
@@ -174,7 +174,7 @@ class RunCommand:
 
         scenario = self.mission.build(self.scenario)
         if self.seed > 0 and not scenario.draws:
-            note(f"{self.scenario} draws nothing: seed {self.seed} gives the same episode as any other")
+            note(f"{self.scenario} has nothing random: seed {self.seed} gives the same episode as any other seed")
         with self.output.progress(ends=False) as told:
             result = run_single(
                 scenario,
@@ -240,7 +240,7 @@ class EvaluateCommand:
         with self.output.progress() as told:
             results = run_evaluation(self.mission.build(self.scenario), config, self.out, progress=told.progress)
         self.output.report("\n".join(map(to_markdown, outcome_tables(results))), seed_document(results))
-        self.output.say(f"{self.out / 'index.html'} shows it all")
+        self.output.say(f"{self.out / 'index.html'} shows all results")
 
 
 @dataclass(frozen=True)

@@ -124,7 +124,7 @@ def check_team(word: str) -> str:
     """
     formation, _, agents = word.removesuffix("-lines").partition("-")
     if not agents.isdecimal():
-        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {word!r}")
+        raise ConfigurationError(f"a team must be FORMATION-AGENTS, for example wedge-4, got {word!r}")
     check_word(_FORMATION, formation)
     return word
 

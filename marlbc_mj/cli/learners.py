@@ -57,7 +57,7 @@ class StudyCommand:
         report = study.report((), study.out)
         self.output.report(report.text, report.document)
         if stopped:
-            note("stopped, and every run saved; repeat the command to resume")
+            note("stopped; every run is saved; repeat the command to resume")
             sys.exit(128 + stopped)
         failed = failed_runs(study)
         if failed:
@@ -98,4 +98,4 @@ class ArmsCommand:
             ended = counting(study.jobs(), lambda _: "trainings", told.progress)
             done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, ended=ended)
         self.output.report(done.report.text, done.report.document)
-        self.output.say(f"{self.out / 'arms.pdf'} shows it")
+        self.output.say(f"{self.out / 'arms.pdf'} shows the results")

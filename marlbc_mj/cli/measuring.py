@@ -95,7 +95,7 @@ class AblationCommand:
             )
         self.output.report(done.report.text, done.report.document)
         if self.out is not None:
-            self.output.say(f"{self.out / 'index.html'} shows it all")
+            self.output.say(f"{self.out / 'index.html'} shows all results")
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ class ScenarioOptions:
 
         if self.robot is not None and robots:
             raise ConfigurationError(
-                f"--robot {self.robot} is every agent's, and robots={','.join(robots)} each agent's; give one"
+                f"--robot {self.robot} is for all agents and robots={','.join(robots)} for each one; give only one of them"
             )
         if self.robot is None and not robots:
             return {}

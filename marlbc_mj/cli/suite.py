@@ -83,7 +83,7 @@ class SuiteCommand:
         self.output.report(done.report.text, done.report.document)
         for problem in done.report.problems:
             note(problem)
-        self.output.say(f"{self.out / LEADERBOARD_PAGE} shows it all")
+        self.output.say(f"{self.out / LEADERBOARD_PAGE} shows all results")
 
     def study(self) -> "SuiteStudy":
         """The suite study that the options describe.
@@ -97,7 +97,7 @@ class SuiteCommand:
         from marlbc_mj.studies.suite.study import SuiteStudy
 
         if self.page and self.source is None:
-            raise ConfigurationError("--page needs --from: the folder whose results it shows")
+            raise ConfigurationError("--page needs --from, the folder with the results to show")
         layouts = QUICK if self.quick and self.layouts is None else self.layouts
         tracks = QUICK_TRACKS if self.quick and not self.track else self.track
         missions = [] if self.page else choose_missions(tracks, self.missions, layouts)

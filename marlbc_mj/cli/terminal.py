@@ -35,7 +35,7 @@ def prepare_gl(strict: bool) -> None:
         if strict:
             raise
         if not switched_off():
-            note(f"{error}; going on without it")
+            note(f"{error}; continuing without it")
         os.environ["MUJOCO_GL"] = SWITCHED_OFF  # with the unusable value, MuJoCo could not be imported
 
 

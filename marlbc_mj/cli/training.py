@@ -124,7 +124,7 @@ class TrainCommand:
         given = [f.name for f in settings if getattr(self, f.name) != f.default]
         if given:
             names = ", ".join(name if name == "method" else f"--{name}" for name in given)
-            raise ConfigurationError(f"--resume continues a run in its folder with its own settings; leave out {names}")
+            raise ConfigurationError(f"--resume continues a run with the settings saved in its folder; leave out {names}")
 
     def config(self) -> "TrainConfig":
         """The preset with the method's and the command line's changes."""

@@ -53,7 +53,7 @@ class Communication:
         agents = len(starts)
         for agent in self.silent:
             if not 0 <= agent < agents:
-                raise ConfigurationError(f"communication.silent: agents are 0 to {agents - 1}, got {agent}")
+                raise ConfigurationError(f"communication.silent must name agents from 0 to {agents - 1}, got {agent}")
         for name in ("period", "delay"):
             ratio = getattr(self, name) / mission_step
             if abs(ratio - round(ratio)) > 1e-9 * max(1.0, ratio):
@@ -64,7 +64,7 @@ class Communication:
         if part.any():
             names = [", ".join(str(i + 1) for i in np.flatnonzero(part == k)) for k in np.unique(part)]
             raise ConfigurationError(
-                f"communication.range {self.range:g} m leaves the team in {len(names)} parts at the start: agents "
+                f"communication.range {self.range:g} m splits the team into {len(names)} parts at the start: agents "
                 + " | ".join(names)
             )
 

@@ -183,7 +183,7 @@ def _find_address(law: Any, signature: Any) -> int:
     name, line = name_of(law), raising_line(law, set())
     if line is not None:
         raise ConfigurationError(
-            f"law {name!r} raises an error ({line}), which compiled code cannot; write NaN to an output instead: it ends the run"
+            f"law {name!r} raises an error ({line}), which compiled code cannot do; to end the run, write NaN to an output"
         )
     kind, entry = ON_ROWS[signature][0], _entry(law, signature)
     try:

@@ -49,13 +49,13 @@ class Names:
     def _check(self) -> None:
         for name in self.names:
             if not name.isidentifier():
-                raise ConfigurationError(f"{name!r} cannot name a number of a law: it is not an identifier")
+                raise ConfigurationError(f"{name!r} cannot be the name of a gain or state: it is not an identifier")
             if hasattr(np.record, name) or hasattr(np.recarray, name):
                 raise ConfigurationError(
-                    f"{name!r} cannot name a number of a law: NumPy's records have an attribute of that name"
+                    f"{name!r} cannot be the name of a gain or state: NumPy's records have an attribute of that name"
                 )
             if self.names.count(name) > 1:
-                raise ConfigurationError(f"{name!r} names two numbers of a law")
+                raise ConfigurationError(f"{name!r} is declared twice by a law")
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -220,7 +220,7 @@ def gains_of(owner: Any, **given: Any) -> dict[str, Any]:
     for name in names:
         if name not in given and not hasattr(owner, name):
             raise ConfigurationError(
-                f"law {name_of(owner.law)!r} has a gain {name!r}, which {type(owner).__name__} has no field for; its names: "
+                f"law {name_of(owner.law)!r} has a gain {name!r}, for which {type(owner).__name__} has no field; its names: "
                 f"{', '.join(names)}"
             )
     return {name: getattr(owner, name) for name in names if name not in given} | given

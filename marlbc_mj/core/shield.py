@@ -107,9 +107,9 @@ class Shield:
         if self.level not in (None, "force", "reference"):
             raise unknown("level of a shield", str(self.level), ("force", "reference"))
         if self.tube is not None and self.level == "force":
-            raise ConfigurationError(f"Shield.tube is for references, but level is 'force'; got {self.tube} m")
+            raise ConfigurationError(f"Shield.tube applies only to level 'reference', but level is 'force'; got {self.tube} m")
         if self.tube == 0.0:
-            raise ConfigurationError("Shield.tube must be positive: no robot is exactly where its reference is; got 0")
+            raise ConfigurationError("Shield.tube must be positive, because no robot tracks its reference exactly; got 0")
         if self.disturbance is not None:
             object.__setattr__(self, "disturbance", ForceBound(*self.disturbance))
             if not all(np.isfinite(x) and x >= 0 for x in self.disturbance):

@@ -133,8 +133,8 @@ def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool 
     fleet.check(scenario)
     if fleet.contact and scenario.moving:
         raise ConfigurationError(
-            f"robot {fleet.solid!r} collides with obstacles, and those of scenario {scenario.name!r} move: they can be passed "
-            "through only; choose a robot without contact"
+            f"robot {fleet.solid!r} collides with obstacles, but those of scenario {scenario.name!r} move, and moving obstacles "
+            "have no contact; choose a robot without contact"
         )
     limit = scenario.force_limit if controller.limited else np.inf
     numbers = resolve(Shield() if shield is True else shield, scenario, limit, controller) if shield else NO_SHIELD

@@ -45,8 +45,8 @@ def resolve(shield: Shield, scenario: Scenario, limit: float, controller: Contro
     level = shield.level or ("reference" if shield.tube is not None or not known or fleet.mixed else "force")
     if level == "force" and fleet.mixed:
         raise ConfigurationError(
-            f"shield: robots {fleet.words} brake differently, and a shield of forces assumes one mass, force limit and error for "
-            "all; a shield of references takes them: Shield(level='reference')"
+            f"shield: robots {fleet.words} brake differently, but a shield of forces assumes one mass, force limit and error for "
+            "all; use a shield of references: Shield(level='reference')"
         )
     _check_sensors(shield, scenario)
     numbers = _of_forces(shield, scenario, robot, limit) if level == "force" else _of_references(shield, scenario, controller)
@@ -101,11 +101,11 @@ def _of_references(shield: Shield, scenario: Scenario, controller: Controller | 
     fleet = scenario.fleet
     if shield.mailed:
         raise ConfigurationError(
-            "shield: messages may be late in a shield of forces only; references are chosen one after the other, all knowing all"
+            "shield: messages may be late only in a shield of forces; in a shield of references every agent knows all references"
         )
     if scenario.moving:
         raise ConfigurationError(
-            f"shield: obstacles of scenario {scenario.name!r} move; a shield of references keeps clear of obstacles at rest only"
+            f"shield: obstacles of scenario {scenario.name!r} move; a shield of references supports only obstacles at rest"
         )
     if scenario.reference != "virtual" or not np.isfinite(scenario.acceleration_limit):
         raise ConfigurationError(
@@ -149,13 +149,13 @@ def _missing(robot: Robot) -> str:
     """Error message about what a robot lacks for a shield."""
     if robot.force_error is not None:
         return (
-            f"shield: robot {robot.name!r} has no tube, how far [m] it may be from its reference, which a shield of references "
-            "needs; give Shield(tube=...), or measure it: `python -m marlbc_mj.studies.shield_robots ROBOT`"
+            f"shield: robot {robot.name!r} has no tube, the largest distance [m] from its reference, which a shield of "
+            "references needs; give Shield(tube=...), or measure it: `python -m marlbc_mj.studies.shield_robots ROBOT`"
         )
     return (
-        f"shield: robot {robot.name!r} has no braking identification: its force_error is missing, a bound [N] of what moves "
-        "it within one substep, in every direction, besides the planar force and the disturbance; and so is its tube, how far "
-        "[m] it may be from its reference; `python -m marlbc_mj.studies.shield_robots ROBOT` measures both"
+        f"shield: robot {robot.name!r} has no braking identification: it lacks force_error, the bound [N] in every direction "
+        "within one substep on forces other than the planar force and the disturbance, and tube, the largest distance [m] from "
+        "its reference; `python -m marlbc_mj.studies.shield_robots ROBOT` measures both"
     )
 
 
@@ -218,7 +218,7 @@ def tracking_tube(scenario: Scenario, controller: Controller, bound: ForceBound)
     force = scenario.mass * (k_p * tube + k_v * error_rate)
     if not force <= scenario.force_limit:
         raise ConfigurationError(
-            f"shield: following references may take {force:.3g} N, more than the force limit of {scenario.force_limit:g} N; "
+            f"shield: following the references may need {force:.3g} N, more than the force limit of {scenario.force_limit:g} N; "
             "give Shield(tube=...)"
         )
     return float(tube)
@@ -265,7 +265,7 @@ def _check_bound(bound: ForceBound, error: float, force: float, scenario: Scenar
     speed = scenario.substep * force / scenario.mass
     for size, share, what in (
         (bound.at(speed), GREATEST_SHARE, "the disturbance"),
-        (bound.at(speed) + error, GREATEST_ERROR, "the disturbance and the robot's own error"),
+        (bound.at(speed) + error, GREATEST_ERROR, "the disturbance plus the robot's force error"),
     ):
         if size > share * force:
             raise ConfigurationError(
@@ -279,14 +279,14 @@ def _check_braking(shield: Shield, scenario: Scenario, bound: ForceBound, force:
     if not bound.at(cap) < force:
         raise ConfigurationError(
             f"shield: at the speed cap of {cap:g} m/s the disturbance may be {bound.at(cap):.3g} N, so a force limit of "
-            f"{force:g} N leaves nothing to brake with; lower speed_cap"
+            f"{force:g} N leaves no force for braking; lower speed_cap"
         )
     if scenario.moving:
         fastest = cap + 2.0 * shield.obstacle_speed
         left = force - bound.at(fastest) - scenario.mass * shield.obstacle_acceleration
         if not left > 0.0:
             raise ConfigurationError(
-                f"shield: beside an obstacle that moves, agents may have {fastest:g} m/s, where the disturbance and an "
+                f"shield: near a moving obstacle agents may reach {fastest:g} m/s, where the disturbance and an obstacle "
                 f"acceleration of {shield.obstacle_acceleration:g} m/s^2 leave {left:.3g} N of the force limit of {force:g} N"
             )
 
@@ -310,14 +310,14 @@ def check_draw(numbers: ShieldNumbers, draw: Draw) -> None:
     gaps = np.linalg.norm(starts[:, None] - obstacles[None, :, :2], axis=-1) - obstacles[:, 2]
     for i, k in np.argwhere(gaps < kept)[:1].tolist():
         raise ConfigurationError(
-            f"shield: agent {i + 1} starts at a clearance of {gaps[i, k]:.3f} m from obstacle {k + 1}, where at least "
-            f"{kept[k]:.3f} m is kept"
+            f"shield: agent {i + 1} starts at a clearance of {gaps[i, k]:.3f} m from obstacle {k + 1}, but needs at least "
+            f"{kept[k]:.3f} m"
         )
     least = numbers.agent_distance + 2.0 * (numbers.tube + stop)
     between = np.linalg.norm(starts[:, None] - starts[None], axis=-1) + np.diag(np.full(len(starts), np.inf))
     for i, j in np.argwhere(between < least)[:1].tolist():
         raise ConfigurationError(
-            f"shield: agents {i + 1} and {j + 1} start {between[i, j]:.3f} m apart, where at least {least:.3f} m is kept"
+            f"shield: agents {i + 1} and {j + 1} start {between[i, j]:.3f} m apart, but need at least {least:.3f} m"
         )
 
 
@@ -333,6 +333,6 @@ def _check_motions(numbers: ShieldNumbers, motions: np.ndarray) -> np.ndarray:
         k = int(values.argmax())
         if values[k] > getattr(numbers, name):
             raise ConfigurationError(
-                f"shield: obstacle {k + 1} has up to {values[k]:.3g} {unit}, more than {name} = {getattr(numbers, name):g} {unit}"
+                f"shield: obstacle {k + 1} reaches {values[k]:.3g} {unit}, more than {name} = {getattr(numbers, name):g} {unit}"
             )
     return np.asarray(speeds)

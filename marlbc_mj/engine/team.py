@@ -110,8 +110,8 @@ def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
     scenario = plan.scenario
     if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
         raise ConfigurationError(
-            f"robot {plan.fleet.solid!r} collides with obstacles, whose radii no seed can change; "
-            "give the family one radius: [r, r]"
+            f"robot {plan.fleet.solid!r} collides with obstacles, so their radii cannot depend on the seed; "
+            "give the family a single radius: [r, r]"
         )
 
 

@@ -80,7 +80,7 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         found = description.get("format") if isinstance(description, dict) else description
         raise ConfigurationError(f"checkpoint {path} has format {found!r}; this version reads {FORMAT}")
     if not _unchanged(arrays, description, header):
-        raise ConfigurationError(f"checkpoint {path} is damaged: its arrays or its header are not those that were written")
+        raise ConfigurationError(f"checkpoint {path} is damaged: its arrays or its header have changed since it was written")
     return arrays, description
 
 
@@ -121,7 +121,7 @@ def read_policy(path: Path) -> tuple[Policy, dict[str, Any]]:
         raise ConfigurationError(f"checkpoint {path} does not hold the networks of a policy") from None
     fault = _fault(policy, arrays) or _unsigned(description.get("signature"))
     if fault:
-        raise ConfigurationError(f"checkpoint {path} does not hold the networks of a policy that can be used: {fault}")
+        raise ConfigurationError(f"checkpoint {path} does not hold the networks of a policy that is usable: {fault}")
     return policy, description
 
 
@@ -144,7 +144,7 @@ def _fault(policy: Policy, arrays: Mapping[str, np.ndarray]) -> str:
     if not (math.isfinite(policy.margin) and 0 <= policy.risk <= 1):
         return f"its margin is {policy.margin}, its risk {policy.risk}"
     if policy.columns < 1 or policy.width(policy.columns) != weights[-1].shape[2]:
-        return f"its {weights[-1].shape[2]} outputs are not those of a policy with dueling {policy.dueling}, risk {policy.risk}"
+        return f"its {weights[-1].shape[2]} outputs do not fit a policy with dueling {policy.dueling}, risk {policy.risk}"
     return ""
 
 
@@ -234,7 +234,7 @@ def check_policy(path: Path, policy: Policy, agents: int, actions: int, state: i
     """
     networks, columns, inputs = len(policy.weights[0]), policy.columns, len(policy.scale)
     if inputs != state:
-        raise ConfigurationError(f"checkpoint {path} has networks for a state of {inputs} numbers; there are {state}")
+        raise ConfigurationError(f"checkpoint {path} has networks for a state of {inputs} numbers; here the state has {state}")
     if (networks, columns) not in {(agents, actions), (1, actions**agents)}:
         raise ConfigurationError(
             f"checkpoint {path} has {networks} networks with {columns} values each; {agents} agents with {actions} actions each "

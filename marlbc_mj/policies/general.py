@@ -39,7 +39,7 @@ ACTIONS_UNDER = {"set-based": len(MOTIONS), "null-space": 2 * len(MOTIONS)}
 """A, the number of actions of an agent, by composition."""
 _NEEDS = {
     "set-based": "decides between formation and column alone and needs the composition that avoids by itself",
-    "null-space": "decides about avoidance, too, and needs the composition that leaves that to it",
+    "null-space": "decides about avoidance, too, and needs the composition that leaves avoidance to it",
 }
 """Reasons why a policy requires its composition, for error messages."""
 INTERVAL = 1.2
@@ -215,11 +215,11 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
     """
     arrays, description = read_arrays(path)
     if description.get("kind") != KIND:
-        raise ConfigurationError(f"checkpoint {path} does not hold a general policy, but one of a single team")
+        raise ConfigurationError(f"checkpoint {path} holds the policy of a single team, not a general policy")
     for name, wanted in (("layout", INPUT_LAYOUT), ("interval", INTERVAL)):
         if description.get(name) != wanted:
             raise ConfigurationError(
-                f"checkpoint {path} was trained on other inputs: its {name} is {description.get(name)}, this version's {wanted}"
+                f"checkpoint {path} was trained on other inputs: {name} is {description.get(name)}, but {wanted} in this version"
             )
     layers = sum(name.startswith("weight") for name in arrays)
     try:
@@ -253,7 +253,7 @@ def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPoli
     networks = [policy.network for policy in policies]
     sizes = {tuple(weight.shape[1:] for weight in network.weights) for network in networks}
     if len(sizes) != 1:
-        raise ConfigurationError(f"a mean takes at least one policy, and networks of the same size; these have {sorted(sizes)}")
+        raise ConfigurationError(f"a mean needs at least one policy and networks of the same size, got sizes {sorted(sizes)}")
     weights = (np.concatenate(layers) for layers in zip(*(network.weights for network in networks), strict=True))
     biases = (np.concatenate(layers) for layers in zip(*(network.biases for network in networks), strict=True))
     return make_general(tuple(weights), tuple(biases), margin)

@@ -82,10 +82,10 @@ def make_sight(scenario: Scenario) -> Sight:
     path = np.array([scenario.path_origin, scenario.path_velocity], dtype=np.float64)
     slots = np.ascontiguousarray(scenario.formations)
     if not path[1].any():
-        raise ConfigurationError(f"scenario {scenario.name!r} has a path at rest: there are no lanes along it to look at")
+        raise ConfigurationError(f"scenario {scenario.name!r} has a path at rest, so there are no lanes along it")
     if np.abs(slots[0] - slots[1]).max() < 1e-9:
         first, second = scenario.formation_names
-        raise ConfigurationError(f"scenario {scenario.name!r} has no column: the slots of {second} are those of {first}")
+        raise ConfigurationError(f"scenario {scenario.name!r} has no column: {second} has the same slots as {first}")
     unit = settling_time(scenario)
     columns = [name.endswith(scenario.formation_names[1]) for name in scenario.orders.commands]
     return Sight(slots, path, unit * np.array(EDGES), float(scenario.safe_distance), unit, scenario.duration, np.array(columns))

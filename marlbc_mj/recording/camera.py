@@ -152,7 +152,7 @@ def _spot(name: str) -> tuple[float, float, float]:
     except ValueError:
         x, y, reach = np.nan, np.nan, np.nan
     if not (np.isfinite([x, y, reach]).all() and reach > 0):
-        raise ConfigurationError(f"camera {name!r} must be at:X,Y,R with a point and a positive reach [m], at:60,0,8 for example")
+        raise ConfigurationError(f"camera {name!r} must be at:X,Y,R with a point and a positive reach [m], for example at:60,0,8")
     return x, y, reach
 
 

@@ -56,7 +56,7 @@ def recover_log(torn: str | Path, out: str | Path, overwrite: bool = False) -> i
         writer.start(header.profile, header.library)
         saved = _copy(records, writer)
         if not saved:
-            raise ConfigurationError(f"{torn} holds no whole message, so there is nothing to recover")
+            raise ConfigurationError(f"{torn} holds no complete message, so there is nothing to recover")
         writer.finish()
     return saved
 
@@ -87,7 +87,7 @@ def open_mcap(path: str | Path) -> Iterator[McapReader]:
         except ConfigurationError:
             raise
         except _DAMAGE as error:
-            text = f"{path} is damaged ({error}); `marlbc log recover {path} OUT` salvages what is whole"
+            text = f"{path} is damaged ({error}); `marlbc log recover {path} OUT` salvages the intact messages"
             raise ConfigurationError(text) from error
 
 
@@ -97,7 +97,7 @@ def _check_whole(path: str | Path, stream: BinaryIO) -> None:
     stream.seek(0)
     opcode, length, summary_start, _, summary_crc, magic = _END.unpack(data[-_END.size :].rjust(_END.size, b"\0"))
     if (opcode, length, magic) != (Opcode.FOOTER, 20, MCAP0_MAGIC):
-        raise ConfigurationError(f"{path} is truncated; `marlbc log recover {path} OUT` salvages what is whole")
+        raise ConfigurationError(f"{path} is truncated; `marlbc log recover {path} OUT` salvages the intact messages")
     if summary_crc and zlib.crc32(data[summary_start : -len(MCAP0_MAGIC) - 4]) != summary_crc:
         raise ValueError("wrong checksum of its summary")
     if summary_start:
@@ -113,7 +113,7 @@ def _check_sizes(stream: BinaryIO) -> None:
         if isinstance(record, Chunk):
             total += _unpacked(record)
             if total > MOST_UNPACKED:
-                raise ValueError(f"its chunks are larger than {MOST_UNPACKED} bytes together")
+                raise ValueError(f"its chunks unpack to more than {MOST_UNPACKED} bytes")
     stream.seek(0)
 
 
@@ -121,7 +121,7 @@ def _unpacked(chunk: Chunk) -> int:
     """Decompressed size of a chunk [bytes]; ValueError if it is too large or differs from that of the compressed data."""
     said, packed = chunk.uncompressed_size, len(chunk.data)
     if said > MOST_CHUNK:
-        raise ValueError(f"a chunk of {packed} bytes claims to hold {said}; none has more than {MOST_CHUNK}")
+        raise ValueError(f"a chunk of {packed} bytes claims to unpack to {said}; at most {MOST_CHUNK} are accepted")
     if chunk.compression == "zstd":
         found = zstandard.frame_content_size(chunk.data)
     elif chunk.compression == "lz4":

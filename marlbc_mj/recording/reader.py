@@ -75,11 +75,11 @@ def _check_log(log: EpisodeLog) -> None:
         if getattr(log, name).shape not in ((steps, 0, 0), (steps, agents, agents)):
             raise ValueError(f"{name} has shape {getattr(log, name).shape}")
     if len(log.robots) not in (0, agents):
-        raise ValueError(f"robots names {len(log.robots)} for {agents} agents")
+        raise ValueError(f"robots has {len(log.robots)} names for {agents} agents")
     if not (log.age >= 0).all():
         raise ValueError("an age is negative, or not a number")
     if log.command.dtype.kind != "i" or not ((log.command >= 0) & (log.command < len(log.commands))).all():
-        raise ValueError(f"a command is none of the {len(log.commands)} that there are")
+        raise ValueError(f"a command is not one of the {len(log.commands)} in the log")
     if not all(isinstance(name, str) for name in log.commands):
         raise ValueError("the names of commands are not strings")
     if not (np.diff(log.time) > 0).all() or not (0 < log.mission_step < np.inf and 0 < log.safe_distance < np.inf):
@@ -157,7 +157,7 @@ def _messages(path: str | Path, reader: McapReader) -> dict[str, list[dict[str, 
         missing = ", ".join(name for name, count in counts.items() if not count)
         raise ConfigurationError(f"{path} has no messages on {missing}: no mission step was recorded")
     if len(set(counts.values())) > 1:
-        raise ConfigurationError(f"{path} has mission steps that are not whole: {counts}")
+        raise ConfigurationError(f"{path} has incomplete mission steps: {counts}")
     return found
 
 

@@ -72,9 +72,9 @@ FORCE = Topic("/force", "marlbc.Force", "force applied in the first substep of a
 PRIORITIES = Topic(
     "/priorities",
     "marlbc.Priorities",
-    "what the mission supervisor commands",
+    "orders of the mission supervisor",
     {
-        "command": MessageField("string", "behaviors from the highest priority down, OA>FM for example"),
+        "command": MessageField("string", "behaviors from the highest priority down, for example OA>FM"),
         "index": MessageField("integer", "the same as an index into the scenario's commands"),
     },
 )
@@ -98,13 +98,13 @@ METRICS = Topic(
     {
         "formation": MessageField("integer", "G at the start: 2 in formation, 1 in column, 0 neither"),
         "reward": MessageField("number", "r1 + r2 of this mission step"),
-        "decision_ms": MessageField("number", "what the supervisor took [ms]"),
+        "decision_ms": MessageField("number", "computing time of the supervisor [ms]"),
     },
 )
 POSE = Topic(
     "/pose",
     "marlbc.Pose",
-    "where the bodies of robots with a free joint are and how they are turned, at the start of a mission step",
+    "position and orientation of the bodies of robots with a free joint, at the start of a mission step",
     {
         **{axis: MessageField("number", f"position of the body, {axis} axis [m]") for axis in ("x", "y", "z")},
         **{f"q{part}": MessageField("number", f"orientation, quaternion {part}") for part in ("w", "x", "y", "z")},
@@ -113,7 +113,7 @@ POSE = Topic(
 SHIELD = Topic(
     "/shield",
     "marlbc.Shield",
-    "what the shield did and saw since the episode began, at the end of a mission step",
+    "counts and sums of the shield since the episode began, at the end of a mission step",
     {
         "interventions": MessageField("number", "substeps in which it changed the force, or the reference velocity"),
         "change": MessageField("number", "integral of |u - wish| dt, or sum of m |v_r - wish| [N s]"),
@@ -127,12 +127,12 @@ SHIELD = Topic(
 COMMUNICATION = Topic(
     "/communication",
     "marlbc.Communication",
-    "who hears whom, and how old what each agent knows of the others is, when orders were given",
+    "links between agents, and the age of what each agent knows of the others, when orders were given",
     {
         "component": MessageField("integer", "number of the first agent of its connected component, from 1"),
         "hears": MessageField("string", "numbers of the agents that it hears directly, from 1"),
-        "ages": MessageField("string", "of what it knows of each agent [s]; - where it knows nothing"),
-        "known": MessageField("integer", "how many agents it knows something of, itself included"),
+        "ages": MessageField("string", "age of what it knows of each agent [s]; - where it knows nothing"),
+        "known": MessageField("integer", "number of agents that it knows something about, including itself"),
         "oldest": MessageField("number", "greatest of the ages [s]"),
     },
 )
@@ -142,7 +142,7 @@ SUBSTEP_ROWS = Topic(
     "position, velocity, reference, reference velocity and force of every substep of a mission step, for metrics",
     {},
     {
-        "substeps": MessageField("integer", "how many there are"),
+        "substeps": MessageField("integer", "number of substeps"),
         "data": MessageField("string", "packed numbers, see encode_substeps"),
     },
 )
@@ -157,7 +157,7 @@ joint, ``SHIELD`` in those of teams with a shield, and ``COMMUNICATION`` in thos
 
 def json_schema(topic: Topic) -> dict[str, Any]:
     """The JSON Schema (draft 2020-12) of a topic."""
-    rows = {"type": "array", "description": "one row an agent", "items": _object(topic.agents)}
+    rows = {"type": "array", "description": "one row per agent", "items": _object(topic.agents)}
     schema = _object(topic.scalars)
     schema["properties"]["agents"] = rows
     schema["required"].append("agents")

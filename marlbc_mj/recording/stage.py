@@ -147,7 +147,7 @@ def make_stage(log: EpisodeLog) -> Stage:
         discs = [model.geom(f"obstacle{k + 1}").id for k in range(len(log.obstacles))]
         _place_obstacles(model, data, discs, log.obstacles, unit)
         if not (np.isfinite([unit, *radii]).all() and unit > 0 and min(radii) >= 0):
-            raise ValueError(f"it says a length unit of {unit} m and radii of {radii} m")
+            raise ValueError(f"it has a length unit of {unit} m and radii of {radii} m")
     except (KeyError, ValueError, ElementTree.ParseError) as error:
         raise ConfigurationError(f"the log's model cannot be shown: {one_line(error)}") from error
     return Stage(
@@ -171,8 +171,8 @@ def _check_self_contained(mjcf: str) -> None:
     for element in ElementTree.fromstring(mjcf).iter():
         files = [name for name in element.attrib if name.lower().startswith("file")]
         if files or element.tag in OUTSIDE:
-            named = f"{files[0]} {element.attrib[files[0]]!r}" if files else "a part of another program"
-            raise ValueError(f"its element {element.tag!r} reads {named}; a log holds all that it needs")
+            named = f"{files[0]} {element.attrib[files[0]]!r}" if files else "something from outside the file"
+            raise ValueError(f"its element {element.tag!r} reads {named}; a log must hold all that it needs")
 
 
 def restage(stage: Stage, log: EpisodeLog) -> Stage:
@@ -216,7 +216,7 @@ def _size(model: mujoco.MjModel, agents: int) -> tuple[float, list[float]]:
         return 1.0, [0.0] * agents
     unit, *radii = model.numeric("robot").data.tolist()
     if len(radii) not in (1, agents):
-        raise ValueError(f"it says {len(radii)} radii for {agents} agents")
+        raise ValueError(f"it has {len(radii)} radii for {agents} agents")
     return unit, radii if len(radii) == agents else radii * agents
 
 

@@ -20,7 +20,7 @@ from marlbc_mj.util.text import one_line
 
 LEAST_PIXELS, MOST_PIXELS = 64, 4096  # limits of width and height [pixels]
 MOST_SAMPLES = 16  # largest number of samples per pixel
-_SIZES = f"size must be two even numbers of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, 1280x720 for example"
+_SIZES = f"size must be two even numbers of pixels from {LEAST_PIXELS} to {MOST_PIXELS}, for example 1280x720"
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None,
     first, last = float(log.time[0]), float(log.time[-1]) + log.mission_step
     begin, until = max(first, first if start is None else start), min(last, last if end is None else end)
     if not begin < until:
-        raise ConfigurationError(f"start {start} and end {end} leave nothing of the log's {first:g} to {last:g} s")
+        raise ConfigurationError(f"nothing of the log, {first:g} to {last:g} s, lies between start {start} and end {end}")
     count = max(1, int(np.ceil((until - begin) * fps / speed - 1e-6)))
     return begin + np.arange(count) * speed / fps
 

@@ -131,7 +131,7 @@ def _legend(episodes: Sequence[Trajectory]) -> list[Line2D]:
     distance = episodes[0].scenario.safe_distance
     handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, linestyle=(0, (3, 2)), label=f"safe distance {distance:g} m"))
     if any(len(e.motions) for e in episodes):
-        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="path of an obstacle, drawn where it came nearest"))
+        handles.append(Line2D([], [], color=pl.GREY, linewidth=0.5, label="path of an obstacle (disc: at its closest approach)"))
     if any(violates(e.clearances(), distance).any() for e in episodes):
         handles.append(Line2D([], [], color=_VIOLATION, linewidth=2.6, label="inside the safe distance"))
     return handles

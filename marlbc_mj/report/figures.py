@@ -41,13 +41,13 @@ _FORCES = (
     "Right: both axes in the two seconds in which the forces change most."
 )
 _PARETO = (
-    "Control cost against what it buys. Colors are supervisors, shapes are controllers. A mark that would cover another "
+    "Control cost against what it achieves. Colors are supervisors, shapes are controllers. A mark that would cover another "
     "is shifted; a thin line leads to its place. Formation error: mean distance of an agent from its slot in "
     "the first formation, relative to the centroid. Dashed: LQR, whose gains minimize this cost in regulation."
 )
 _CONTROL = (
-    "with each framework's controller, below around the largest of them all. One scale: linear up to SORLC's limit (dashed), "
-    "logarithmic beyond."
+    "with each framework's controller; bottom row: around the largest of all forces. One scale: linear up to SORLC's limit "
+    "(dashed), logarithmic beyond."
 )
 
 
@@ -108,13 +108,13 @@ def _controller_figures(laws: Mapping[str, Trajectory], supervisor: str) -> list
         found.append(Plot("figure4_weights_sorlc", f"Figure 4: {weights_caption(own)}", partial(weight_norms, own)))
         text = (
             "Figure 5: distance of SORLC's weights from their values at the end (Frobenius norm), in place of ideal weights, "
-            "which nobody knows."
+            "which are unknown."
         )
         found.append(Plot("figure5_weight_errors_sorlc", text, partial(weight_errors, own)))
     for number, name in ((6, "sorlc"), (7, "rlc")):
         if name in laws:
             law, over = source_of(name).display, source_of(supervisor).display
-            text = f"Figure {number}: tracking errors of {law}, supervisor: {over}. Each pixel column shows its largest."
+            text = f"Figure {number}: tracking errors of {law}, supervisor: {over}. Each pixel column shows its largest error."
             found.append(Plot(f"figure{number}_tracking_{name}", text, partial(errors, laws[name]), narrow=True))
     return found
 
@@ -155,7 +155,7 @@ def _method(result: Result, trajectory: Trajectory, supervisor: bool) -> list[Pl
     found = []
     if supervisor:
         found.append(own("priorities", f"Behavior priorities; {_STRIPS}", lambda: priorities([trajectory]), narrow=True))
-    found.append(own("errors", "Tracking errors, each pixel column its largest.", lambda: errors(trajectory), narrow=True))
+    found.append(own("errors", "Tracking errors; each pixel column shows its largest.", lambda: errors(trajectory), narrow=True))
     if supervisor:
         found.append(own("trajectories", f"Paths, {_PATHS}", lambda: trajectories([trajectory])))
     found.append(own("forces", _FORCES, lambda: forces(trajectory)))

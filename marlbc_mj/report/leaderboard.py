@@ -27,7 +27,7 @@ CONTROL = "control"
 """The track that compares controllers."""
 _REFERENCE_NOTE = (
     f"Reference: {display_name(SUPERVISOR_REFERENCE)} under the null-space composition. A run that was not finished, or not "
-    "begun because the method refuses the mission, counts as violated, struck and collided, too."
+    "begun because the method refuses the mission, also counts as violated, struck and collided."
 )
 LEADING = 3
 """Number of columns that every table begins with; in text, only these show their intervals."""
@@ -238,7 +238,7 @@ def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list
         ("Processor", str(facts["cpu"])),
         ("Code", str(facts["code"])),
         *origin_facts(facts),
-        *(("Rows beside these", f"flown {other['date']} by {other['code']}: {other['command']}") for other in beside),
+        *(("Other rows", f"run {other['date']} by {other['code']}: {other['command']}") for other in beside),
     ]
 
 

@@ -125,7 +125,7 @@ def fill_page(path: Path, template: str, links: Sequence[Path], **values: Any) -
         links=[_link(link, path.parent) for link in links],
         errata=paper_values.ERRATA.items(),
         citation=paper_values.CITATION,
-        details_title="Beside the paper" if values["of_paper"] else "Tables of single quantities",
+        details_title="Compared with the paper" if values["of_paper"] else "Tables of single quantities",
         doi=paper_values.DOI,
         **values,
     )

@@ -80,7 +80,7 @@ def _mission_table(mission: str, rows: Sequence[CellScores]) -> Table:
     )
     flown = [row for row in rows if not row.refused]
     reasons = {row.reason: display_name(row.cell.supervisor) for row in rows if row.refused}
-    notes = tuple(f"Not flown: {supervisor}: {reason}." for reason, supervisor in reasons.items())
+    notes = tuple(f"Not run: {supervisor}: {reason}." for reason, supervisor in reasons.items())
     return Table(f"safety-{mission}", mission, columns, tuple(map(_cells, flown)), notes)
 
 

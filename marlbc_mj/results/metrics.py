@@ -107,7 +107,7 @@ def _of_trajectory(episode: Trajectory) -> _Flown:
 
 def _of_log(log: EpisodeLog) -> _Flown:
     if log.substeps is None:
-        raise ConfigurationError("the log holds mission steps only, and metrics need every substep; fly the episode again")
+        raise ConfigurationError("the log holds only mission steps, but metrics need every substep; run the episode again")
     every = log.substeps
     return _Flown(
         every.course,

@@ -160,7 +160,7 @@ def _weights(tracks: Mapping[str, str], by_track: bool) -> dict[str, float]:
 def _matrix(rows: Sequence[MissionRuns], merit: Merit) -> _Matrix:
     common = set.intersection(*({run.seed for run in each.runs} for each in rows))
     if not common:
-        raise ConfigurationError(f"no layout of {rows[0].mission} was flown by all methods")
+        raise ConfigurationError(f"no layout of {rows[0].mission} was run with all methods")
     chosen = [sorted((run for run in each.runs if run.seed in common), key=_seed_of) for each in rows]
     merits = np.array([[merit(run) for run in runs] for runs in chosen])
     outcomes = np.array([[[getattr(run, kind) for run in runs] for runs in chosen] for kind in OUTCOMES], dtype=bool)

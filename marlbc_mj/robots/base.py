@@ -83,7 +83,7 @@ class Robot:
             if value is not None and not value > 0:
                 raise ConfigurationError(f"robot {self.name!r}: {name} must be positive, got {value}")
         if (self.drive is None) != (self.reading is None):
-            raise ConfigurationError(f"robot {self.name!r} has one of drive and reading; it needs both, or neither and motors")
+            raise ConfigurationError(f"robot {self.name!r} has only one of drive and reading; give both, or neither and motors")
         if self.drive is not None and self.reading is not None and _names(self.drive) != _names(self.reading):
             raise ConfigurationError(f"robot {self.name!r}: drive and reading must declare the same names of gains and state")
         if self.drive is None and len(self.motors) != 2:

@@ -138,7 +138,7 @@ def _locate(path: Path, folder: Path, source: _Source, file: str) -> Path:
         if not place.resolve().is_relative_to(folder):
             raise ConfigurationError(f"{path} uses a file outside its folder: {file}")
     if not there:
-        raise ConfigurationError(f"{path} uses a file that is not there: {file}")
+        raise ConfigurationError(f"{path} uses a file that does not exist: {file}")
     for place in there:
         if not place.is_file():
             raise ConfigurationError(f"{path} uses {file}, which is not a regular file")

@@ -146,5 +146,5 @@ class RobotFleet:
         if standing and others:
             raise ConfigurationError(
                 f"robots {standing[0]!r} and {others[0]!r} cannot be in one world: the first stands on the arena's ground, the "
-                "second on a floor of its own file"
+                "second on a floor in its own file"
             )

@@ -146,6 +146,8 @@ def check_motors(model: mujoco.MjModel, dofs: tuple[int, int], motors: Sequence[
         if why is not None:
             raise ConfigurationError(f"actuator {name!r} is not a motor: {why}")
         if not _pushes(upright[u], turned[u], dof):
-            raise ConfigurationError(f"motors[{axis}] {name!r} does not push along {'xy'[axis]} alone; motors name those of x, y")
+            raise ConfigurationError(
+                f"motors[{axis}] {name!r} does not push along {'xy'[axis]} alone; motors must name those of x and y"
+            )
         found.append(_motor(model, u, dof, float(upright[u, dof])))
     return found[0], found[1]

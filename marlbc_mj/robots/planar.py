@@ -71,7 +71,7 @@ def _refuse_turning_slides(model: mujoco.MjModel, slides: Sequence[int]) -> None
     for j in range(last):
         if model.jnt_type[j] != _SLIDE and tree[j] == tree[last] and model.jnt_bodyid[j] <= model.jnt_bodyid[last]:
             raise ConfigurationError(
-                f"joint {model.joint(j).name!r} turns the slide joints, so that they are not along x and y; put it after them"
+                f"joint {model.joint(j).name!r} comes before the slide joints and turns them away from x and y; put it after them"
             )
 
 
@@ -189,7 +189,7 @@ def _straighten_slide(
     direction = data.xaxis[k]
     if _along(direction) != axis or model.jnt_type[k] != _SLIDE:
         raise ConfigurationError(
-            f"joints[{axis}] {name!r} moves along {np.round(direction, 3).tolist()}; joints name the slides along x, y"
+            f"joints[{axis}] {name!r} moves along {np.round(direction, 3).tolist()}; joints must name the slides along x and y"
         )
     sense, reference = float(np.sign(direction[axis])), float(model.qpos0[model.jnt_qposadr[k]])
     if sense > 0.0 and abs(reference - place) < 1e-12:
@@ -215,10 +215,11 @@ def _refuse_followers(model: mujoco.MjModel, k: int, name: str) -> None:
     coupled = (model.eq_type == mujoco.mjtEq.mjEQ_JOINT) & ((model.eq_obj1id == k) | (model.eq_obj2id == k))
     if wrapped.any() or coupled.any():
         raise ConfigurationError(
-            f"joint {name!r} is in a tendon or an equality and is reversed or offset; let it point along +x or +y from 0"
+            f"joint {name!r} is used by a tendon or an equality, so it must not be reversed or offset; "
+            "let it point along +x or +y from 0"
         )
     for u in range(model.nu):
         if model.actuator_trntype[u] in _JOINTS and model.actuator_trnid[u, 0] == k and model.actuator_biasprm[u, 1]:
             raise ConfigurationError(
-                f"joint {name!r} has the servo {model.actuator(u).name!r} and is reversed or offset; let it start at 0"
+                f"joint {name!r} has the servo {model.actuator(u).name!r} and must not be reversed or offset; let it start at 0"
             )

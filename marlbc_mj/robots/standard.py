@@ -60,7 +60,7 @@ def _standard_text(path: Path, place: Path, state: tuple[tuple[str, int, int], .
             mujoco.MjSpec.from_string(text).compile()
             return text
         except (ValueError, mujoco.FatalError) as error:
-            raise ConfigurationError(f"{path} cannot be made one text: {one_line(error)}") from error
+            raise ConfigurationError(f"{path} cannot be merged into one text: {one_line(error)}") from error
 
 
 def _blame(error: Exception) -> str:
@@ -78,17 +78,17 @@ def _try_out(path: Path) -> None:
     try:
         status, said = try_out(path, _LIMITS)
     except OSError as error:
-        raise ConfigurationError(f"{path} cannot be tried out: {one_line(error)}") from error
+        raise ConfigurationError(f"{path} cannot be tested: {one_line(error)}") from error
     if status is None:
         raise ConfigurationError(f"{path} takes more than {_LIMITS.seconds:g} s to compile")
     if status == -signal.SIGXCPU:
         raise ConfigurationError(
-            f"{path} takes more than {_LIMITS.cpu} s of a processor to compile and make two steps; simplify it"
+            f"{path} takes more than {_LIMITS.cpu} s of processor time to compile and run two steps; simplify it"
         )
     if status < 0:
         raise ConfigurationError(f"{path} makes MuJoCo itself crash (signal {-status}); simplify the file")
     if status not in (0, 3):
-        raise ConfigurationError(f"{path} cannot be tried out: {one_line(said)[-200:]}")
+        raise ConfigurationError(f"{path} cannot be tested: {one_line(said)[-200:]}")
     if status == 3 and "memory" in said.lower():
         raise ConfigurationError(f"{path} does not compile: {one_line(said)}")
 

@@ -156,7 +156,7 @@ def from_mjcf(path: Path, name: str) -> Robot:
     if isinstance(motors, Reason):
         raise ConfigurationError(f"{path}: actuator {motors.name!r} is not a motor: {motors.why}; {_WAY_OUT}")
     if motors is not None:
-        turning = f"; {', '.join(moved)} taken after the slides, so that it turns about itself" if moved else ""
+        turning = f"; {', '.join(moved)} moved after the slides, so that it turns about its own axis" if moved else ""
         return _direct({**fields, "description": f"two motors along x and y{turning}"}, (motors[0].name, motors[1].name), limit)
     _refuse_legs_and_wheels(path, model, base)
     if len(base.joints) == 1:
@@ -188,7 +188,7 @@ def _moving_root(path: Path, model: mujoco.MjModel) -> int:
         names = ", ".join(model.body(b).name for b in roots)
         still = ", ".join(repr(model.body(b).name) for b in range(1, model.nbody) if model.body_parentid[b] == 0)
         hint = f"it has {names}" if names else f"give one of its bodies a free joint: {still}"
-        raise ConfigurationError(f"{path} must have one body that moves by a joint of its own; {hint}")
+        raise ConfigurationError(f"{path} must have exactly one base, a body with a joint and no moving parent; {hint}")
     return roots[0]
 
 
@@ -233,7 +233,7 @@ def _flying(fields: dict[str, Any], path: Path, spec: mujoco.MjSpec) -> Robot:
     if not able > 0.0:
         weight = f"its weight of {mass * params['gravity']:g} N"
         raise ConfigurationError(
-            f"{path}: rotors fly by tilting against gravity, but its rotors cannot both hold {weight} and turn it"
+            f"{path}: a rotorcraft flies by tilting against gravity, but its rotors cannot both hold {weight} and tilt it"
         )
     heading = (
         "" if any(turn for _, _, turn in params["moment_share"]) else "; none turns its heading alone, which is left to itself"

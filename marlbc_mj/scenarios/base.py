@@ -235,7 +235,7 @@ class Scenario:
             gaps = np.linalg.norm(starts[:, None] - first[None, :, :2], axis=-1) - first[:, 2]
             if (gaps > 0).all():
                 return Draw(starts, obstacles, float(rng.uniform(*spread.drag_scale)), motions, number)
-        raise ConfigurationError(f"scenario {self.name!r}: {spread} puts an obstacle on a start in every one of 100 draws")
+        raise ConfigurationError(f"scenario {self.name!r}: with {spread}, each of 100 draws puts an obstacle on a start")
 
     def draw_of(self, seed: int) -> Draw:
         """The draw that ``World.reset(seed)`` uses for world 0.
@@ -304,7 +304,7 @@ class Scenario:
         names = [b.name for b in self.behaviors]
         if len(names) > MOST_BEHAVIORS:
             raise ConfigurationError(
-                f"{len(names)} behaviors make {factorial(len(names))} orders; at most {MOST_BEHAVIORS} are ordered"
+                f"{len(names)} behaviors make {factorial(len(names))} orders; at most {MOST_BEHAVIORS} behaviors are supported"
             )
         if len(set(names)) != len(names):
             raise ConfigurationError(f"scenario {self.name!r}: two behaviors share a name: {', '.join(names)}")
@@ -342,7 +342,7 @@ class Scenario:
     def _check_clocks(self) -> None:
         if self.mission_step / self.substep > MOST_SUBSTEPS:
             raise ConfigurationError(
-                f"substep {self.substep} s makes more than {MOST_SUBSTEPS} of a mission step of {self.mission_step} s"
+                f"a mission step of {self.mission_step} s has more than {MOST_SUBSTEPS} substeps of {self.substep} s"
             )
         if self.duration / self.mission_step > MOST_STEPS:
             raise ConfigurationError(
@@ -364,9 +364,9 @@ def with_changes(made: Mapping[str, Any], changes: Mapping[str, Any]) -> Scenari
     """
     known = [each.name for each in fields(Scenario)]
     if "agents" in changes:
-        team = f"a team of {len(made['starts'])} of its own, and agents cannot be set"
+        team = f"a fixed team of {len(made['starts'])} agents"
         raise ConfigurationError(
-            f"scenario {changes.get('name', made['name'])!r} has {team}; families such as 'field' and 'gates' take agents"
+            f"scenario {changes.get('name', made['name'])!r} has {team}; only families such as 'field' and 'gates' accept agents"
         )
     for name in changes:
         if name not in known:

@@ -140,7 +140,7 @@ class Gates(Family):
             )
         if self._pitch() < self.depth + 2.0 * self.post:
             each, whole = self.depth + 2.0 * self.post, float(np.ptp(self.way))
-            raise self.infeasible(f"{self.gates} passages of {each:g} m do not fit into {whole:g} m of way")
+            raise self.infeasible(f"{self.gates} passages of {each:g} m do not fit into a way of {whole:g} m")
 
     def _pitch(self) -> float:
         """Distance from one opening to the next [m]."""
@@ -200,7 +200,7 @@ class TrafficFamily(Family):
         super().check()
         if self.obstacles < 1 or not 0 <= self.swinging <= self.obstacles:
             raise self.infeasible(
-                f"obstacles must be at least 1 and swinging at most as many, got {self.obstacles} and {self.swinging}"
+                f"obstacles must be at least 1 and swinging from 0 to obstacles, got {self.obstacles} and {self.swinging}"
             )
         for key, least in (("radius", 0.0), ("obstacle_speed", 1e-9), ("swing", 1e-9)):
             low, high = getattr(self, key)
@@ -252,5 +252,7 @@ def held_out(scenario: Scenario) -> Scenario:
     """
     if scenario.layout is None:
         drawn = ", ".join(name for name, family in FAMILIES.items() if family().layout() is not None)
-        raise ConfigurationError(f"scenario {scenario.name!r} draws no layouts, so none can be held out; those that do: {drawn}")
+        raise ConfigurationError(
+            f"scenario {scenario.name!r} draws no layouts, so none can be held out; scenarios that do: {drawn}"
+        )
     return replace(scenario, split="test")

@@ -157,10 +157,12 @@ class Family(Mission):
             if getattr(self, key) < 1.1 * self.agent_distance:
                 least = f"1.1 times the agent_distance of {self.agent_distance:g} m"
                 value = getattr(self, key)
-                raise self.infeasible(f"{key} must be at least {least}, or AA would break it up; got {value:g} m")
+                raise self.infeasible(f"{key} must be at least {least}, or AA would break up the formation; got {value:g} m")
         if self.cluttered and not self.way[0] < self.way[1]:
             extent = float(np.ptp(slots[:, 0]))
-            raise self.infeasible(f"a formation {extent:g} m long leaves nothing of a way of {self.length:g} m; make it longer")
+            raise self.infeasible(
+                f"a formation {extent:g} m long leaves no room for obstacles on a path of {self.length:g} m; make the path longer"
+            )
 
     def behaviors(self) -> tuple[Behavior, ...]:
         """The behaviors for the family's formation and column."""
@@ -168,7 +170,7 @@ class Family(Mission):
 
     def infeasible(self, reason: str) -> ConfigurationError:
         """The error that rejects this family's parameters."""
-        return ConfigurationError(f"scenario {self.name!r} cannot be flown: {reason}")
+        return ConfigurationError(f"scenario {self.name!r} is infeasible: {reason}")
 
     def _scenario(self, rest: dict[str, Any]) -> Scenario:
         layout = self.layout()

@@ -90,9 +90,7 @@ def load_scenario(path: str | Path, *, allow_code: bool = False, **changes: Any)
     except ConfigurationError as error:
         raise ConfigurationError(f"{path}: {error}") from error
     except (ArithmeticError, TypeError, ValueError, RecursionError, MemoryError) as error:  # numbers that no check anticipates
-        raise ConfigurationError(
-            f"{path}: a value that no scenario can have: {one_line(error) or type(error).__name__}"
-        ) from error
+        raise ConfigurationError(f"{path}: a value is invalid: {one_line(error) or type(error).__name__}") from error
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -34,14 +34,16 @@ class Scatter:
         mean = 0.5 * sum(self.radius) + 0.5 * self.gap
         area = (self.x[1] - self.x[0] + 2.0 * mean) * (self.y[1] - self.y[0] + 2.0 * mean)
         if self.count * np.pi * mean**2 > _FULL * area:
-            raise ConfigurationError(self._reason("the discs and their gaps alone would cover it"))
+            raise ConfigurationError(
+                self._reason(f"the discs with their gaps would cover more than {100 * _FULL:.0f} % of the area")
+            )
         most = 0
         for _ in range(RESTARTS):
             discs = self._throw(rng)
             if len(discs) == self.count:
                 return Sample(discs, np.zeros((0, NUMBERS)))
             most = max(most, len(discs))
-        raise ConfigurationError(self._reason(f"of {RESTARTS} draws the fullest held {most}"))
+        raise ConfigurationError(self._reason(f"the fullest of {RESTARTS} draws has room for {most}"))
 
     def _throw(self, rng: np.random.Generator) -> np.ndarray:
         """(k, 3) discs; k = ``count`` if there was room for all."""
@@ -127,7 +129,7 @@ class Traffic:
                 return Sample(anchors, motions)
         raise ConfigurationError(
             f"no room for {self.count} moving obstacles of radius up to {self.radius[1]:g} m on {self.x[1] - self.x[0]:g} m of "
-            f"way in {RESTARTS} draws; take fewer, smaller ones or a longer path"
+            f"path in {RESTARTS} draws; use fewer or smaller obstacles or a longer path"
         )
 
     def _add_all(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:

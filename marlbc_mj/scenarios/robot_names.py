@@ -23,7 +23,7 @@ def settle_robots(scenario: str, agents: int, robot: str, robots: Any) -> tuple[
         return robot, ()
     listed = ", ".join(robots)
     if len(robots) != agents:
-        raise ConfigurationError(f"scenario {scenario!r}: robots names {len(robots)} robots for {agents} agents: {listed}")
+        raise ConfigurationError(f"scenario {scenario!r}: robots lists {len(robots)} robots for {agents} agents: {listed}")
     if robot not in (PAPER_ROBOT, robots[0]):
-        raise ConfigurationError(f"scenario {scenario!r}: robot {robot!r} and robots {listed} disagree; give one of both")
+        raise ConfigurationError(f"scenario {scenario!r}: robot {robot!r} and robots {listed} disagree; give only one of them")
     return robots[0], tuple(robots) if len(set(robots)) > 1 else ()

@@ -32,7 +32,7 @@ def read_team(name: str) -> TeamName:
     """
     formation, dash, agents = name.partition("-")
     if not (dash and agents.isdigit()):
-        raise ConfigurationError(f"a team is FORMATION-AGENTS, wedge-4 for example, got {name!r}")
+        raise ConfigurationError(f"a team must be FORMATION-AGENTS, for example wedge-4, got {name!r}")
     if formation not in FORMATIONS:
         raise unknown("formation", formation, FORMATIONS)
     if int(agents) < 2:

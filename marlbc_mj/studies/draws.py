@@ -71,7 +71,7 @@ class DrawsStudy:
         if len(set(self.seeds)) != len(self.seeds) or min(self.seeds) < 0:
             raise ConfigurationError(f"seeds must differ and not be negative, got {list(self.seeds)}")
         if self.against is not None and self.against not in keys:
-            raise ConfigurationError(f"reference method {self.against!r} is not run; choose from: {', '.join(keys)}")
+            raise ConfigurationError(f"reference {self.against!r} is not among the methods; choose from: {', '.join(keys)}")
         for supervisor, controller in self.methods:
             make_supervisor(supervisor, controller)
             make_controller(controller)

@@ -127,7 +127,7 @@ def frozen(scenario: Scenario, seed: int) -> Scenario:
     """
     draw = scenario.draw_of(seed)
     if len(draw.motions):
-        raise ConfigurationError(f"mission {scenario.name!r} has obstacles that move; the search plans around those at rest")
+        raise ConfigurationError(f"mission {scenario.name!r} has moving obstacles; the search needs obstacles at rest")
     return replace(
         scenario,
         starts=tuple((x, y) for x, y in draw.starts.tolist()),

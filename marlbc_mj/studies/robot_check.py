@@ -76,15 +76,15 @@ def _mass(robot: Robot) -> Item:
     model, _ = _compiled(robot)
     weighed = float(model.body(robot.body).subtreemass[0])
     if robot.mass is None:
-        return Item("mass", weighed > 0, f"{weighed:g} kg, scaled to the scenario's")
+        return Item("mass", weighed > 0, f"{weighed:g} kg, scaled to the scenario's mass")
     if robot.direct and len(robot.joints) == 2:
         along_x, along_y = moved_masses(model, base_of(model, robot.body, robot.joints))
         if not np.isclose(along_x, along_y, rtol=MASSES):
-            said = f"{along_x:g} kg move along x, {along_y:g} kg along y; a robot has one mass"
+            said = f"{along_x:g} kg move along x, {along_y:g} kg along y; both masses must be equal"
             return Item("mass", False, said)
     rotating = robot.mass - weighed
     good = weighed > 0 and -1e-6 <= rotating <= weighed
-    return Item("mass", good, f"{weighed:g} kg in the MJCF, {robot.mass:g} kg with what turns along")
+    return Item("mass", good, f"{weighed:g} kg in the MJCF, {robot.mass:g} kg with rotating parts")
 
 
 def _actuators(robot: Robot) -> Item:
@@ -113,7 +113,7 @@ def _options(robot: Robot) -> Item:
     ]
     lost = [f"timestep {given.timestep:g} s (the scenario's substep counts)"] if given.timestep != usual.timestep else []
     said = "; ".join(f"{word}: {', '.join(names)}" for word, names in (("kept", kept), ("not kept", lost)) if names)
-    return Item("options", True, said or "MuJoCo's own")
+    return Item("options", True, said or "MuJoCo's defaults")
 
 
 def _shown(name: str, value: Any) -> str:
@@ -210,7 +210,7 @@ def _cause(scenario: Scenario, force: np.ndarray, v: np.ndarray) -> str:
     share = float((np.abs(force) > 0.99 * scenario.force_limit).any(axis=-1).mean())
     if share > 0.2:
         return f": its force is at the limit of {scenario.force_limit:g} N for {100 * share:.0f} % of the time; what brakes it?"
-    return ": mass, gains or limits do not fit what it weighs and what brakes it"
+    return ": its mass, gains or limits do not match its weight and its friction"
 
 
 def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
@@ -220,7 +220,7 @@ def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
     astray = float(np.linalg.norm(offset - offset[0], axis=-1).max())
     away = float(np.linalg.norm(offset[0], axis=-1).max())
     slip = float(max(truth.velocity_error.max() for truth in truths))
-    said = f"p stays within {1e3 * astray:.3g} mm of its place on {robot.body!r}, v within {1e3 * slip:.3g} mm/s of its velocity"
+    said = f"p within {1e3 * astray:.3g} mm of a fixed point of {robot.body!r}, v within {1e3 * slip:.3g} mm/s of its velocity"
     good = astray < 1e-3 * robot.length and away < max(robot.radius, robot.length) and slip < 1e-3 * robot.length
     gaps = [float(truth.force_error.max()) for truth in truths[1:] if truth.force_error is not None]
     if gaps:
@@ -230,7 +230,7 @@ def _measured(world: World, truths: Sequence[Truth], force: np.ndarray) -> Item:
         good = good and max(gaps) < 1e-3 * most + within
         said += f", force within {max(gaps):.3g} N of MuJoCo's actuators"
     if away >= max(robot.radius, robot.length):
-        said = f"p is {away:.3g} m from body {robot.body!r}, where MuJoCo has it (xpos): is it read in the world?"
+        said = f"p is {away:.3g} m from MuJoCo's position of body {robot.body!r} (xpos): is it in world coordinates?"
     return Item("measured", good, said)
 
 
@@ -242,7 +242,7 @@ def _saturation(robot: Robot, world: World, force: np.ndarray) -> Item:
     try:
         hard.step(orders)
     except MarlbcError as error:
-        return Item("saturation", False, f"a hundredfold gain: {error}")
+        return Item("saturation", False, f"with a hundredfold gain: {error}")
     model = world.plan.model
     limited = model.actuator_ctrllimited.astype(bool)
     forces = np.abs([each.data[0].actuator_force[limited] for each in (world, hard)])

@@ -204,7 +204,7 @@ class _Count:
     def retried(self, reason: str) -> None:
         """Report that a worker died and that its work is repeated."""
         self.again += 1
-        note(f"{reason}; its work is repeated ({self.again} so far)")
+        note(f"{reason}; repeating this work (repetition {self.again})")
 
 
 def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Path, overwrite: bool) -> None:
@@ -223,11 +223,11 @@ def _begin(store: RunStore, study: Study[Any, Any], keys: Sequence[str], out: Pa
         unused = f"{others} results of {why}"
         if not used and not overwrite:
             raise ConfigurationError(
-                f"{out} holds an unfinished run, {unused}, of which nothing can be used here; choose another or add --overwrite"
+                f"{out} holds an unfinished run with {unused}, none of which can be used here; choose another or add --overwrite"
             )
         note(f"{unused} in {out / JOBS_FOLDER} cannot be used here")
     if not used:
         store.drop()
     else:
-        note(f"going on with the unfinished run in {out}: {used} of {len(wanted)} jobs are done")
+        note(f"resuming the unfinished run in {out}: {used} of {len(wanted)} jobs are done")
     store.begin({"study": type(study).__name__, "code": code_version(), "jobs": len(keys)})

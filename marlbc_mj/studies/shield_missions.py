@@ -133,7 +133,7 @@ def report_missions(arguments: Sequence[str] | None = None) -> None:
         try:
             scenario = mission_of(family, agents, given.seconds)
         except ConfigurationError as error:  # no room for a team of this size
-            print(f"{family}, {agents} agents, not flown: {error}", flush=True)
+            print(f"{family}, {agents} agents, not run: {error}", flush=True)
             continue
         cell = run_missions(scenario, given.missions, given.seed)
         changed = f"{100 * cell.interventions / cell.substeps:.2f} %"

@@ -37,7 +37,7 @@ class PartialPage(Generic[EndedT]):
         if not self.folder.is_dir():
             with writing(self.folder):
                 self.folder.mkdir(parents=True)
-            note(f"{self.folder / 'index.html'} grows as methods end")
+            note(f"{self.folder / 'index.html'} is updated as methods end")
         with writing(self.folder):
             self.write([self.results[key] for key in self.keys if key in self.results], len(self.keys), self.folder)
         now = monotonic()

@@ -92,7 +92,7 @@ class RunStore:
             found = json.loads(path.read_text(encoding="utf-8"))
             if isinstance(found, dict) and found.get("schema") == STORE_SCHEMA:
                 return found
-        raise ConfigurationError(f"{path} is of another version of marlbc, or of something else; remove {self.folder}")
+        raise ConfigurationError(f"{path} was written by another version of marlbc or by another program; remove {self.folder}")
 
     def place_files(self, keys: Mapping[str, Any], out: Path) -> None:
         """Link or copy the large files of these jobs into ``out`` under their own names; the store keeps them, too."""

@@ -13,7 +13,7 @@ LEAST_ROUNDS = 5
 def check_rounds(rounds: int) -> None:
     """Raise ConfigurationError if there are too few rounds for a median."""
     if rounds < LEAST_ROUNDS:
-        raise ConfigurationError(f"rounds must be at least {LEAST_ROUNDS} for a median to mean something, got {rounds}")
+        raise ConfigurationError(f"rounds must be at least {LEAST_ROUNDS} for a meaningful median, got {rounds}")
 
 
 def _seconds(action: Callable[[], Any], clock: Callable[[], float]) -> float:

@@ -148,7 +148,7 @@ class MPCMS:
         if most * horizon * scenario.agents > MOST_ORDERS:
             raise ConfigurationError(
                 f"MPCMS would predict {most} candidates over {horizon} steps for {scenario.agents} agents: more than "
-                f"{MOST_ORDERS} orders a decision; choose fewer instants or a supervisor that decides per agent"
+                f"{MOST_ORDERS} orders per decision; choose fewer instants or a supervisor that decides per agent"
             )
         self._candidates(scenario, joint)
         twins, worlds = self._simulators(scenario, teams, most) if self.prediction == "mujoco" else (None, None)

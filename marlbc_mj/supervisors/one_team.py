@@ -53,7 +53,7 @@ def stack_decisions(decisions: tuple[Decision, ...], agents: int) -> Decision:
     if not given:
         return np.stack(orders)
     if len(given) < len(decisions):
-        raise ConfigurationError("a supervisor gave velocities for some teams and orders alone for others")
+        raise ConfigurationError("a supervisor returned velocities for some teams and only orders for others")
     return Blend(np.stack(orders), np.stack(given))
 
 

@@ -165,14 +165,14 @@ def search(
     """
     if scenario.layout is not None or scenario.moving:
         raise ConfigurationError(
-            f"the oracle plans around obstacles at rest in known places; scenario {scenario.name!r} has others"
+            f"the oracle plans only around known obstacles at rest; scenario {scenario.name!r} has moving or random ones"
         )
     if scenario.perturbation != Perturbation():
-        raise ConfigurationError("the oracle's schedule is for one draw; search on a scenario without perturbation")
+        raise ConfigurationError("the oracle's schedule is for a single draw; search on a scenario without perturbation")
     if seed < 0:
         raise ConfigurationError(f"seed must not be negative, got {seed}")
     if population < 2 or budget < population:
-        raise ConfigurationError(f"budget must be at least the population, and that at least 2, got {budget} and {population}")
+        raise ConfigurationError(f"population must be at least 2 and budget at least population, got {population} and {budget}")
     world = World(scenario, make_controller(controller), worlds=population, threads=threads, record=True)
     best = command_table(scenario, scenario.schedule if start is None else start)
     rng = np.random.default_rng(seed)

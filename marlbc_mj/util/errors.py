@@ -58,4 +58,4 @@ def enough_memory(what: str) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, MarlbcError) or not (isinstance(error, MemoryError) or "allocate memory" in str(error)):
             raise
-        raise ConfigurationError(f"{what} need more memory than there is") from error
+        raise ConfigurationError(f"{what} need more memory than is available") from error

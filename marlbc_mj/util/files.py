@@ -211,11 +211,11 @@ def _refused_when_filled(out: Path) -> Iterator[None]:
     try:
         yield
     except FileExistsError as error:
-        raise ConfigurationError(f"{out} has been written by another process meanwhile; choose another name") from error
+        raise ConfigurationError(f"{out} was written by another process in the meantime; choose another name") from error
     except OSError as error:
         if error.errno != errno.ENOTEMPTY:
             raise
-        raise ConfigurationError(f"output folder {out} has been filled by another process meanwhile; choose another") from error
+        raise ConfigurationError(f"output folder {out} was filled by another process in the meantime; choose another") from error
 
 
 def _swap(target: Path, staging: Path, ours: set[str]) -> None:

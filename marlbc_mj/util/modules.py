@@ -33,7 +33,7 @@ def split_name(name: str) -> tuple[str, str]:
         ConfigurationError: the name is not a string.
     """
     if not isinstance(name, str):
-        raise ConfigurationError(f"a name must be a text, got {type(name).__name__}")
+        raise ConfigurationError(f"a name must be a string, got {type(name).__name__}")
     file, colon, attribute = name.rpartition(":")
     return (file, attribute) if colon and file.endswith(_SUFFIX) else (name, "")
 

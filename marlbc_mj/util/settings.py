@@ -82,7 +82,7 @@ def check_kinds(settings: Any, prefix: str = "") -> None:
             raise ConfigurationError(f"{prefix}{name} must be {wanted}, got {value!r}")
 
 
-_KINDS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a text", bool: "true or false"}
+_KINDS: dict[Any, str] = {float: "a number", int: "a whole number", str: "a string", bool: "true or false"}
 _ABSTRACT: dict[Any, type] = {float: Real, int: Integral}
 """Abstract types of numbers, which NumPy's numbers match too."""
 
@@ -278,7 +278,7 @@ def tables() -> Converter:
         (float, _finite),
         (Unlimited, _limitless),
         (bool, _exactly(bool, "true or false")),
-        (str, _exactly(str, "a text")),
+        (str, _exactly(str, "a string")),
     ):
         converter.register_structure_hook(kind, hook)
     return converter
@@ -292,7 +292,7 @@ def json_data() -> Converter:
     converter = tables()
     for kind in (float, Unlimited):
         converter.register_structure_hook(kind, lambda value, hint: _number(math.inf if value == "inf" else value, hint))
-    converter.register_structure_hook_func(_made_of(Literal), _exactly(str, "a text"))
+    converter.register_structure_hook_func(_made_of(Literal), _exactly(str, "a string"))
     return converter
 
 
@@ -310,7 +310,7 @@ def texts() -> Converter:
 
     converter = Converter()
     converter.register_structure_hook_factory(_made_of(tuple), _numbers_hook)
-    converter.register_structure_hook_func(_made_of(Literal), parsed(str, "a text"))
+    converter.register_structure_hook_func(_made_of(Literal), parsed(str, "a string"))
     converter.register_structure_hook_func(is_dataclass, _refuse_whole)
     for kind, hook in (
         (int, parsed(int, "int")),

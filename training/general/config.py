@@ -162,8 +162,8 @@ class GeneralConfig:
             read_team(name)
         if (self.learner == "distilled") != bool(self.teachers):
             raise ConfigurationError(
-                f"the learner distilled, and no other, has teachers: got learner {self.learner} with {len(self.teachers)} "
-                "teachers; set learner=distilled teachers=FILE,FILE"
+                f"the learner distilled needs teachers, and no other learner has any; got learner {self.learner} with "
+                f"{len(self.teachers)} teachers; set learner=distilled teachers=FILE,FILE"
             )
 
 

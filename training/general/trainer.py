@@ -93,10 +93,12 @@ class GeneralTrainer:
                 was trained under another composition.
         """
         if len(policy.network.weights[0]) > 1:
-            raise ConfigurationError(f"checkpoint {self.config.start} is a mean of several networks; a run begins with one")
+            raise ConfigurationError(f"checkpoint {self.config.start} is a mean of several networks; a run must start from one")
         found = tuple(bias.shape[2] for bias in policy.network.biases[:-1])
         if found != self.config.hidden:
-            raise ConfigurationError(f"checkpoint {self.config.start} has hidden layers {found}, the run {self.config.hidden}")
+            raise ConfigurationError(
+                f"checkpoint {self.config.start} has hidden layers {found}, but the run has {self.config.hidden}"
+            )
         orders_for(policy, self.squads[0].scenario)
         learner = self.learner
         arrays = (*policy.network.weights, *policy.network.biases)

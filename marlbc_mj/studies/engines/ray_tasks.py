@@ -47,7 +47,7 @@ class RayTasks:
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None:
-            raise ConfigurationError("jobs that save themselves run on this machine only; leave out --engine ray")
+            raise ConfigurationError("jobs that save their own progress run on this machine only; leave out --engine ray")
         with nullcontext() if os.environ.get(ADDRESS) else _guarded(), self._connected():
             yield from self._finished(work, tasks)
 
@@ -76,9 +76,9 @@ class RayTasks:
         try:
             found: Outcome = pickle.loads(self.ray.get(reference))  # unpickled here, so that arrays are writable
         except (exceptions.RayTaskError, exceptions.RaySystemError) as error:
-            raise SimulationError(f"a task of Ray failed: {one_line(str(error)[-300:])}") from error
+            raise SimulationError(f"a Ray task failed: {one_line(str(error)[-300:])}") from error
         except exceptions.RayError as error:
-            said = f"a worker of Ray died {MOST_TRIES} times on the same job"
+            said = f"a Ray worker died {MOST_TRIES} times on the same job"
             raise SimulationError(f"{said}: {one_line(str(error)[:300])}") from error
         return found
 
@@ -98,7 +98,7 @@ class RayTasks:
         try:
             ray.init(**where, log_to_driver=False, logging_level="ERROR", configure_logging=False)
         except Exception as error:
-            raise ConfigurationError(f"no Ray at {address or 'this machine'}: {one_line(error)}") from error
+            raise ConfigurationError(f"cannot use Ray at {address or 'this machine'}: {one_line(error)}") from error
         try:
             if before is not None:
                 signal.signal(signal.SIGTERM, before)

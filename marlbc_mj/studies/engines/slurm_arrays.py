@@ -72,12 +72,12 @@ class SlurmArray:
         except ImportError as error:
             raise ConfigurationError("the engine slurm needs submitit: pip install 'marlbc-mj[slurm]'") from error
         if cluster == "slurm" and shutil.which("sbatch") is None:
-            raise ConfigurationError("no SLURM here: there is no command sbatch")
+            raise ConfigurationError("SLURM is not available here: the command sbatch was not found")
         self._jobs: list[Any] = []  # submitit jobs of the last array
 
     def map(self, work: Work[JobT, ResultT], tasks: Sequence[Task], ears: EngineCallbacks) -> Generator[tuple[int, ResultT]]:
         if ears.stop is not None or work.scratch is None:
-            raise ConfigurationError("the engine slurm needs an output folder, and jobs that do not save themselves")
+            raise ConfigurationError("the engine slurm needs an output folder and cannot run jobs that save their own progress")
         with writing(work.scratch):
             (work.scratch / _LOGS).mkdir(parents=True, exist_ok=True)
         self._cancel(work.scratch)
@@ -96,7 +96,7 @@ class SlurmArray:
             if not array.left:
                 return
             if tries:
-                ears.retried(f"tasks of SLURM ended without {len(array.left)} of their results")
+                ears.retried(f"SLURM tasks ended with {len(array.left)} results missing")
             jobs = self._submit(work, list(array.left.values()), work.scratch, tries)
             looked = monotonic()
             while array.left:
@@ -108,7 +108,7 @@ class SlurmArray:
                         break
                 sleep(RESULTS_EVERY)
         if array.left:
-            raise SimulationError(f"tasks of SLURM ended {MOST_TRIES} times without their results{_last_words(work.scratch)}")
+            raise SimulationError(f"SLURM tasks ended {MOST_TRIES} times without all results{_last_words(work.scratch)}")
 
     def _submit(self, work: Work[Any, Any], tasks: list[Task], scratch: Path | None, tries: int) -> list[Any]:
         assert scratch is not None

@@ -146,7 +146,7 @@ def read_study(folder: Path) -> tuple[list[CsvLine], list[CsvLine]]:
             raise unknown("variant", line["variant"], VARIANTS)
         texts = [text for key, text in line.items() if key not in ("variant", "failure")]
         if not all(_is_number(part) for text in texts for part in text.split("/") if part):
-            raise ConfigurationError(f"a line of {folder} is not a record of a study: {', '.join(line.values())}")
+            raise ConfigurationError(f"a line in {folder} is not a record of a learner study: {', '.join(line.values())}")
     return rows, curves
 
 

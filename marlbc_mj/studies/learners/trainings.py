@@ -114,7 +114,7 @@ def compare_learners(rows: Sequence[CsvLine], curves: Sequence[CsvLine], folder:
     """Write the table and the figure, which are made from the lines of the CSV files alone."""
     write_comparison(folder, rows, curves)
     table = to_markdown(learners_table(rows))
-    return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show it all", list(rows))
+    return Report(f"{table}\n{folder / 'study.md'} and {folder / 'curves.pdf'} show all results", list(rows))
 
 
 def train_learners(study: LearnerStudy, workers: int, progress: Progress = silent) -> int:
@@ -163,7 +163,7 @@ def train_job(job: TrainingJob, watch: Watch) -> TrainingEnd:
         raise Stopped
     begun = training.resumable(job.folder)
     (job.folder / FAILED_MARK).unlink(missing_ok=True)
-    watch.progress(f"{job.key}: {'goes on' if begun else 'begins'}", 0, job.config.budget)
+    watch.progress(f"{job.key}: {'resumes' if begun else 'begins'}", 0, job.config.budget)
     observe = _observer(job, watch)
     try:
         if begun:

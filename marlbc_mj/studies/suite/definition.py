@@ -247,6 +247,6 @@ def check_frozen(tracks: Sequence[str]) -> None:
     for name in tracks:
         if track_hash(name) != FROZEN[name]:
             raise ConfigurationError(
-                f"track {name} of suite {VERSION} is {FROZEN[name][:12]}, but this code's missions make {track_hash(name)[:12]}: "
-                "a default has changed; restore it, or give the suite another version"
+                f"track {name} of suite {VERSION} has hash {FROZEN[name][:12]}, but this code's missions have "
+                f"{track_hash(name)[:12]}: a default has changed; restore it, or give the suite another version"
             )

@@ -93,10 +93,10 @@ def read_suite(folder: Path) -> SuiteResults:
     if missing:
         raise ConfigurationError(f"{path} lacks {', '.join(missing)}")
     if form != FORM:
-        raise ConfigurationError(f"{path} has form {form}, this code reads form {FORM}")
+        raise ConfigurationError(f"{path} has format {form}, but this code reads format {FORM}")
     if (version, found) != (VERSION, suite_hash()):
         raise ConfigurationError(
-            f"{path} is of suite {version} {str(found)[:12]}, this code's is {VERSION} {suite_hash()[:12]}: not comparable"
+            f"{path} belongs to suite {version} {str(found)[:12]}, this code has {VERSION} {suite_hash()[:12]}: not comparable"
         )
     groups = [each for track in tracks if track in TRACKS for each in read_layout_rows(folder / f"{track}.csv", track)]
     return SuiteResults(content, tuple(groups))

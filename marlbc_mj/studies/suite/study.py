@@ -68,7 +68,7 @@ class SuiteStudy:
 def _other_code_versions(results: SuiteResults) -> list[str]:
     """One line for every other version of the code that made some of the results."""
     codes = dict.fromkeys(str(facts["code"]) for facts in (results.facts, *results.facts.get("beside", ())))
-    return [f"rows are of other code ({code}) than this ({code_version()})" for code in codes if code != code_version()]
+    return [f"some rows come from other code ({code}) than this ({code_version()})" for code in codes if code != code_version()]
 
 
 def track_summaries() -> dict[str, str]:
