@@ -84,7 +84,7 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
     copy = results.parent / "copy"
     main(["bench", "paper", "--out", str(copy), *quick, *SHORT])
     said = capsys.readouterr()
-    assert "1/1  Schedule + Saturated PD: return " in said.err and f"{copy}/.jobs/so_far/index.html grows" in said.err
+    assert "1/1  Schedule + Saturated PD: return " in said.err and f"{copy}/.jobs/so_far/index.html is updated" in said.err
     assert "Saturated PD" in said.out and "scripted" not in said.out
     main(["bench", "paper", "--out", str(copy), *quick, *SHORT, "--overwrite", "--quiet"])
     assert capsys.readouterr() == ("", "")

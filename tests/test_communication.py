@@ -237,7 +237,7 @@ def test_what_cannot_be_is_refused_in_one_line(settings, fragment):
 def test_a_range_that_leaves_two_parts_names_them():
     scenario = make_scenario("open", formation="line", agents=5)
     starts = [*scenario.starts[:3], (0.0, 90.0), (0.0, 96.0)]
-    with pytest.raises(ConfigurationError, match=r"in 2 parts at the start: agents 1, 2, 3 \| 4, 5"):
+    with pytest.raises(ConfigurationError, match=r"into 2 parts at the start: agents 1, 2, 3 \| 4, 5"):
         replace(scenario, starts=tuple(starts), communication=Communication(range=7.0))
 
 

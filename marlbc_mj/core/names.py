@@ -49,10 +49,10 @@ class Names:
     def _check(self) -> None:
         for name in self.names:
             if not name.isidentifier():
-                raise ConfigurationError(f"{name!r} cannot be the name of a gain or state: it is not an identifier")
+                raise ConfigurationError(f"{name!r} cannot name a gain or a state of a law: it is not an identifier")
             if hasattr(np.record, name) or hasattr(np.recarray, name):
                 raise ConfigurationError(
-                    f"{name!r} cannot be the name of a gain or state: NumPy's records have an attribute of that name"
+                    f"{name!r} cannot name a gain or a state of a law: NumPy's records have an attribute of that name"
                 )
             if self.names.count(name) > 1:
                 raise ConfigurationError(f"{name!r} is declared twice by a law")
