@@ -69,7 +69,7 @@ class Replay:
 
 @laws.controller
 def faulty(params, state, p, v, p_r, v_r, drag, h, force_out):
-    """Zero force; if ``params[0]`` is 1 and x > ``params[3]``, force ``params[2]`` from call number ``params[1]`` on."""
+    """Zero force until it breaks. ``params``: 1 if it may break, first call that breaks, force then, x that must be exceeded."""
     broken = params[0] == 1.0 and state[0] >= params[1] and p[0] > params[3]
     force_out[0] = params[2] if broken else 0.0
     force_out[1] = 0.0
@@ -118,7 +118,7 @@ class Pulse:
 
 @laws.behavior
 def line_following(params, p, path, obstacles, team, agent, velocity_out, jacobian_out):
-    """Stay at height ``params[1]``: rho = p_2, J = (0, 1), gain ``params[0]``."""
+    """Stay at a height: rho = p_2, J = (0, 1). ``params``: gain, height."""
     velocity_out[0] = 0.0
     velocity_out[1] = params[0] * (params[1] - p[1])
     jacobian_out[0, 0] = 0.0

@@ -187,7 +187,7 @@ def test_a_mask_chooses_the_worlds_that_begin_anew():
     other, _ = vector.reset(options={"reset_mask": ~mask})
     assert (other[mask] == begun[mask]).all() and (other[~mask] != begun[~mask]).any(axis=1).all()
     ends = [vector.step(actions)[2] for _ in range(20)]
-    assert (ends[19] == True).all() and not np.any(ends[:19])  # noqa: E712  # all worlds had the same time left
+    assert np.array_equal(ends[19], [True] * vector.num_envs) and not np.any(ends[:19])  # all worlds had the same time left
 
 
 def test_a_list_has_a_seed_for_every_world():

@@ -98,13 +98,13 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     assert (orders == greedy(expected, last, fresh, policy.margin)).mean() > 0.999
 
 
-@pytest.mark.parametrize("flown", [{"dwell": 1, "deadline": 0.0}, {"dwell": 3, "deadline": 1.0}])
-def test_the_general_policy_is_exported_as_it_decides(flown, tmp_path):
+@pytest.mark.parametrize(("flown", "networks"), [({"dwell": 1, "deadline": 0.0}, 1), ({"dwell": 3, "deadline": 1.0}, 5)])
+def test_the_general_policy_is_exported_as_it_decides(flown, networks, tmp_path):
     """One graph for every team size, of one network and of a mean; some agents have not heard others, some are alone."""
     policy = read_general(shipped("marlms-general"))[0]._replace(**flown)
-    if policy.dwell == 1:
-        weights, biases = ([layer[:1] for layer in layers] for layers in (policy.network.weights, policy.network.biases))
-        policy = policy._replace(network=policy.network._replace(weights=tuple(weights), biases=tuple(biases)))
+    network = policy.network
+    weights, biases = (tuple(layer[:networks] for layer in layers) for layers in (network.weights, network.biases))
+    policy = policy._replace(network=network._replace(weights=weights, biases=biases))
     checkpoint, out, rng = tmp_path / "agent.safetensors", tmp_path / "agent.onnx", np.random.default_rng(3)
     write_general(checkpoint, policy, {})
     main(["export", str(checkpoint), str(out)])

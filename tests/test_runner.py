@@ -56,7 +56,9 @@ def test_results_are_in_the_order_of_the_jobs(workers: int) -> None:
 @WORKERS
 def test_a_study_leaves_its_folder_whole(workers: int, tmp_path: Path) -> None:
     """It holds the report and the jobs' files; after a failure only finished jobs, from which the study can resume."""
-    done = run_study(Squares(), tmp_path / "out", workers=workers)
+    told: list[tuple[str, float, float]] = []
+    done = run_study(Squares(), tmp_path / "out", workers=workers, progress=lambda *step: told.append(step))
+    assert [step[1:] for step in told if step[0] == "jobs"] == [(k, 4) for k in range(5)]
     assert done.results == [0, 1, 4, 9] and done.report == Report("sum 14", ("no picture",))
     assert {path.name for path in (tmp_path / "out").iterdir()} == {MANIFEST, "sum.txt", *(f"{k}.txt" for k in range(4))}
     with pytest.raises(SimulationError, match="it fell"):

@@ -1,6 +1,5 @@
 """``marlbc bench``, ``run``, ``evaluate`` and ``safety``."""
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -91,8 +90,7 @@ class BenchCommand:
             counted = _Counted(len(config.methods), told.line)
             results, problems = run_bench(scenario, config, self.out, progress=told.progress, ended=counted.tell)
         self.output.report(lambda: print_results(results), summary(results, scenario.name, versions()))
-        for problem in problems:
-            print(f"marlbc: {problem}", file=sys.stderr)
+        self.output.complain(problems)
 
     def _run_draws(self) -> None:
         """Run every method on the same draws."""

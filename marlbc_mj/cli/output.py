@@ -2,7 +2,7 @@
 
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
@@ -28,6 +28,11 @@ class OutputOptions:
         if self.talks:
             for line in lines:
                 print(line)
+
+    def complain(self, problems: Iterable[str]) -> None:
+        """Print what could not be made, one line per problem on standard error, also if the command is quiet."""
+        for problem in problems:
+            print(f"marlbc: {problem}", file=sys.stderr)
 
     @contextmanager
     def progress(self, *, ends: bool = True) -> Iterator[Told]:

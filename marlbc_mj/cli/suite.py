@@ -17,7 +17,6 @@ from marlbc_mj.cli.choices import (
 )
 from marlbc_mj.cli.output import ReportOptions
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.progress import note
 
 if TYPE_CHECKING:
     from marlbc_mj.studies.suite.study import SuiteStudy
@@ -81,8 +80,7 @@ class SuiteCommand:
                 ended=ended,
             )
         self.output.report(done.report.text, done.report.document)
-        for problem in done.report.problems:
-            note(problem)
+        self.output.complain(done.report.problems)
         self.output.say(f"{self.out / LEADERBOARD_PAGE} shows all results")
 
     def study(self) -> "SuiteStudy":

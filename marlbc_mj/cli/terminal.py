@@ -93,24 +93,21 @@ def seldom(every: float = SELDOM, *, ends: bool = True) -> Progress:
         every: least time between two lines on running stages [s].
         ends: whether to print a line when a stage ends.
     """
-    began: dict[str, tuple[float, float]] = {}
-    reached: dict[str, float] = {}
-    ended: set[str] = set()
+    stages: dict[str, tuple[float, float, float]] = {}  # when each began, how much was done then, and how much at the last call
     last = monotonic()
 
     def tell(what: str, done: float, total: float) -> None:
         nonlocal last
         now = monotonic()
-        if done < reached.get(what, done):
-            began.pop(what)
-            ended.discard(what)
-        reached[what] = done
-        start, before = began.setdefault(what, (now, done))
-        if ends and total > 1 and done >= total and what not in ended:
-            ended.add(what)
-            print(f"{display_key(what)}: {done:g} of {total:g} in {now - start:.1f} s", file=sys.stderr, flush=True)
+        start, before, reached = stages.get(what, (now, done, -1.0))
+        if done < reached:
+            start, before, reached = now, done, -1.0
+        stages[what] = start, before, done
+        if ends and total > 1 and done >= total:
+            if reached < total:
+                print(f"{display_key(what)}: {done:g} of {total:g} in {now - start:.1f} s", file=sys.stderr, flush=True)
             return
-        if now < last + every or done <= before or what in ended:
+        if now < last + every or done <= before:
             return
         last = now
         rate = (done - before) / (now - start)

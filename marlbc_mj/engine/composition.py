@@ -1,6 +1,6 @@
 """From a priority order to a reference velocity: behaviors are evaluated in turn, composed and limited.
 
-There are two compositions: null-space (12), :func:`compose`, to which errata 5 and 6 apply, and set-based,
+There are two compositions: null-space (12), :func:`compose`, to which erratum 5 and erratum 6 apply, and set-based,
 :func:`compose_set_based`, in which avoidance is an inequality. The engine, the predictions of supervisors and the older
 frameworks all use :func:`compose_team`.
 """

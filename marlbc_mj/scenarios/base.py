@@ -28,7 +28,7 @@ MOST_BEHAVIORS = 6  # 6 behaviors have 720 orders, still few enough for a table
 REFERENCE_MODES = ("virtual", "actual")
 COMPOSITIONS = ("null-space", "set-based")
 """Null-space composition treats avoidance as an equality task (12), set-based composition as an inequality."""
-ADDED_LATER = {"young": True}
+ADDED_LATER = {"added_later": True}
 """Metadata of a field added later: at its default it changes nothing and is left out of hashes, so old hashes stay valid."""
 
 
@@ -179,6 +179,11 @@ class Scenario:
     def least_acceleration(self) -> float:
         """Largest acceleration per axis of the weakest agent [m/s^2]."""
         return float((self.force_limits / (self.fleet.masses(self.mass) if self.robots else self.mass)).min())
+
+    @property
+    def unhashed(self) -> set[str]:
+        """Names of the fields that hashes leave out: those of :data:`ADDED_LATER` that have their defaults."""
+        return {each.name for each in fields(self) if each.metadata == ADDED_LATER and getattr(self, each.name) == each.default}
 
     @property
     def mission_steps(self) -> int:

@@ -11,7 +11,7 @@ of its segments' scores.
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from itertools import pairwise
 from pathlib import Path
@@ -25,7 +25,6 @@ from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.world import World
 from marlbc_mj.scenarios import Perturbation, Scenario, Window
-from marlbc_mj.scenarios.base import ADDED_LATER
 from marlbc_mj.supervisors.scripted import Schedule, Scripted, orders_at
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import write_json
@@ -67,10 +66,8 @@ def shipped_schedules() -> Path:
 def cache_key(scenario: Scenario, controller: Controller) -> str:
     """Hash of everything that affects a schedule's return, without names, descriptions and the scripted schedule."""
     bare = plain_data(replace(scenario, name="", description="", schedule=()))
-    for field in fields(scenario):
-        if field.metadata == ADDED_LATER and getattr(scenario, field.name) == field.default:
-            del bare[field.name]
-    return config_hash({"scenario": bare, "controller": controller})
+    hashed = {name: value for name, value in bare.items() if name not in scenario.unhashed}
+    return config_hash({"scenario": hashed, "controller": controller})
 
 
 def read_cache(path: Path) -> dict[str, Any]:

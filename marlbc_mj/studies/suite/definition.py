@@ -16,7 +16,6 @@ from marlbc_mj.core.disturbances import LinearDrag
 from marlbc_mj.results.seeds import seed_range
 from marlbc_mj.robots import make_robot
 from marlbc_mj.scenarios import Perturbation, Scenario, held_out, make_scenario, standard_behaviors
-from marlbc_mj.scenarios.base import ADDED_LATER
 from marlbc_mj.scenarios.robot_gate import AIR_DRAG
 from marlbc_mj.scenarios.teams import team_mission
 from marlbc_mj.studies.draws import CASE_STUDY_PERTURBATION
@@ -228,8 +227,7 @@ def _digest(content: Any) -> str:
 
 def _canonical(scenario: Scenario) -> Any:
     """A scenario as rounded data, without its description and without later fields that have their defaults."""
-    young = {f.name: f.default for f in scenario.__dataclass_fields__.values() if f.metadata == ADDED_LATER}
-    left_out = {name for name, default in young.items() if getattr(scenario, name) == default} | {"description"}
+    left_out = scenario.unhashed | {"description"}
     data = {name: getattr(scenario, name) for name in scenario.__dataclass_fields__ if name not in left_out}
     return _round(plain_data(data))
 

@@ -15,7 +15,7 @@ from marlbc_mj.studies.suite.definition import TRACKS, SuiteMission
 from marlbc_mj.studies.suite.entries import Choice
 from marlbc_mj.studies.suite.files import SuiteResults, describe_suite, merge, read_suite, write_suite
 from marlbc_mj.studies.suite.flights import SuiteJob, fly_layouts, suite_jobs
-from marlbc_mj.util.progress import Progress, silent
+from marlbc_mj.util.progress import Progress, note, silent
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,9 @@ class SuiteStudy:
         tables = write_leaderboard(gathered.groups, gathered.facts, track_summaries(), out)
         document = {"facts": gathered.facts, "tables": list(map(table_document, tables))}
         text = "\n".join(map(to_markdown, leading_tables(tables)))
-        return Report(text, document, (*problems, *_other_code_versions(gathered)))
+        for line in _other_code_versions(gathered):
+            note(line)
+        return Report(text, document, tuple(problems))
 
 
 def _other_code_versions(results: SuiteResults) -> list[str]:
