@@ -351,11 +351,11 @@ def test_the_paragraph_follows_the_numbers(results: list[Result]) -> None:
     sorlc = results[0]
     run = [sorlc, scaled("scripted+finite-time", sorlc, 2.0)]
     cheap = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 0.25), scaled("scripted+lqr", sorlc, 0.125, 1.7)])
-    assert "every rival is cheaper: Finite-time" in cheap and "(0.25 times)" in cheap
+    assert "every baseline is cheaper: Finite-time" in cheap and "(0.25 times)" in cheap
     assert "LQR is the floor" in cheap and "violates the safe distance for 1.70 s" in cheap
     assert "is reversed for Finite-time" in cheap
     dear = same_actuator([*run, scaled("scripted+finite-time-limited", sorlc, 1.5), scaled("scripted+lqr", sorlc, 3.0)])
-    assert "no rival is cheaper: Finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
+    assert "no baseline is cheaper: Finite-time" in dear and "LQR costs" in dear and "keeps the safe distance" in dear
     assert "reversed" not in dear and "stands" in dear
     assert same_actuator(results) == ""
 

@@ -107,12 +107,12 @@ def same_actuator(results: Sequence[Result]) -> str:
         return ""
     ours = costs["sorlc"]
     first = f"With supervisor {display_name(supervisor)} the {_count(chosen)} agents cost {grouped(ours)} with SORLC. "
-    found = first + _rivals(chosen, limited, ours) + _floor(chosen, costs, ours)
+    found = first + _compare_limited(chosen, limited, ours) + _floor(chosen, costs, ours)
     of_paper = all(r.trajectory is None or r.trajectory.scenario.name == paper_values.SCENARIO for r in chosen.values())
     return found + _conclusion(costs, limited, ours) if of_paper else found.rstrip()
 
 
-def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
+def _compare_limited(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: float) -> str:
     """Sentences on which baselines are cheaper than SORLC with the same actuator, and which are not."""
     limit = next(iter(chosen.values())).trajectory
     force = "same actuator" if limit is None else f"same actuator of {limit.scenario.force_limit:g} N"
@@ -120,8 +120,8 @@ def _rivals(chosen: Mapping[str, Result], limited: Mapping[str, float], ours: fl
     cheaper = [said[name] for name, cost in limited.items() if cost < ours]
     costlier = [said[name] for name, cost in limited.items() if cost >= ours]
     if not cheaper:
-        return f"Given the {force}, no rival is cheaper: {listed(costlier)}. "
-    which = "every rival is" if not costlier else f"{len(cheaper)} of {len(limited)} rivals are"
+        return f"Given the {force}, no baseline is cheaper: {listed(costlier)}. "
+    which = "every baseline is" if not costlier else f"{len(cheaper)} of {len(limited)} baselines are"
     text = f"Given the {force}, {which} cheaper: {listed(cheaper)}. "
     return text + (f"Not cheaper: {listed(costlier)}. " if costlier else "")
 
@@ -139,9 +139,9 @@ def _floor(chosen: Mapping[str, Result], costs: Mapping[str, float], ours: float
 
 def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: float) -> str:
     """Sentences on whether the published conclusion still holds for the published baselines."""
-    rivals = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
-    reversed_for = [name for name in rivals if limited[name] < ours < costs[name]]
-    before = [name for name in rivals if limited[name] < ours and costs[name] <= ours]
+    baselines = [name for name in paper_values.PAPER_CONTROLLERS if name in costs and name in limited]
+    reversed_for = [name for name in baselines if limited[name] < ours < costs[name]]
+    before = [name for name in baselines if limited[name] < ours and costs[name] <= ours]
     text = ""
     if reversed_for:
         text = f"The published conclusion that SORLC costs less is reversed for {listed(list(map(display_name, reversed_for)))}: "
@@ -149,7 +149,7 @@ def _conclusion(costs: Mapping[str, float], limited: Mapping[str, float], ours: 
     if before:
         cheaper = listed(list(map(display_name, before)))
         text += f"{cheaper}, summed over agents, {'costs' if len(before) == 1 else 'cost'} less even without one. "
-    if not text and rivals:
+    if not text and baselines:
         text = "The published conclusion that SORLC costs less stands. "
     return text.strip()
 

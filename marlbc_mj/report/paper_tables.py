@@ -212,7 +212,7 @@ def _table(name: str, caption: str, kind: str, comparison: _Comparison, notes: S
     if second:
         rules.append(len(rows))
         rows += comparison.block(second)
-        notes = (*notes, "Last block: the same rivals with SORLC's actuator limit, and LQR, which stays below it.")
+        notes = (*notes, "Last block: the same baselines with SORLC's actuator limit, and LQR, which stays below it.")
     columns = (Column("", kind), *comparison.columns())
     return Table(name, caption, columns, tuple(rows), (*notes, *comparison.notes()), tuple(rules))
 
