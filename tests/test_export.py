@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from test_general import random_policy as random_general
 
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
-from marlbc_mj.policies.general import Sensed, read_general, write_general
-from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, WAYS, join_inputs
+from marlbc_mj.policies.general import Sensed, lead_of_column, mean_policy, write_general
+from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.policies.shipped import shipped
 from marlbc_mj.policies.states import make_state
@@ -98,13 +99,17 @@ def test_a_shipped_policy_is_exported_as_it_flies(name, tmp_path):
     assert (orders == greedy(expected, last, fresh, policy.margin)).mean() > 0.999
 
 
-@pytest.mark.parametrize(("flown", "networks"), [({"dwell": 1, "deadline": 0.0}, 1), ({"dwell": 3, "deadline": 1.0}, 5)])
-def test_the_general_policy_is_exported_as_it_decides(flown, networks, tmp_path):
+@pytest.mark.parametrize(
+    ("flown", "networks", "actions"),
+    [
+        ({"dwell": 1, "consensus": False}, 1, 2),
+        ({"dwell": 3, "deadline": 1.0, "consensus": True}, 5, 2),
+        ({"consensus": True}, 2, 4),
+    ],
+)
+def test_the_general_policy_is_exported_as_it_decides(flown, networks, actions, tmp_path):
     """One graph for every team size, of one network and of a mean; some agents have not heard others, some are alone."""
-    policy = read_general(shipped("marlms-general"))[0]._replace(**flown)
-    network = policy.network
-    weights, biases = (tuple(layer[:networks] for layer in layers) for layers in (network.weights, network.biases))
-    policy = policy._replace(network=network._replace(weights=weights, biases=biases))
+    policy = mean_policy([random_general(k, actions=actions) for k in range(networks)], 0.1)._replace(**flown)
     checkpoint, out, rng = tmp_path / "agent.safetensors", tmp_path / "agent.onnx", np.random.default_rng(3)
     write_general(checkpoint, policy, {})
     main(["export", str(checkpoint), str(out)])
@@ -115,18 +120,23 @@ def test_the_general_policy_is_exported_as_it_decides(flown, networks, tmp_path)
         features[..., WAYS:] = rng.uniform(0.0, 1.0, size=features[..., WAYS:].shape)
         heard = rng.normal(size=(teams, agents, agents, SENT)).astype(np.float32)
         age = np.where(rng.random((teams, agents, agents)) < 0.3, np.inf, rng.uniform(0.0, 5.0, (teams, agents, agents)))
-        last, fresh = rng.integers(2, size=(teams, agents)), np.arange(teams) % 2 == 1
-        rows = teams * agents
+        last, fresh = rng.integers(actions, size=(teams, agents)), np.arange(teams) % 2 == 1
+        rows, itself = teams * agents, np.eye(agents, dtype=bool)
+        leads, lead_age = 9.0 * rng.normal(size=age.shape).astype(np.float32), rng.uniform(0.0, 2.0, age.shape).astype(np.float32)
         given = {
             "features": features.reshape(rows, -1),
             "heard": heard.reshape(rows, agents, -1),
             "age": age.reshape(rows, agents).astype(np.float32),
+            "lead": leads.reshape(rows, agents),
+            "lead_age": np.where(itself, np.inf, lead_age).astype(np.float32).reshape(rows, agents),
             "last": np.where(fresh[:, None], -1, last).reshape(rows),
         }
-        values, action = session.run(["values", "action"], given)
-        expected = policy.values(join_inputs(features, heard, age).reshape(rows, -1))
-        np.testing.assert_allclose(values, expected, rtol=1e-4, atol=1e-4)
-        decided = policy.decide(Sensed(features, last, fresh), heard, age)
+        values, own, action = session.run(["values", "own_lead", "action"], given)
+        expected = policy.evaluate(features, heard, age)
+        np.testing.assert_allclose(values, expected.reshape(rows, -1), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(own, lead_of_column(expected).reshape(rows), rtol=1e-4, atol=1e-3)
+        known = np.where(itself, lead_of_column(expected)[:, :, None], leads).astype(np.float32)
+        decided = policy.decide(Sensed(features, last, fresh), expected, known, np.where(itself, 0.0, lead_age))
         np.testing.assert_array_equal(action.reshape(teams, agents), decided)
 
 

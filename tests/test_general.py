@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from marlbc_mj import World, make_scenario, paper
 from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.core.communication import Communication
+from marlbc_mj.policies import general
 from marlbc_mj.policies import general_inputs as inputs
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general import (
     GeneralPolicy,
     Sensed,
+    lead_of_column,
     make_general,
     mean_policy,
     must_return,
@@ -45,6 +47,12 @@ def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
     return make_general((weights[0], weight, weights[1]), (biases[0], biases[0], biases[1]), 0.0)
 
 
+def decide(policy: GeneralPolicy, now: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+    """Actions of agents that hear features and leads of the same agents."""
+    values = policy.evaluate(now.features, heard, age)
+    return policy.decide(now, values, np.repeat(lead_of_column(values)[:, None], age.shape[1], axis=1), age)
+
+
 def field(**changes):
     return make_scenario("field", composition="set-based", **changes)
 
@@ -53,11 +61,52 @@ def test_isolated_agent_ignores_messages() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(1, 3, inputs.FEATURES)).astype(np.float32)
     age = np.where(np.eye(3, dtype=bool), 0.0, np.inf)[None]
-    policy, now = random_policy(), Sensed(features, np.zeros((1, 3), np.int64), np.array([True]))
+    policy, now = random_policy(consensus=True), Sensed(features, np.zeros((1, 3), np.int64), np.array([True]))
     heard = np.repeat(features[:, None, :, : inputs.SENT], 3, axis=1)
-    alone = policy.decide(now, heard, age)
+    alone = decide(policy, now, heard, age)
     heard[:, 0, 1:], heard[:, 1, ::2], heard[:, 2, :2] = 7.0, -7.0, 3.0
-    np.testing.assert_array_equal(policy.decide(now, heard, age), alone)
+    np.testing.assert_array_equal(decide(policy, now, heard, age), alone)
+
+
+def test_only_fresh_leads_count() -> None:
+    leads, interval = np.float32([[[1.0, 2.0, 6.0], [1.0, 2.0, 6.0]]]), general.INTERVAL
+    age = np.array([[[0.0, interval, np.inf], [interval + 1e-6, 0.1, 0.0]]])
+    np.testing.assert_array_equal(general.mean_lead(leads, age), np.float32([[1.5, 4.0]]))
+    np.testing.assert_array_equal(general.mean_lead(leads[:, :1], np.zeros((1, 1, 3))), [[3.0]])
+
+
+@pytest.mark.parametrize("actions", [2, 4])
+def test_a_lead_moves_the_column_against_the_formation(actions: int) -> None:
+    """The values get the wanted lead; actions with the same motion keep their distances."""
+    rng = np.random.default_rng(0)
+    values, lead = rng.normal(size=(3, 5, actions)).astype(np.float32), rng.normal(size=(3, 5)).astype(np.float32)
+    moved = general.with_lead(values, lead)
+    np.testing.assert_array_equal(lead_of_column(moved), lead)
+    for motion in (0, 1):
+        own, other = values[..., motion::2], moved[..., motion::2]
+        np.testing.assert_allclose(other - other[..., :1], own - own[..., :1], atol=1e-6)
+    np.testing.assert_array_equal(lead_of_column(values), values[..., 1::2].max(axis=-1) - values[..., 0::2].max(axis=-1))
+
+
+@pytest.mark.parametrize("actions", [2, 4])
+def test_agents_that_hear_each_other_take_the_motion_with_the_greatest_sum(actions: int) -> None:
+    """It is the one with the greatest sum of the agents' values; two groups that do not hear each other decide apart."""
+    rng, policy = np.random.default_rng(3), random_policy(2, actions=actions, consensus=True)
+    features = rng.normal(size=(40, 5, inputs.FEATURES)).astype(np.float32)
+    features[..., inputs.WAYS :] = rng.uniform(size=features[..., inputs.WAYS :].shape)
+    now = Sensed(features, np.zeros((40, 5), np.int64), np.ones(40, dtype=bool))
+    group = np.array([0, 0, 0, 1, 1])
+    apart = np.where(group[:, None] == group, 0.0, np.inf)[None].repeat(40, 0)
+    heard, motions = features[:, None, :, : inputs.SENT].repeat(5, 1), set()
+    for age in (np.zeros((40, 5, 5)), apart):
+        best = policy.evaluate(features, heard, age).astype(float)
+        totals = np.stack([best[..., motion::2].max(axis=-1) for motion in (0, 1)], axis=-1)
+        chosen = decide(policy, now, heard, age) % 2
+        for members in [group == 0, group == 1] if age is apart else [group >= 0]:
+            wanted = totals[:, members].sum(axis=1).argmax(axis=-1)
+            np.testing.assert_array_equal(chosen[:, members], wanted[:, None].repeat(members.sum(), 1))
+        motions |= set(chosen.ravel().tolist())
+    assert motions == {0, 1}
 
 
 @pytest.mark.parametrize("dwell", [1, 2, 4])
@@ -104,7 +153,7 @@ def test_the_deadline_brings_everybody_into_formation(actions: int) -> None:
     features[10:, :, inputs.ENDING + 1], features[:10, :, inputs.ENDING + 1] = 1.0, 1e-3
     now = Sensed(features, np.zeros((20, 4), np.int64), np.ones(20, dtype=bool))
     heard, age = features[:, None, :, : inputs.SENT], np.zeros((20, 1, 4))
-    free, bound = (random_policy(1, actions=actions, deadline=d).decide(now, heard, age) for d in (0.0, 1.0))
+    free, bound = (decide(random_policy(1, actions=actions, deadline=d), now, heard, age) for d in (0.0, 1.0))
     np.testing.assert_array_equal(bound[:10], free[:10])
     np.testing.assert_array_equal(bound[10:], free[10:] - free[10:] % 2)
     assert (free[10:] % 2 == 1).any()
@@ -179,12 +228,12 @@ def test_a_formation_that_is_its_own_column_is_refused() -> None:
 
 
 def test_a_checkpoint_comes_back_as_it_was(tmp_path: Path) -> None:
-    policy, path = random_policy(margin=0.25, dwell=4, deadline=0.5), tmp_path / "general.safetensors"
+    policy, path = random_policy(margin=0.25, dwell=4, deadline=0.5, consensus=True), tmp_path / "general.safetensors"
     write_general(path, policy, {"note": "x"})
     read, description = read_general(path)
     for one, other in zip(policy.network.weights, read.network.weights, strict=True):
         np.testing.assert_array_equal(one, other)
-    assert (read.network.margin, read.dwell, read.deadline, description["note"]) == (0.25, 4, 0.5, "x")
+    assert (read.network.margin, read.dwell, read.deadline, read.consensus, description["note"]) == (0.25, 4, 0.5, True, "x")
     assert isinstance(make_supervisor(str(path)), General)
     assert path.stat().st_size < 1_000_000
 
@@ -230,6 +279,8 @@ def test_the_mean_of_policies_has_the_mean_of_their_values() -> None:
         np.testing.assert_allclose(mean_policy(policies, 0.05).values(seen), mean, rtol=1e-4, atol=1e-4)
     with pytest.raises(ConfigurationError, match="at least one policy"):
         mean_policy([], 0.0)
+    with pytest.raises(ConfigurationError, match="all decide by consensus"):
+        mean_policy([random_policy(), random_policy(consensus=True)], 0.0)
     with pytest.raises(ConfigurationError, match="of the same size"):
         mean_policy([random_policy(), deep[0]], 0.0)
 
@@ -242,9 +293,9 @@ def test_the_shipped_policy_flies_what_it_never_saw() -> None:
     assert shipped("marlms-general").stat().st_size < 1_000_000
 
 
-def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
+def decisions(scenario, steps: int = 60, worlds: int = 2, consensus: bool = True) -> np.ndarray:
     """Orders (steps, B, N) of a random policy in the first mission steps."""
-    supervisor, world = General(random_policy()), World(scenario, worlds=worlds)
+    supervisor, world = General(random_policy(2, consensus=consensus)), World(scenario, worlds=worlds)
     observation, memory = world.reset(3), supervisor.start(scenario, worlds)
     taken = []
     for _ in range(steps):
@@ -254,10 +305,23 @@ def decisions(scenario, steps: int = 30, worlds: int = 2) -> np.ndarray:
     return np.stack(taken)
 
 
-def test_ideal_communication_is_the_limit_of_a_long_range() -> None:
+@pytest.mark.parametrize("consensus", [False, True])
+def test_ideal_communication_is_the_limit_of_a_long_range(consensus: bool) -> None:
     """Decisions are the same with ideal communication, which has no layer, and with a layer of very long range."""
-    ideal, carried = (field(communication=c) for c in (Communication(), Communication(range=1e6)))
-    np.testing.assert_array_equal(decisions(carried), decisions(ideal))
+    ideal, carried = (decisions(field(communication=c), consensus=consensus) for c in (Communication(), Communication(range=1e6)))
+    np.testing.assert_array_equal(carried, ideal)
+    assert (ideal == ideal[..., :1]).all() == consensus
+
+
+def test_a_team_that_cannot_hear_does_not_agree() -> None:
+    """With a silent agent the others agree among themselves; if all are silent, everybody decides alone."""
+    silent, alone, own = (
+        decisions(field(communication=Communication(silent=agents)), consensus=consensus)
+        for agents, consensus in (((0,), True), ((0, 1, 2, 3), True), ((0, 1, 2, 3), False))
+    )
+    assert (silent[..., 1:] == silent[..., 1:2]).all()
+    assert not (alone == alone[..., :1]).all()
+    np.testing.assert_array_equal(alone, own)
 
 
 @pytest.mark.parametrize("changes", [{"delay": 0.1, "loss": 0.5}, {"silent": (0,)}, {"protocol": "consensus", "range": 9.0}])

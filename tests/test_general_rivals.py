@@ -13,10 +13,11 @@ from marlbc_mj.policies.general import read_general, write_general
 from marlbc_mj.policies.general_inputs import INPUTS
 from marlbc_mj.training.general.config import GeneralConfig, learner_config
 from marlbc_mj.training.general.ppo import PPOTrainer, with_team
-from marlbc_mj.training.general.rivals import Imitation, TeamMixer, TeamReplay, TeamVDN
+from marlbc_mj.training.general.rivals import Imitation, TeamMixer, TeamQMIX, TeamReplay, TeamVDN, team_means
 from marlbc_mj.training.general.run import make_general_trainer, train_general
 from marlbc_mj.training.general.shipping import ship_general
 from marlbc_mj.training.general.trainer import GeneralTrainer
+from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.mappo import advantages
 from marlbc_mj.training.methods import PPO
 from marlbc_mj.training.replay import Batch
@@ -63,7 +64,26 @@ def test_the_values_of_a_team_are_the_mean_of_its_agents() -> None:
     ahead = torch.tensor([[[2.0, 4.0], [8.0, 6.0], [5.0, 5.0]]])
     chosen, target = learner.estimates(batch, now, ahead)
     assert chosen.tolist() == [[(1.0 + 6.0) / 2, 9.0]]
-    assert target.tolist() == [[((1.0 + 0.5 * 4.0) + (3.0 + 0.5 * 8.0)) / 2, -1.0]]
+    assert target.tolist() == [[(1.0 + 3.0) / 2 + 0.5 * (2.0 + 8.0) / 2, -1.0]]  # both in formation: (4 + 6) / 2 is the same
+    learner.consensus = False
+    assert learner.estimates(batch, now, ahead)[1].tolist() == [[(1.0 + 3.0) / 2 + 0.5 * (4.0 + 8.0) / 2, -1.0]]
+
+
+@pytest.mark.parametrize("kind", [TeamVDN, TeamQMIX])
+def test_a_target_by_consensus_is_the_better_of_the_teams_two_motions(kind: type[Learner]) -> None:
+    """With four actions every agent avoids as is best for itself; actions 0 and 2 take the formation, 1 and 3 the column."""
+    learner = kind(learner_config(SMALL), 1, 4, np.ones(INPUTS, dtype=np.float32), torch.Generator().manual_seed(0))
+    rng, team = np.random.default_rng(0), np.array([0, 0, 0, 1, 1])
+    state, one = rng.normal(size=(5, INPUTS)).astype(np.float32), np.ones((5, 1), dtype=np.float32)
+    batch = Batch(state, np.zeros((5, 1), dtype=np.int64), 0.0 * one, one, state, one, team=team)
+    ahead = torch.from_numpy(rng.normal(size=(1, 5, 4)).astype(np.float32))
+    target = learner.estimates(batch, ahead, ahead)[1][0]
+    whole = []
+    for actions in ((0, 2), (1, 3)):
+        best = ahead[..., actions].amax(dim=-1)
+        mixed = learner.target_mixer(best, torch.from_numpy(state), torch.from_numpy(team)) if kind is TeamQMIX else None
+        whole.append(team_means(best.T, torch.from_numpy(team)).T if mixed is None else mixed)
+    np.testing.assert_allclose(target.detach(), torch.stack(whole).amax(dim=0)[0].detach(), rtol=1e-6)
 
 
 def test_the_mixture_rises_with_every_agents_value_and_knows_no_order() -> None:

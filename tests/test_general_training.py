@@ -19,6 +19,7 @@ from marlbc_mj.policies.general import (
     COLUMN_ACTION,
     FORMATION,
     MOTIONS,
+    lead_of_column,
     mean_policy,
     read_general,
     write_general,
@@ -225,6 +226,36 @@ def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:
         squad = GeneralTrainer(replace(SMALL, worlds=1, composition=composition)).squads[0]
         squad.inputs, squad.bins[:] = seen, 0
         assert squad._guide().tolist() == [wanted]
+
+
+def test_agents_in_training_decide_by_the_leads_that_they_hear() -> None:
+    """A mute agent does not count for the others, but knows their leads; learners without a team's value decide alone."""
+    trainer = GeneralTrainer(SMALL)
+    squad = trainer.squads[0]
+    values = np.random.default_rng(0).normal(size=(2, 4, 2)).astype(np.float32)
+    lead = values[..., 1] - values[..., 0]
+    squad.age[:] = 0.0
+    squad.age[1, 1:, 0] = 1.0
+    found = lead_of_column(squad.agree(values))
+    np.testing.assert_allclose(found[0], lead[0].mean(), rtol=1e-5)
+    np.testing.assert_allclose(found[1], [lead[1].mean(), *[lead[1, 1:].mean()] * 3], rtol=1e-5)
+    assert trainer.policy().consensus
+    for learner, wanted in (("qmix", True), ("mappo", False), ("lenient", False), ("imitation", False)):
+        assert replace(SMALL, learner=learner).by_consensus == wanted
+    assert not GeneralTrainer(replace(SMALL, consensus=False)).policy().consensus
+
+
+def test_a_team_in_training_takes_one_motion() -> None:
+    """If nothing is explored and every message arrives; without consensus agents differ."""
+    for consensus in (True, False):
+        trainer = GeneralTrainer(replace(SMALL, consensus=consensus))
+        seen = np.random.default_rng(1).normal(scale=3.0, size=(sum(squad.rows for squad in trainer.squads), inputs.INPUTS))
+        for squad in trainer.squads:
+            squad.bins[:] = 0
+            squad.age[:] = 0.0
+            squad.explore = lambda greedy, *_: greedy
+        taken = trainer.choose(seen.astype(np.float32))
+        assert all((actions == actions[:, :1]).all() for actions in taken) == consensus
 
 
 def test_lost_messages_age() -> None:

@@ -19,6 +19,8 @@ from torch import Tensor, nn
 from marlbc_mj.policies.actions import order_of
 from marlbc_mj.policies.checkpoint import read_policy
 from marlbc_mj.policies.general import (
+    COLUMN_ACTION,
+    FORMATION,
     INTERVAL,
     MOTIONS,
     GeneralPolicy,
@@ -108,10 +110,11 @@ def _general_model(checkpoint: Path) -> tuple[Any, str]:
         "margin": repr(policy.network.margin),
         "dwell": repr(policy.dwell),
         "deadline": repr(policy.deadline),
+        "consensus": json.dumps(policy.consensus),
     }
     return build_general(policy, metadata), (
-        f"features (batch, {FEATURES}), heard (batch, agents, {SENT}), age (batch, agents) and last (batch,) give "
-        f"values (batch, {policy.actions}) and action (batch,)"
+        f"features (batch, {FEATURES}), heard (batch, agents, {SENT}), age, lead and lead_age (batch, agents) and last (batch,) "
+        f"give values (batch, {policy.actions}), own_lead (batch,) and action (batch,)"
     )
 
 
@@ -177,27 +180,38 @@ class TeamPolicy(nn.Module):
 
 class AgentPolicy(nn.Module):
     """``GeneralPolicy.decide`` of one agent as a torch module; received vectors are pooled as by
-    :func:`~marlbc_mj.policies.general_inputs.pool_heard`.
+    :func:`~marlbc_mj.policies.general_inputs.pool_heard`, leads as by :func:`~marlbc_mj.policies.general.mean_lead`.
     """
 
     def __init__(self, policy: GeneralPolicy) -> None:
         super().__init__()
         self.network, self.margin = _as_modules(policy.network), policy.network.margin
-        self.dwell, self.deadline = policy.dwell, policy.deadline
+        self.dwell, self.deadline, self.consensus = policy.dwell, policy.deadline, policy.consensus
 
-    def forward(self, features: Tensor, heard: Tensor, age: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-        """Values (B, A) and chosen actions (B,) from features (B, F), received vectors (B, N, M), their ages (B, N) and last
-        actions (B,), which are negative if there are none.
+    def forward(
+        self, features: Tensor, heard: Tensor, age: Tensor, lead: Tensor, lead_age: Tensor, last: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Values (B, A), the agent's own lead (B,) for the others, and chosen actions (B,).
+
+        The arguments are features (B, F), received vectors (B, N, M) and their ages (B, N), received leads (B, N) and their ages
+        (B, N), infinite for the agent itself, and last actions (B,), which are negative if there are none.
         """
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
         mean = values.mean(dim=0)
+        each = mean.shape[-1] // len(MOTIONS)
+        best = mean.reshape(-1, each, len(MOTIONS)).amax(dim=1)  # (B, 2) of formation and column
+        own = best[:, COLUMN_ACTION] - best[:, FORMATION]
+        counts = (lead_age <= INTERVAL).to(lead.dtype) * float(self.consensus)
+        ahead = (own + torch.where(counts > 0, lead, 0.0).sum(dim=1)) / (1.0 + counts.sum(dim=1))
+        shift = torch.stack([torch.zeros_like(ahead), ahead], dim=-1) - best
+        used = mean + shift.repeat(1, each)
         kept, fresh = last.clamp(min=0), last < 0
         free = may_change(features[..., AGE_ENTRIES], fresh, self.dwell)
-        chosen = torch.where(free, _choose(mean, kept, fresh, self.margin), kept)
+        chosen = torch.where(free, _choose(used, kept, fresh, self.margin), kept)
         if self.deadline:
             back = must_return(features[..., WAYS + 1], features[..., ENDING + 1], self.deadline)
             chosen = torch.where(back, chosen - chosen % len(MOTIONS), chosen)
-        return mean, chosen
+        return mean, own, chosen
 
 
 def pool(heard: Tensor, age: Tensor) -> Tensor:
@@ -243,11 +257,13 @@ def build_general(policy: GeneralPolicy, metadata: dict[str, str]) -> Any:
         "features": torch.zeros(2, FEATURES),
         "heard": torch.zeros(2, 3, SENT),
         "age": torch.zeros(2, 3),
+        "lead": torch.zeros(2, 3),
+        "lead_age": torch.zeros(2, 3),
         "last": torch.zeros(2, dtype=torch.int64),
     }
     batch, agents = torch.export.Dim("batch"), torch.export.Dim("agents")
-    shapes = ({0: batch}, {0: batch, 1: agents}, {0: batch, 1: agents}, {0: batch})
-    return _graph(AgentPolicy(policy), inputs, ["values", "action"], shapes, metadata)
+    shapes = ({0: batch}, *({0: batch, 1: agents} for _ in range(4)), {0: batch})
+    return _graph(AgentPolicy(policy), inputs, ["values", "own_lead", "action"], shapes, metadata)
 
 
 def _graph(module: nn.Module, inputs: dict[str, Tensor], outputs: list[str], shapes: Any, metadata: dict[str, str]) -> Any:

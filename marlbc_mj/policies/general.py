@@ -1,8 +1,12 @@
 """The general policy: one network for every agent of every team. Each agent decides between formation and column and, under the
 null-space composition, where the composition does not avoid by itself, also whether avoidance is on top.
 
-Its inputs are defined in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one feature vector to the others. It decides
-from its own features and those heard so far, of any age and from any number of agents, even none.
+Its inputs are defined in :mod:`marlbc_mj.policies.general_inputs`. An agent sends one feature vector to the others. It computes
+its action values from its own features and those heard so far, of any age and from any number of agents, even none.
+
+Agents can decide by *consensus*: each sends its *lead*, the value of the column minus that of the formation, and takes the mean
+of the leads that it knows in place of its own. Value decomposition learns the value of a team as the mean over its agents, so the
+sign of the mean lead tells which of the two the team should take. Agents that hear each other then take the same.
 """
 
 import math
@@ -43,7 +47,7 @@ _NEEDS = {
 }
 """Reasons why a policy requires its composition, for error messages."""
 INTERVAL = 1.2
-"""Time for which a decision holds, in settling times."""
+"""Time for which a decision holds, in settling times. Leads that are older do not count."""
 
 
 class Sensed(NamedTuple):
@@ -63,6 +67,7 @@ class GeneralPolicy(NamedTuple):
     network: Policy  # one or more networks with INPUTS inputs and A action values
     dwell: int = 1  # least number of decisions for which an agent keeps a new order
     deadline: float = 0.0  # time reserved for the way back to the formation, per distance from the slot [T per d_OA]; 0: none
+    consensus: bool = False  # whether agents decide by the mean of their leads
 
     @property
     def actions(self) -> int:
@@ -78,17 +83,30 @@ class GeneralPolicy(NamedTuple):
         """(B, N, M) message of each agent to the others: the features that it sends."""
         return features[..., :SENT]
 
-    def decide(self, sensed: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+    def evaluate(self, features: np.ndarray, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
+        """(B, N, A) action values of each agent.
+
+        Args:
+            features: (B, N, F) float32, sensed features of each agent.
+            heard: (B, N, N, M) or (B, 1, N, M), see :func:`join_inputs`; row i is what agent i has heard of each agent.
+            age: (B, N, N) or (B, 1, N), age of these messages [T]; infinite where nothing was heard.
+        """
+        inputs = join_inputs(features, heard, age)
+        return self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
+
+    def decide(self, sensed: Sensed, values: np.ndarray, leads: np.ndarray, age: np.ndarray) -> np.ndarray:
         """(B, N) actions: the best one if its value leads by more than the margin and the agent :func:`may_change`, else the
         action in force. An agent that :func:`must_return` takes the formation, with avoidance on top if the action had it.
 
         Args:
             sensed: features of each agent, and the actions in force.
-            heard: (B, N, N, M) or (B, 1, N, M), see :func:`join_inputs`; row i is what agent i has heard of each agent.
-            age: (B, N, N) or (B, 1, N), age of these messages [T]; infinite where nothing was heard.
+            values: (B, N, A) from :meth:`evaluate`.
+            leads: (B, N, N) or (B, 1, N), row i is the newest lead of each agent that agent i knows, its own included; only a
+                policy with ``consensus`` reads them.
+            age: age of these leads [T]; infinite where none is known.
         """
-        inputs = join_inputs(sensed.features, heard, age)
-        values = self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
+        if self.consensus:
+            values = with_lead(values, mean_lead(leads, age))
         chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
         _keep_or_return(chosen, sensed, self.dwell, self.deadline)
         return chosen
@@ -97,6 +115,36 @@ class GeneralPolicy(NamedTuple):
         """(M, A) action values for inputs (M, S), one row per agent."""
         each = self.network.values(inputs)
         return each[:, 0] if each.shape[1] == 1 else _mean_values(each)
+
+
+def lead_of_column(values: np.ndarray) -> np.ndarray:
+    """(...,) best value of an action that takes the column minus the best of one that takes the formation; values (..., A)."""
+    formation, column = (values[..., motion :: len(MOTIONS)].max(axis=-1) for motion in MOTIONS)
+    return np.asarray(column - formation)
+
+
+@compiled
+def mean_lead(leads, age):
+    """(B, N) or (B, 1) mean of the leads (B, R, N) with an ``age`` (B, R, N) of at most one interval [T], for each receiver."""
+    mean = np.zeros(leads.shape[:2], dtype=np.float32)
+    for b in range(leads.shape[0]):
+        for r in range(leads.shape[1]):
+            count = 0
+            for s in range(leads.shape[2]):
+                if age[b, r, s] <= INTERVAL:
+                    mean[b, r] += leads[b, r, s]
+                    count += 1
+            mean[b, r] /= np.float32(max(count, 1))
+    return mean
+
+
+def with_lead(values: np.ndarray, lead: np.ndarray) -> np.ndarray:
+    """Values (B, N, A) relative to the formation's, shifted so that the column leads by ``lead`` (B, N or 1)."""
+    shifted = np.empty_like(values)
+    for motion, ahead in ((FORMATION, 0.0), (COLUMN_ACTION, lead[..., None])):
+        own = values[..., motion :: len(MOTIONS)]
+        shifted[..., motion :: len(MOTIONS)] = own - own.max(axis=-1, keepdims=True) + ahead
+    return shifted
 
 
 @compiled
@@ -191,7 +239,7 @@ def write_general(path: Path, policy: GeneralPolicy, description: dict[str, Any]
     """Write a policy with its description, and the description again as a JSON file beside it for people to read."""
     network = policy.network
     arrays = {f"weight{k}": w for k, w in enumerate(network.weights)} | {f"bias{k}": b for k, b in enumerate(network.biases)}
-    flown = {"margin": network.margin, "dwell": policy.dwell, "deadline": policy.deadline}
+    flown = {"margin": network.margin, "dwell": policy.dwell, "deadline": policy.deadline, "consensus": policy.consensus}
     said = {**description, "kind": KIND, "layout": INPUT_LAYOUT, "interval": INTERVAL, **flown}
     write_arrays(path, arrays, said)
     write_json(path.with_suffix(".json"), said)
@@ -226,10 +274,10 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
         weights = tuple(arrays[f"weight{k}"] for k in range(layers))
         biases = tuple(arrays[f"bias{k}"] for k in range(layers))
         margin, dwell = float(description["margin"]), int(description.get("dwell", 1))
-        deadline = float(description.get("deadline", 0.0))
+        deadline, consensus = float(description.get("deadline", 0.0)), bool(description.get("consensus", False))
     except (KeyError, TypeError, ValueError):
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy") from None
-    policy = make_general(weights, biases, margin)._replace(dwell=dwell, deadline=deadline)
+    policy = make_general(weights, biases, margin)._replace(dwell=dwell, deadline=deadline, consensus=consensus)
     fault = _fault(policy)
     if fault:
         raise ConfigurationError(f"checkpoint {path} does not hold the network of a general policy: {fault}")
@@ -239,24 +287,26 @@ def read_general(path: Path) -> tuple[GeneralPolicy, dict[str, Any]]:
 def make_general(weights: tuple[np.ndarray, ...], biases: tuple[np.ndarray, ...], margin: float) -> GeneralPolicy:
     """The policy of M dueling networks with weights (M, in, out) and biases (M, 1, out) per layer; the last has 1 + A outputs.
 
-    It has no dwell time and no deadline.
+    It has no dwell time and no deadline, and agents decide by their own leads.
     """
     return GeneralPolicy(Policy(weights, biases, np.ones(INPUTS, dtype=np.float32), True, margin))
 
 
 def mean_policy(policies: Sequence[GeneralPolicy], margin: float) -> GeneralPolicy:
-    """A policy that averages the values of several policies; it has no dwell time and no deadline.
+    """A policy that averages the values of several policies; it has no dwell time and no deadline. It decides as they all do.
 
     Raises:
-        ConfigurationError: no policies, or networks of different sizes.
+        ConfigurationError: no policies, networks of different sizes, or only some policies that decide by consensus.
     """
     networks = [policy.network for policy in policies]
     sizes = {tuple(weight.shape[1:] for weight in network.weights) for network in networks}
     if len(sizes) != 1:
         raise ConfigurationError(f"a mean needs at least one policy and networks of the same size, got sizes {sorted(sizes)}")
+    if len({policy.consensus for policy in policies}) > 1:
+        raise ConfigurationError("a mean needs policies that all decide by consensus, or policies that all do not")
     weights = (np.concatenate(layers) for layers in zip(*(network.weights for network in networks), strict=True))
     biases = (np.concatenate(layers) for layers in zip(*(network.biases for network in networks), strict=True))
-    return make_general(tuple(weights), tuple(biases), margin)
+    return make_general(tuple(weights), tuple(biases), margin)._replace(consensus=policies[0].consensus)
 
 
 def _fault(policy: GeneralPolicy) -> str:

@@ -1,13 +1,15 @@
 """``marlms-general``: one learned policy for every agent of every team, distributed (project).
 
-Every agent senses its own lanes, sends these features to the others, and decides between formation and column from its own
-features and those it has heard; see :mod:`marlbc_mj.policies.general`. The shipped policy leaves avoidance to the composition,
-which must be the set-based one. A policy that was trained under the null-space composition also decides about avoidance, and
-its agents give way to each other as under other supervisors.
+Every agent senses its own lanes, sends these features to the others, and computes the values of formation and column from its own
+features and those it has heard; see :mod:`marlbc_mj.policies.general`. If the policy decides by consensus, the agent also sends
+its lead and decides by the mean of the leads that it knows. The shipped policy leaves avoidance to the composition, which must be
+the set-based one. A policy that was trained under the null-space composition also decides about avoidance, and its agents give
+way to each other as under other supervisors.
 
-The scenario's communication layer carries the messages at every mission step. With ideal communication, all agents hear each
-other at once, and messages are computed only at decisions. An agent that is cut off continues with its own features and those
-heard before; their age and the number of agents heard are among its inputs. So each connected component decides for itself.
+The scenario's communication layer carries the messages at every mission step, in two rounds if there are leads: features first.
+With ideal communication, all agents hear each other at once, and messages are computed only at decisions. An agent that is cut
+off continues with its own features and those heard before; their age and the number of agents heard are among its inputs. Leads
+of others count for one interval only. So each connected component decides for itself.
 """
 
 from dataclasses import dataclass
@@ -19,7 +21,15 @@ import numpy as np
 
 from marlbc_mj.core.communication import IDEAL
 from marlbc_mj.engine.observation import Observation
-from marlbc_mj.policies.general import FORMATION, GeneralPolicy, Sensed, decision_steps, orders_for, read_general
+from marlbc_mj.policies.general import (
+    FORMATION,
+    GeneralPolicy,
+    Sensed,
+    decision_steps,
+    lead_of_column,
+    orders_for,
+    read_general,
+)
 from marlbc_mj.policies.general_inputs import SENT, Sight, make_sight, sense_features
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
@@ -36,7 +46,8 @@ class GeneralMemory(NamedTuple):
     actions: np.ndarray  # (B, N) actions in force
     way: GiveWay  # data for giving way to other agents; none if the composition does it
     layer: Layer | None = None  # None: communication is ideal
-    network: Any = None  # the layer's memory
+    network: Any = None  # the layer's memory of features
+    leads: Any = None  # the layer's memory of leads
     solver_ms: float = 0.0  # computing time of inputs and network in the last mission step [ms]
 
 
@@ -71,7 +82,7 @@ class General:
         if scenario.communication == IDEAL:
             return memory
         layer = make_layer(scenario)
-        return memory._replace(layer=layer, network=layer.start(teams, SENT))
+        return memory._replace(layer=layer, network=layer.start(teams, SENT), leads=layer.start(teams, 1))
 
     def decide(self, observation: Observation, memory: GeneralMemory) -> tuple[np.ndarray, GeneralMemory]:
         """Orders of the actions in force, which teams with a due decision choose anew; see :meth:`GeneralPolicy.decide`."""
@@ -88,30 +99,42 @@ class General:
         seen = observation if np.count_nonzero(due) == len(due) else Observation(*(field[due] for field in observation))
         features = sense_features(seen, memory.sight)
         sent = self.policy.messages(features)
-        heard, age = sent[:, None], np.zeros((len(sent), 1, sent.shape[1]))
-        return self._with_actions(features, seen.step == 0, (heard, age), memory, due)
+        age = np.zeros((len(sent), 1, sent.shape[1]))
+        values = self.policy.evaluate(features, sent[:, None], age)
+        leads = lead_of_column(values)[:, None]
+        return self._with_actions((features, seen.step == 0), values, (leads, age), memory, due)
 
     def _exchange_and_decide(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
         """The memory after one mission step of communication, with new actions of the teams ``due`` (B,)."""
         assert memory.layer is not None
         features, time = sense_features(observation, memory.sight), observation.time
-        sent = self.policy.messages(features)
-        (heard, stamp), network = memory.layer.exchange(time, observation.position, sent, memory.network, observation.noise_seed)
+        layer, where, seed = memory.layer, (time, observation.position), observation.noise_seed
+        (heard, stamp), network = layer.exchange(*where, self.policy.messages(features), memory.network, seed)
         memory = memory._replace(network=network)
+        if not (self.policy.consensus or due.any()):
+            return memory
+        values = self.policy.evaluate(features, heard, (time[:, None, None] - stamp) / memory.sight.time)
+        lead = lead_of_column(values)[..., None]
+        told = np.repeat(lead[:, None], lead.shape[1], axis=1)
+        if self.policy.consensus:
+            (told, stamp), leads = layer.exchange(*where, lead, memory.leads, seed)
+            memory = memory._replace(leads=leads)
         if not due.any():
             return memory
-        age = (time[:, None, None] - stamp) / memory.sight.time
-        return self._with_actions(features[due], observation.step[due] == 0, (heard[due], age[due]), memory, due)
+        known = told[due, ..., 0], (time[due, None, None] - stamp[due]) / memory.sight.time
+        return self._with_actions((features[due], observation.step[due] == 0), values[due], known, memory, due)
 
     def _with_actions(
         self,
-        features: np.ndarray,
-        fresh: np.ndarray,
-        knowledge: tuple[np.ndarray, np.ndarray],
+        sensed: tuple[np.ndarray, np.ndarray],
+        values: np.ndarray,
+        leads: tuple[np.ndarray, np.ndarray],
         memory: GeneralMemory,
         due: np.ndarray,
     ) -> GeneralMemory:
-        """The memory with new actions of the teams ``due`` (B,); features, fresh and knowledge have one row per due team."""
-        actions = memory.actions.copy()
-        actions[due] = self.policy.decide(Sensed(features, actions[due], fresh), *knowledge)
+        """The memory with new actions of the teams ``due`` (B,); ``sensed`` (features, and whether a team begins), values and
+        leads (with their ages) have one row per due team.
+        """
+        actions, (features, fresh) = memory.actions.copy(), sensed
+        actions[due] = self.policy.decide(Sensed(features, actions[due], fresh), values, *leads)
         return memory._replace(actions=actions)

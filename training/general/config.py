@@ -134,6 +134,9 @@ class GeneralConfig:
     null-space composition, where avoidance must start at once."""
     deadline: Annotated[float, NOT_NEGATIVE] = 1.0
     """In flight, an agent returns to the formation when this many settling times are left per d_OA of its way; 0: never."""
+    consensus: bool = True
+    """Whether agents decide by the mean of their leads, in learning and in flight. Only for the learners vdn, qmix and distilled:
+    values or logits of agents that learn alone do not add up to a team's value."""
     hide: tuple[str, ...] = ()
     """Groups of inputs hidden from the network, for ablations: pooled, lanes, column-lane, ways."""
     ppo: PPO = GENERAL_PPO
@@ -149,6 +152,11 @@ class GeneralConfig:
     """Threads of the simulation."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Device that the network runs on: cpu or cuda."""
+
+    @property
+    def by_consensus(self) -> bool:
+        """Whether agents decide by the mean of their leads, under these settings."""
+        return self.consensus and self.learner in (*TEAM_ERRORS, "distilled")
 
     def __post_init__(self) -> None:
         check(self)
@@ -190,8 +198,9 @@ def judging_scenarios(config: GeneralConfig) -> dict[str, Scenario]:
 
 
 def as_flown(policy: GeneralPolicy, config: GeneralConfig) -> GeneralPolicy:
-    """The policy with a configuration's dwell time (1 under null-space) and deadline."""
-    return policy._replace(dwell=config.dwell if policy.composition == "set-based" else 1, deadline=config.deadline)
+    """The policy with a configuration's dwell time (1 under null-space), deadline and kind of decision."""
+    dwell = config.dwell if policy.composition == "set-based" else 1
+    return policy._replace(dwell=dwell, deadline=config.deadline, consensus=config.by_consensus)
 
 
 def learner_config(config: GeneralConfig) -> TrainConfig:

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from marlbc_mj.policies.general import GeneralPolicy
+from marlbc_mj.policies.general import MOTIONS, GeneralPolicy
 from marlbc_mj.training.learner import Learner
 from marlbc_mj.training.networks import feed_forward, side_by_side
 from marlbc_mj.training.replay import Batch, Replay
@@ -17,18 +17,28 @@ def team_means(rows: Tensor, team: Tensor) -> Tensor:
     return torch.zeros((len(count), rows.shape[1]), device=rows.device).index_add(0, team, rows) / count[:, None]
 
 
+def by_motion(values: Tensor) -> Tensor:
+    """(M, 2) best of the values (M, A) of the actions that take each motion, formation and column."""
+    return values.reshape(len(values), -1, len(MOTIONS)).amax(dim=1)
+
+
 class TeamVDN(Learner):
     """VDN (Sunehag et al., AAMAS 2018) with one network for all agents, for teams of any size.
 
-    A team's value, reward and target are the means over its agents, so that large teams do not outweigh small ones.
+    A team's value, reward and target are the means over its agents, so that large teams do not outweigh small ones. If agents
+    decide by consensus, a team takes the better of its two motions next; else every agent takes its own best action.
     """
 
     joint = True
+    consensus = True  # whether agents decide by the mean of their leads
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, K) values of the actions of K teams, and their targets; ``batch`` lists the agents team by team."""
         chosen, target = super().estimates(batch, now, ahead)
         team = _teams_of(batch, chosen)
+        if self.consensus:
+            reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
+            return team_means(chosen.T, team).T, reward + discount * team_means(by_motion(ahead[0]), team).amax(dim=-1)
         return team_means(chosen.T, team).T, team_means(target.T, team).T
 
 
@@ -48,7 +58,9 @@ class TeamMixer(MixingLayers):
 
 
 class TeamQMIX(QMIX):
-    """QMIX with one network for all agents and a :class:`TeamMixer`; reward as in :class:`TeamVDN`."""
+    """QMIX with one network for all agents and a :class:`TeamMixer`; reward and consensus as in :class:`TeamVDN`."""
+
+    consensus = True
 
     def make_mixer(self, agents: int, scale: Tensor, generator: torch.Generator) -> nn.Module:
         """A mixer for any number of agents; inputs are not scaled."""
@@ -59,8 +71,10 @@ class TeamQMIX(QMIX):
         chosen = self.chosen(batch, now)
         team = _teams_of(batch, chosen)
         reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
-        target = reward + discount * self.target_mixer(ahead.amax(dim=-1), self.tensor(batch.next_state), team)
-        return self.mixer(chosen, self.tensor(batch.state), team), target
+        best = by_motion(ahead[0]) if self.consensus else ahead[0].amax(dim=-1, keepdim=True)
+        state = self.tensor(batch.next_state)
+        team_value = torch.stack([self.target_mixer(own[None], state, team) for own in best.unbind(dim=-1)]).amax(dim=0)
+        return self.mixer(chosen, self.tensor(batch.state), team), reward + discount * team_value
 
 
 class Imitation(Learner):

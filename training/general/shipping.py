@@ -21,6 +21,11 @@ _DECIDES = {
     "null-space": "between formation and column and whether avoidance is on top",
 }
 """Wording in the model card for an agent's decision, by the composition that the policy needs."""
+_BY_CONSENSUS = (
+    "It also sends how far the value of the column exceeds that of the formation, and goes by the mean of these leads, so agents "
+    "that hear each other take the same. "
+)
+"""Sentence in the model card of a policy that decides by consensus."""
 
 
 def ship_general(run: Path, name: str, folder: Path = FOLDER, *, overwrite: bool = False) -> Path:
@@ -52,7 +57,8 @@ def ship_mean(checkpoints: Sequence[Path], name: str, folder: Path = FOLDER, *, 
     """
     parts = [read_general(path) for path in checkpoints]
     config = GeneralConfig()
-    policy = as_flown(mean_policy([part for part, _ in parts], config.switching_margin), config)
+    mean = mean_policy([part for part, _ in parts], config.switching_margin)
+    policy = as_flown(mean, config)._replace(consensus=mean.consensus)
     target = folder / f"{name}.safetensors"
     check_target(target, overwrite=overwrite)
     runs = [run for _, part in parts for run in trainings(part)]
@@ -89,8 +95,8 @@ def _what(train: dict[str, Any]) -> str:
     return (
         f"{method} one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
         f"itself {_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
-        f"that it pools of what it heard. It needs the {composition} composition, a formation with a column and a path that "
-        "moves."
+        f"that it pools of what it heard. {_BY_CONSENSUS if train.get('consensus') else ''}It needs the {composition} "
+        "composition, a formation with a column and a path that moves."
     )
 
 

@@ -9,7 +9,16 @@ from marlbc_mj.core.behaviors import LineFormation
 from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.loop import FORMATION_REWARD
 from marlbc_mj.engine.world import World
-from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION, MOTIONS, action_orders, decision_steps
+from marlbc_mj.policies.general import (
+    COLUMN_ACTION,
+    FORMATION,
+    MOTIONS,
+    action_orders,
+    decision_steps,
+    lead_of_column,
+    mean_lead,
+    with_lead,
+)
 from marlbc_mj.policies.general_inputs import (
     CLEARANCE_ENTRY,
     COARSE,
@@ -102,6 +111,11 @@ class Squad:
         np.copyto(self.heard, features[:, None, :, :SENT], where=arrives[..., None])
         self.age = np.where(arrives, 0.0, self.age + (1.0 if only is None else only[:, None, None]))
         return join_inputs(features, self.heard, self.age * self.interval * self.scenario.mission_step / self.sight.time)
+
+    def agree(self, values: np.ndarray) -> np.ndarray:
+        """Values (W, N, A) with the mean lead of the agents that each agent heard at this decision, see ``GeneralPolicy``."""
+        leads = lead_of_column(values)[:, None].repeat(values.shape[1], axis=1)
+        return with_lead(values, mean_lead(leads, np.where(self.age == 0.0, 0.0, np.inf)))
 
     def choose(self, greedy: np.ndarray, temperature: float) -> np.ndarray:
         """(W, N) actions: ``greedy`` or the guide's, some replaced by :class:`Exploration` at this temperature."""

@@ -18,7 +18,7 @@ from marlbc_mj.training.general.config import (
     learner_config,
     training_scenarios,
 )
-from marlbc_mj.training.general.rivals import GENERAL_RIVALS, Distilled, TeamReplay
+from marlbc_mj.training.general.rivals import GENERAL_RIVALS, Distilled, TeamQMIX, TeamReplay, TeamVDN
 from marlbc_mj.training.general.squads import Squad
 from marlbc_mj.training.learner import Learner, restore_learning, snapshot_learning
 from marlbc_mj.training.leniency import leniency
@@ -53,6 +53,8 @@ class GeneralTrainer:
         self.teachers = [read_general(Path(path)) for path in config.teachers]  # policies and their headers
         if isinstance(self.learner, Distilled):
             self.learner.teach(self._teacher())
+        if isinstance(self.learner, (TeamVDN, TeamQMIX)):
+            self.learner.consensus = config.by_consensus
         self.rng = np.random.default_rng(config.seed)
         self.sizes = np.concatenate([np.full(config.worlds, squad.scenario.agents) for squad in self.squads])  # (T,) team sizes
         self.replay = self.make_replay(int(self.sizes.sum()))
@@ -147,13 +149,15 @@ class GeneralTrainer:
 
     def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
         """(W, N) actions of every squad (greedy, explored or the guide's), from the inputs of all agents (M, S)."""
-        greedy, temperature = self.learner.values(inputs)[:, 0].argmax(axis=-1), self.temperature
-        return [squad.choose(best, temperature) for squad, best in zip(self.squads, self.by_squad(greedy), strict=True)]
+        values, agreed = self.by_squad(self.learner.values(inputs)[:, 0]), self.config.by_consensus
+        greedy = [squad.agree(own) if agreed else own for squad, own in zip(self.squads, values, strict=True)]
+        return [squad.choose(own.argmax(axis=-1), self.temperature) for squad, own in zip(self.squads, greedy, strict=True)]
 
-    def by_squad(self, actions: np.ndarray) -> list[np.ndarray]:
-        """Split the actions of all agents (M,) into those of every squad (W, N)."""
+    def by_squad(self, rows: np.ndarray) -> list[np.ndarray]:
+        """Split an array with one row for every agent (M, ...) into those of every squad (W, N, ...)."""
         bounds = np.cumsum([squad.rows for squad in self.squads])[:-1]
-        return [own.reshape(squad.last.shape) for squad, own in zip(self.squads, np.split(actions, bounds), strict=True)]
+        parts = zip(self.squads, np.split(rows, bounds), strict=True)
+        return [own.reshape(*squad.last.shape, *rows.shape[1:]) for squad, own in parts]
 
     @property
     def learning_rate(self) -> float:
