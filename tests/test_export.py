@@ -11,7 +11,7 @@ from test_general import random_policy as random_general
 
 from marlbc_mj.cli import main
 from marlbc_mj.policies.checkpoint import read_policy, signature, write_policy
-from marlbc_mj.policies.general import Sensed, lead_of_column, mean_policy, write_general
+from marlbc_mj.policies.general import Sensed, agree, lead_of_column, mean_policy, write_general
 from marlbc_mj.policies.general_inputs import FEATURES, INPUT_LAYOUT, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, greedy
 from marlbc_mj.policies.shipped import shipped
@@ -136,7 +136,8 @@ def test_the_general_policy_is_exported_as_it_decides(flown, networks, actions, 
         np.testing.assert_allclose(values, expected.reshape(rows, -1), rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(own, lead_of_column(expected).reshape(rows), rtol=1e-4, atol=1e-3)
         known = np.where(itself, lead_of_column(expected)[:, :, None], leads).astype(np.float32)
-        decided = policy.decide(Sensed(features, last, fresh), expected, known, np.where(itself, 0.0, lead_age))
+        agreed = agree(expected, known, np.where(itself, 0.0, lead_age)) if policy.consensus else expected
+        decided = policy.decide(Sensed(features, last, fresh), agreed)
         np.testing.assert_array_equal(action.reshape(teams, agents), decided)
 
 

@@ -50,7 +50,8 @@ def with_middle_layer(policy: GeneralPolicy, seed: int) -> GeneralPolicy:
 def decide(policy: GeneralPolicy, now: Sensed, heard: np.ndarray, age: np.ndarray) -> np.ndarray:
     """Actions of agents that hear features and leads of the same agents."""
     values = policy.evaluate(now.features, heard, age)
-    return policy.decide(now, values, np.repeat(lead_of_column(values)[:, None], age.shape[1], axis=1), age)
+    leads = np.repeat(lead_of_column(values)[:, None], age.shape[1], axis=1)
+    return policy.decide(now, general.agree(values, leads, age) if policy.consensus else values)
 
 
 def field(**changes):

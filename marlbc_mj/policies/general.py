@@ -94,19 +94,14 @@ class GeneralPolicy(NamedTuple):
         inputs = join_inputs(features, heard, age)
         return self.values(inputs.reshape(-1, INPUTS)).reshape(*inputs.shape[:2], self.actions)
 
-    def decide(self, sensed: Sensed, values: np.ndarray, leads: np.ndarray, age: np.ndarray) -> np.ndarray:
+    def decide(self, sensed: Sensed, values: np.ndarray) -> np.ndarray:
         """(B, N) actions: the best one if its value leads by more than the margin and the agent :func:`may_change`, else the
         action in force. An agent that :func:`must_return` takes the formation, with avoidance on top if the action had it.
 
         Args:
             sensed: features of each agent, and the actions in force.
-            values: (B, N, A) from :meth:`evaluate`.
-            leads: (B, N, N) or (B, 1, N), row i is the newest lead of each agent that agent i knows, its own included; only a
-                policy with ``consensus`` reads them.
-            age: age of these leads [T]; infinite where none is known.
+            values: (B, N, A) from :meth:`evaluate`; for a policy with ``consensus``, after :func:`agree`.
         """
-        if self.consensus:
-            values = with_lead(values, mean_lead(leads, age))
         chosen = greedy(values, sensed.last, sensed.fresh, self.network.margin)
         _keep_or_return(chosen, sensed, self.dwell, self.deadline)
         return chosen
@@ -115,6 +110,17 @@ class GeneralPolicy(NamedTuple):
         """(M, A) action values for inputs (M, S), one row per agent."""
         each = self.network.values(inputs)
         return each[:, 0] if each.shape[1] == 1 else _mean_values(each)
+
+
+def agree(values: np.ndarray, leads: np.ndarray, age: np.ndarray) -> np.ndarray:
+    """Values (B, N, A), with the mean of the leads that an agent knows in place of its own.
+
+    Args:
+        values: (B, N, A) action values.
+        leads: (B, N, N) or (B, 1, N), row i is the newest lead of each agent that agent i knows, its own included.
+        age: age of these leads [T]; infinite where none is known.
+    """
+    return with_lead(values, mean_lead(np.ascontiguousarray(leads, dtype=np.float32), age))
 
 
 def lead_of_column(values: np.ndarray) -> np.ndarray:

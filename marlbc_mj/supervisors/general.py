@@ -25,6 +25,7 @@ from marlbc_mj.policies.general import (
     FORMATION,
     GeneralPolicy,
     Sensed,
+    agree,
     decision_steps,
     lead_of_column,
     orders_for,
@@ -101,8 +102,9 @@ class General:
         sent = self.policy.messages(features)
         age = np.zeros((len(sent), 1, sent.shape[1]))
         values = self.policy.evaluate(features, sent[:, None], age)
-        leads = lead_of_column(values)[:, None]
-        return self._with_actions((features, seen.step == 0), values, (leads, age), memory, due)
+        if self.policy.consensus:
+            values = agree(values, lead_of_column(values)[:, None], age)
+        return self._with_actions(features, seen.step == 0, values, memory, due)
 
     def _exchange_and_decide(self, observation: Observation, memory: GeneralMemory, due: np.ndarray) -> GeneralMemory:
         """The memory after one mission step of communication, with new actions of the teams ``due`` (B,)."""
@@ -114,27 +116,21 @@ class General:
         if not (self.policy.consensus or due.any()):
             return memory
         values = self.policy.evaluate(features, heard, (time[:, None, None] - stamp) / memory.sight.time)
-        lead = lead_of_column(values)[..., None]
-        told = np.repeat(lead[:, None], lead.shape[1], axis=1)
         if self.policy.consensus:
-            (told, stamp), leads = layer.exchange(*where, lead, memory.leads, seed)
+            (told, stamp), leads = layer.exchange(*where, lead_of_column(values)[..., None], memory.leads, seed)
+            values = agree(values, told[..., 0], (time[:, None, None] - stamp) / memory.sight.time)
             memory = memory._replace(leads=leads)
-        if not due.any():
-            return memory
-        known = told[due, ..., 0], (time[due, None, None] - stamp[due]) / memory.sight.time
-        return self._with_actions((features[due], observation.step[due] == 0), values[due], known, memory, due)
+        return self._with_actions(features[due], observation.step[due] == 0, values[due], memory, due) if due.any() else memory
 
     def _with_actions(
         self,
-        sensed: tuple[np.ndarray, np.ndarray],
+        features: np.ndarray,
+        fresh: np.ndarray,
         values: np.ndarray,
-        leads: tuple[np.ndarray, np.ndarray],
         memory: GeneralMemory,
         due: np.ndarray,
     ) -> GeneralMemory:
-        """The memory with new actions of the teams ``due`` (B,); ``sensed`` (features, and whether a team begins), values and
-        leads (with their ages) have one row per due team.
-        """
-        actions, (features, fresh) = memory.actions.copy(), sensed
-        actions[due] = self.policy.decide(Sensed(features, actions[due], fresh), values, *leads)
+        """The memory with new actions of the teams ``due`` (B,); features, fresh and values have one row per due team."""
+        actions = memory.actions.copy()
+        actions[due] = self.policy.decide(Sensed(features, actions[due], fresh), values)
         return memory._replace(actions=actions)

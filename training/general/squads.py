@@ -14,10 +14,9 @@ from marlbc_mj.policies.general import (
     FORMATION,
     MOTIONS,
     action_orders,
+    agree,
     decision_steps,
     lead_of_column,
-    mean_lead,
-    with_lead,
 )
 from marlbc_mj.policies.general_inputs import (
     CLEARANCE_ENTRY,
@@ -115,7 +114,7 @@ class Squad:
     def agree(self, values: np.ndarray) -> np.ndarray:
         """Values (W, N, A) with the mean lead of the agents that each agent heard at this decision, see ``GeneralPolicy``."""
         leads = lead_of_column(values)[:, None].repeat(values.shape[1], axis=1)
-        return with_lead(values, mean_lead(leads, np.where(self.age == 0.0, 0.0, np.inf)))
+        return agree(values, leads, np.where(self.age == 0.0, 0.0, np.inf))
 
     def choose(self, greedy: np.ndarray, temperature: float) -> np.ndarray:
         """(W, N) actions: ``greedy`` or the guide's, some replaced by :class:`Exploration` at this temperature."""
