@@ -2,6 +2,7 @@
 
 import ast
 import re
+import tokenize
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,19 @@ def test_few_lines_are_silenced() -> None:
     text = "\n".join(path.read_text() for path in sources(ROOT))
     assert "fmt: skip" not in text and "fmt: off" not in text
     assert text.count("type: ignore") < MOST_IGNORES
+
+
+def links_by_mistake(path: Path) -> list[str]:
+    """``file: line`` of comments and docstrings with ``[x] [m]``, which the API pages read as a link to m."""
+    with path.open() as stream:
+        tokens = [
+            token for token in tokenize.generate_tokens(stream.readline) if token.type in (tokenize.COMMENT, tokenize.STRING)
+        ]
+    text = [token for token in tokens if token.type == tokenize.COMMENT or token.string.startswith('"""')]
+    return [f"{path.name}: {token.start[0]}" for token in text if re.search(r"\]\s+\[[^\]\s]+\]", token.string)]
+
+
+def test_no_unit_follows_a_bracket(tmp_path: Path) -> None:
+    assert [entry for path in sources(ROOT) for entry in links_by_mistake(path)] == []
+    (tmp_path / "planted.py").write_text("x: tuple  # each [x, y] [m]\n")
+    assert links_by_mistake(tmp_path / "planted.py") == ["planted.py: 1"]

@@ -48,7 +48,7 @@ class Custom(Mission):
     formation_gain: float = 2.0  # [1/s]
     path_origin: Point = (0.0, 0.0)  # [m]
     path_velocity: Point = (1.0, 0.0)  # [m/s]
-    obstacles: tuple[Obstacle, ...] = ()  # each [x, y] or [x, y, radius] [m]
+    obstacles: tuple[Obstacle, ...] = ()  # each (x, y) or (x, y, radius) [m]
     motions: tuple[Motion, ...] = ()  # each [vx, vy, ax, ay, period, phase]; trailing defaults may be left out
     schedule: tuple[Window, ...] = ()  # each [start, end, agent, order]
     duration: float = 60.0  # [s]
