@@ -44,9 +44,14 @@ def test_a_mean_is_shipped_with_a_line_for_each_network(tmp_path: Path) -> None:
         write_general(tmp_path / f"{k}.safetensors", random_policy(k), run)
     shipped_to = ship_mean([tmp_path / "0.safetensors", tmp_path / "1.safetensors"], "both", tmp_path)
     assert read_general(shipped_to)[1]["mean_of"] == [run, run]
-    assert shipped_to.with_suffix(".md").read_text().count("marlbc train marlms-general --seed 0 --set budget=400") == 2
+    card = shipped_to.with_suffix(".md").read_text()
+    assert card.count("marlbc train marlms-general --seed 0 --set budget=400") == 2
+    assert "mean of these leads" not in card and not read_general(shipped_to)[0].consensus
     with pytest.raises(ConfigurationError, match="exists"):
         ship_mean([shipped_to], "both", tmp_path)
+    write_general(tmp_path / "agreed.safetensors", random_policy(consensus=True), run)
+    agreed = ship_mean([tmp_path / "agreed.safetensors"], "agreed-mean", tmp_path)
+    assert "mean of these leads" in agreed.with_suffix(".md").read_text() and read_general(agreed)[0].consensus
 
 
 def test_the_command_ships_the_mean_of_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -242,6 +247,7 @@ def test_agents_in_training_decide_by_the_leads_that_they_hear() -> None:
     assert trainer.policy().consensus
     for learner, wanted in (("qmix", True), ("mappo", False), ("lenient", False), ("imitation", False)):
         assert replace(SMALL, learner=learner).by_consensus == wanted
+    assert not replace(SMALL, hide=("pooled",)).by_consensus
     assert not GeneralTrainer(replace(SMALL, consensus=False)).policy().consensus
 
 

@@ -32,6 +32,7 @@ from marlbc_mj.policies.general import (
 from marlbc_mj.policies.general_inputs import AGE_ENTRIES, COARSE, ENDING, FEATURES, INPUT_LAYOUT, MOST_BEYOND, SENT, WAYS
 from marlbc_mj.policies.greedy import Policy, takes_best
 from marlbc_mj.scenarios import make_scenario
+from marlbc_mj.training.general.rivals import by_motion
 from marlbc_mj.training.networks import NetworkSize, TeamNetwork, mask_risky
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import check_target, staged_file
@@ -198,13 +199,12 @@ class AgentPolicy(nn.Module):
         """
         values, _ = self.network.heads(torch.cat([features, pool(heard, age)], dim=-1))
         mean = values.mean(dim=0)
-        each = mean.shape[-1] // len(MOTIONS)
-        best = mean.reshape(-1, each, len(MOTIONS)).amax(dim=1)  # (B, 2) of formation and column
+        best = by_motion(mean)
         own = best[:, COLUMN_ACTION] - best[:, FORMATION]
         counts = (lead_age <= INTERVAL).to(lead.dtype) * float(self.consensus)
         ahead = (own + torch.where(counts > 0, lead, 0.0).sum(dim=1)) / (1.0 + counts.sum(dim=1))
         shift = torch.stack([torch.zeros_like(ahead), ahead], dim=-1) - best
-        used = mean + shift.repeat(1, each)
+        used = mean + shift.repeat(1, mean.shape[-1] // len(MOTIONS))
         kept, fresh = last.clamp(min=0), last < 0
         free = may_change(features[..., AGE_ENTRIES], fresh, self.dwell)
         chosen = torch.where(free, _choose(used, kept, fresh, self.margin), kept)

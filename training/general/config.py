@@ -155,8 +155,8 @@ class GeneralConfig:
 
     @property
     def by_consensus(self) -> bool:
-        """Whether agents decide by the mean of their leads, under these settings."""
-        return self.consensus and self.learner in (*TEAM_ERRORS, "distilled")
+        """Whether agents decide by the mean of their leads, under these settings; not if all that they hear is hidden."""
+        return self.consensus and self.learner in (*TEAM_ERRORS, "distilled") and "pooled" not in self.hide
 
     def __post_init__(self) -> None:
         check(self)

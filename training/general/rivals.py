@@ -19,7 +19,7 @@ def team_means(rows: Tensor, team: Tensor) -> Tensor:
 
 def by_motion(values: Tensor) -> Tensor:
     """(M, 2) best of the values (M, A) of the actions that take each motion, formation and column."""
-    return values.reshape(len(values), -1, len(MOTIONS)).amax(dim=1)
+    return values.reshape(-1, values.shape[-1] // len(MOTIONS), len(MOTIONS)).amax(dim=1)
 
 
 class TeamVDN(Learner):
@@ -34,12 +34,14 @@ class TeamVDN(Learner):
 
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(1, K) values of the actions of K teams, and their targets; ``batch`` lists the agents team by team."""
-        chosen, target = super().estimates(batch, now, ahead)
+        chosen = self.chosen(batch, now)
         team = _teams_of(batch, chosen)
-        if self.consensus:
-            reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
-            return team_means(chosen.T, team).T, reward + discount * team_means(by_motion(ahead[0]), team).amax(dim=-1)
-        return team_means(chosen.T, team).T, team_means(target.T, team).T
+        value = team_means(chosen.T, team).T
+        if not self.consensus:
+            _, target = super().estimates(batch, now, ahead)
+            return value, team_means(target.T, team).T
+        reward, discount = (team_means(self.tensor(each), team).T for each in (batch.reward, batch.discount))
+        return value, reward + discount * team_means(by_motion(ahead[0]), team).amax(dim=-1)
 
 
 class TeamMixer(MixingLayers):

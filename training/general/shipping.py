@@ -88,14 +88,14 @@ def _within(path: str) -> str:
     return "/".join(Path(path).parts[-3:])
 
 
-def _what(train: dict[str, Any]) -> str:
+def _what(train: dict[str, Any], *, consensus: bool) -> str:
     """The introduction of a model card: method, decisions, inputs and requirements of a training's policy."""
     composition = train.get("composition", "set-based")
     method = "Policy distillation into" if train.get("teachers") else "Dueling Q-learning of"
     return (
         f"{method} one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
         f"itself {_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
-        f"that it pools of what it heard. {_BY_CONSENSUS if train.get('consensus') else ''}It needs the {composition} "
+        f"that it pools of what it heard. {_BY_CONSENSUS if consensus else ''}It needs the {composition} "
         "composition, a formation with a column and a path that moves."
     )
 
@@ -105,7 +105,7 @@ def _mean_card(name: str, policy: GeneralPolicy, runs: list[dict[str, Any]]) -> 
     lines = [
         f"# {name}",
         "",
-        f"{_what(runs[0]['train'])} Its action values are the mean of those of {_introduced(runs)}",
+        f"{_what(runs[0]['train'], consensus=policy.consensus)} Its action values are the mean of those of {_introduced(runs)}",
         "",
         _rules(policy.network.margin, policy.dwell, policy.deadline),
         "",
@@ -165,7 +165,8 @@ def general_card(name: str, description: dict[str, Any], rows: list[dict[str, st
     lines = [
         f"# {name}",
         "",
-        _what(train) + (f" It learned the mean values of {_introduced(teachers)}" if teachers else ""),
+        _what(train, consensus=description.get("consensus", False))
+        + (f" It learned the mean values of {_introduced(teachers)}" if teachers else ""),
         "",
         _rules(description["margin"], description.get("dwell", 1), description.get("deadline", 0.0)),
         "",

@@ -149,9 +149,10 @@ class GeneralTrainer:
 
     def choose(self, inputs: np.ndarray) -> list[np.ndarray]:
         """(W, N) actions of every squad (greedy, explored or the guide's), from the inputs of all agents (M, S)."""
-        values, agreed = self.by_squad(self.learner.values(inputs)[:, 0]), self.config.by_consensus
-        greedy = [squad.agree(own) if agreed else own for squad, own in zip(self.squads, values, strict=True)]
-        return [squad.choose(own.argmax(axis=-1), self.temperature) for squad, own in zip(self.squads, greedy, strict=True)]
+        values, temperature = self.by_squad(self.learner.values(inputs)[:, 0]), self.temperature
+        if self.config.by_consensus:
+            values = [squad.agree(own) for squad, own in zip(self.squads, values, strict=True)]
+        return [squad.choose(own.argmax(axis=-1), temperature) for squad, own in zip(self.squads, values, strict=True)]
 
     def by_squad(self, rows: np.ndarray) -> list[np.ndarray]:
         """Split an array with one row for every agent (M, ...) into those of every squad (W, N, ...)."""
