@@ -7,14 +7,17 @@ from hypothesis import strategies as st
 from test_general import field, random_policy
 
 from marlbc_mj import World
+from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies import general_inputs as inputs
+from marlbc_mj.scenarios import make_scenario
 
 
 def sight_of(length: float, time: float, speed=(1.0, 0.3)) -> inputs.Sight:
     """Slots, path and bins in units of ``length`` and ``time``."""
     slots = length * np.random.default_rng(1).normal(scale=4.0, size=(2, 3, 2))
     path = np.array([(0.0, 1.0), np.array(speed) / time]) * length
-    return inputs.Sight(slots, path, time * np.array(inputs.EDGES), length, time, 20.0 * time, np.array([False, True]))
+    edges, delays = time * np.array(inputs.EDGES), time * np.array(inputs.WAY_DELAYS)
+    return inputs.Sight(slots, path, edges, delays, 4.0 * length / time, length, time, 20.0 * time, np.array([False, True]))
 
 
 def sensed(sight: inputs.Sight, length: float, time: float, moving: bool) -> np.ndarray:
@@ -60,23 +63,60 @@ def test_a_lane_is_the_least_clearance_in_every_bin(seed: int) -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10_000))
-def test_a_way_is_the_least_clearance_on_it(seed: int) -> None:
-    """Against a thousand samples, obstacles near and far."""
-    rng, length = np.random.default_rng(seed), 1.5
+def test_a_way_is_the_least_clearance_of_an_agent_that_sets_out_later(seed: int) -> None:
+    """Against a thousand samples per delay, obstacles near and far, at rest and moving."""
+    rng, sight = np.random.default_rng(seed), sight_of(1.5, 0.7)
     at, slot, reach = rng.normal(scale=5.0, size=2), rng.normal(scale=5.0, size=2), rng.choice((10.0, 30.0))
-    obstacles = np.concatenate([rng.uniform(-reach, reach, (6, 2)), rng.uniform(0.0, 2.0, (6, 1))], axis=1)
-    on_it = at + np.linspace(0.0, 1.0, 1001)[:, None, None] * (slot - at)
-    gap = np.linalg.norm(on_it - obstacles[:, :2], axis=-1) - obstacles[:, 2]
-    wanted = np.clip(gap.min() / length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
-    assert wanted - 1e-3 <= inputs.way_clearance(at, slot, length, obstacles) + 1e-12 <= wanted + 2e-12
+    obstacles = np.concatenate(
+        [rng.uniform(-reach, reach, (6, 2)), rng.uniform(0.0, 2.0, (6, 1)), rng.normal(size=(6, 2))], axis=1
+    )
+    for shown, velocity in ((obstacles, obstacles[:, 3:]), (np.ascontiguousarray(obstacles[:, :3]), np.zeros((6, 2)))):
+        ways = way_clearances(at, slot, sight, shown)
+        away = np.linalg.norm(slot - at) / sight.speed  # how long it takes [s]
+        for delay, found in zip(sight.delays, ways, strict=True):
+            share = np.linspace(0.0, 1.0, 1001)[:, None, None]
+            time = delay + share * away
+            on_it = at + share * (slot - at) + time * sight.path[1]
+            gap = np.linalg.norm(on_it - obstacles[:, :2] - time * velocity, axis=-1) - obstacles[:, 2]
+            wanted = np.clip(gap.min() / sight.length - 1.0, inputs.LEAST_BEYOND, inputs.MOST_BEYOND)
+            assert wanted - 1e-3 <= found + 1e-12 <= wanted + 2e-12
+
+
+def way_clearances(at: np.ndarray, slot: np.ndarray, sight: inputs.Sight, obstacles: np.ndarray) -> np.ndarray:
+    ways = np.empty(len(inputs.WAY_DELAYS))
+    inputs.fill_ways(at, slot, sight, obstacles, ways)
+    return ways
 
 
 def test_the_way_to_a_slot_sees_what_is_between() -> None:
-    obstacles = np.array([[5.0, 0.5, 0.25]])
-    at, slot = np.zeros(2), np.array([10.0, 0.0])
-    assert inputs.way_clearance(at, slot, 1.0, obstacles) == pytest.approx(-0.75)
-    assert inputs.way_clearance(at, at, 1.0, obstacles) == inputs.MOST_BEYOND
-    assert inputs.way_clearance(at, slot, 1.0, obstacles[:0]) == inputs.MOST_BEYOND
+    """A path along x: an obstacle on the way now is behind the way of an agent that sets out later."""
+    sight, obstacles = sight_of(1.0, 1.0, speed=(1.0, 0.0)), np.array([[1.25, 5.0, 0.25]])
+    at, slot = np.zeros(2), np.array([0.0, 10.0])  # 2.5 s at 4 m/s, so half-way at (1.25, 5)
+    ways = way_clearances(at, slot, sight, obstacles)
+    assert ways[0] == inputs.LEAST_BEYOND
+    assert (np.diff(ways) > 0.0).all()
+    assert way_clearances(at, at, sight, obstacles).tolist() == [inputs.MOST_BEYOND] * len(ways)
+    assert way_clearances(at, slot, sight, obstacles[:0]).tolist() == [inputs.MOST_BEYOND] * len(ways)
+
+
+def test_references_take_the_way() -> None:
+    """Without obstacles, a wedge that changes to the column or back stays close to the ways and arrives when they say so."""
+    scenario = make_scenario("open", agents=4, formation="wedge", composition="set-based")
+    sight, world = inputs.make_sight(scenario), World(scenario, make_controller("pd"))
+    order = [scenario.orders.index(name) for name in scenario.formation_names]
+    for which in (0, 1, 0):
+        now, start = world.state.steps[0] * scenario.mission_step, world.state.reference[0].copy()
+        slots = sight.path[0] + now * sight.path[1] + sight.slots[which]
+        arrival = np.linalg.norm(slots - start, axis=1) / sight.speed
+        way = slots + arrival[:, None] * sight.path[1] - start
+        for k in range(60):
+            world.step(np.full((1, 4), order[which]))
+            flown, time = world.state.reference[0] - start, (k + 1) * scenario.mission_step
+            share = np.clip(time / np.maximum(arrival, 1e-9), 0.0, 1.0)
+            aside = np.abs(way[:, 0] * flown[:, 1] - way[:, 1] * flown[:, 0]) / np.maximum(np.linalg.norm(way, axis=1), 1e-9)
+            assert (aside[share < 1.0] < 0.3 * sight.length).all()
+            away = np.linalg.norm(start + flown - slots - (k + 1) * scenario.mission_step * sight.path[1], axis=1)
+            assert (away[time > arrival + sight.time] <= scenario.formation_tolerance).all()
 
 
 def test_all_hearing_all_is_the_limit_of_hearing_each() -> None:

@@ -226,7 +226,7 @@ def test_a_guide_puts_avoidance_on_top_where_the_way_is_blocked() -> None:
     """For agents close to an obstacle and with a blocked way to their slot; never under the set-based composition."""
     seen = np.ones((1, 4, inputs.INPUTS))
     seen[0, :3, inputs.CLEARANCE_ENTRY] = 0.1
-    seen[0, 1:, inputs.LANES + FORMATION] = -0.5
+    seen[0, 1:, inputs.FORMATION_WAY] = -0.5
     for composition, wanted in (("null-space", [0, 2, 2, 0]), ("set-based", [0, 0, 0, 0])):
         squad = GeneralTrainer(replace(SMALL, worlds=1, composition=composition)).squads[0]
         squad.inputs, squad.bins[:] = seen, 0

@@ -6,7 +6,7 @@ import pytest
 from marlbc_mj import World
 from marlbc_mj.controllers import make_controller
 from marlbc_mj.policies.general import COLUMN_ACTION, FORMATION
-from marlbc_mj.policies.general_inputs import INPUTS, LANES, WAYS
+from marlbc_mj.policies.general_inputs import COLUMN_WAY, FORMATION_WAY, INPUTS, WAYS
 from marlbc_mj.scenarios import FAMILIES
 from marlbc_mj.scenarios.teams import files_of, room_for, team_mission
 from marlbc_mj.studies.safety import ground
@@ -43,7 +43,7 @@ def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
     """Two lanes blocked within its bins make a column, one does not; the column stays while any agent's way back is blocked."""
     inputs, last, bins = np.ones((4, 3, INPUTS)), np.full((4, 3), FORMATION), np.full(4, 6)
     inputs[0, :2, 5] = inputs[1, :2, 6] = inputs[2, 1, 5] = -0.5
-    inputs[3, 1, LANES] = -0.5
+    inputs[3, 1, FORMATION_WAY] = -0.5
     assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, FORMATION]
     last[3, 2] = COLUMN_ACTION
     assert look_ahead(inputs, last, bins).tolist() == [COLUMN_ACTION, FORMATION, FORMATION, COLUMN_ACTION]
@@ -51,11 +51,11 @@ def test_a_guiding_look_ahead_sees_only_its_bins() -> None:
 
 def test_shut_out_conditions() -> None:
     inputs = np.zeros((1, 4, INPUTS))
-    inputs[..., LANES:WAYS] = -1.0
+    inputs[..., [FORMATION_WAY, COLUMN_WAY]] = -1.0
     inputs[..., [WAYS + 1, WAYS + 3]] = 0.99
-    inputs[0, 1, LANES + 1] = 0.1
+    inputs[0, 1, COLUMN_WAY] = 0.1
     inputs[0, 2, WAYS + 3] = 0.5
-    inputs[0, 3, LANES] = 0.0
+    inputs[0, 3, FORMATION_WAY] = 0.0
     assert shut_out(inputs).tolist() == [[True, False, False, False]]
 
 

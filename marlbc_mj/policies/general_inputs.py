@@ -29,10 +29,15 @@ COARSE = 5.0
 COARSEST = 20.0
 """The coarse scale of ages and of the time left [T]."""
 
+WAY_DELAYS = (0.0, 1.2, 2.4, 3.6, 6.0)
+"""Times until an agent sets out for a slot, for which the clearance of its way is known, in settling times."""
+
 LANES = 2 * LANE_BINS
 """Entries 0 to LANES - 1: lane profiles of the slot in the formation and of the slot in the column."""
-WAYS = LANES + 2
-"""Entries LANES to WAYS - 1: clearances of the straight ways to both slots."""
+FORMATION_WAY, COLUMN_WAY = LANES, LANES + len(WAY_DELAYS)
+"""First of the entries for the way to each slot, one for every delay; the first is for an agent that sets out at once."""
+WAYS = LANES + 2 * len(WAY_DELAYS)
+"""Entries LANES to WAYS - 1: clearances of the ways to both slots."""
 ERRORS = WAYS + 4
 """Entries WAYS to ERRORS - 1: distances from both slots, each on two scales."""
 COLUMN_ENTRY, AGE_ENTRIES, CLEARANCE_ENTRY = ERRORS, ERRORS + 1, ERRORS + 3
@@ -48,7 +53,7 @@ POOLED = 2 * SENT + (AGE_ENTRIES + 2 - WAYS) + 2
 INPUTS = FEATURES + POOLED
 """S, number of inputs of a network."""
 INPUT_LAYOUT: dict[str, float | list[float]] = {
-    **{"version": 2, "features": FEATURES, "sent": SENT, "pooled": POOLED, "edges": list(EDGES)},
+    **{"version": 3, "features": FEATURES, "sent": SENT, "pooled": POOLED, "edges": list(EDGES), "delays": list(WAY_DELAYS)},
     **{"nearest": LEAST_BEYOND, "farthest": MOST_BEYOND, "far": COARSE, "old": COARSEST},
 }
 """Layout of the inputs, for which a network's weights are valid; ``version`` increases when the meaning of entries changes."""
@@ -60,6 +65,8 @@ class Sight(NamedTuple):
     slots: np.ndarray  # (2, N, 2) slots of formation and column around the desired centroid [m]
     path: np.ndarray  # (2, 2) p_cd(0) [m] and its velocity [m/s]
     edges: np.ndarray  # (LANE_BINS + 1,) bounds of the lanes' time bins [s]
+    delays: np.ndarray  # WAY_DELAYS [s]
+    speed: float  # v_max [m/s]
     length: float  # d_OA [m]
     time: float  # T [s]
     end: float  # end of the mission [s]
@@ -88,7 +95,8 @@ def make_sight(scenario: Scenario) -> Sight:
         raise ConfigurationError(f"scenario {scenario.name!r} has no column: {second} has the same slots as {first}")
     unit = settling_time(scenario)
     columns = [name.endswith(scenario.formation_names[1]) for name in scenario.orders.commands]
-    return Sight(slots, path, unit * np.array(EDGES), float(scenario.safe_distance), unit, scenario.duration, np.array(columns))
+    edges, delays, speed = unit * np.array(EDGES), unit * np.array(WAY_DELAYS), float(make_barrier(scenario).speed)
+    return Sight(slots, path, edges, delays, speed, float(scenario.safe_distance), unit, scenario.duration, np.array(columns))
 
 
 def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
@@ -102,7 +110,7 @@ def sense_features(observation: Observation, sight: Sight) -> np.ndarray:
 @compiled
 def _fill_features(sight, column, time, position, clearance, age, obstacles, features):
     """Fill ``features`` (B, N, F), see :func:`sense_features`; ``column`` (B, N) bool, other arguments as in an observation."""
-    slot, lane = np.empty(2), np.empty(LANE_BINS)
+    slot, lane, ways = np.empty(2), np.empty(LANE_BINS), np.empty(len(WAY_DELAYS))
     for b in range(position.shape[0]):
         for i in range(position.shape[1]):
             row = features[b, i]
@@ -113,7 +121,9 @@ def _fill_features(sight, column, time, position, clearance, age, obstacles, fea
                 fill_lane(slot, sight, obstacles[b], lane)
                 for k in range(LANE_BINS):
                     row[which * LANE_BINS + k] = lane[k]
-                row[LANES + which] = way_clearance(position[b, i], slot, sight.length, obstacles[b])
+                fill_ways(position[b, i], slot, sight, obstacles[b], ways)
+                for k in range(len(WAY_DELAYS)):
+                    row[LANES + which * len(WAY_DELAYS) + k] = ways[k]
                 error = np.sqrt((position[b, i, 0] - slot[0]) ** 2 + (position[b, i, 1] - slot[1]) ** 2) / sight.length
                 row[WAYS + 2 * which] = np.tanh(error)
                 row[WAYS + 2 * which + 1] = np.tanh(error / COARSE)
@@ -156,18 +166,32 @@ def fill_lane(slot, sight, obstacles, lane):
 
 
 @allocation_free
-def way_clearance(p, slot, length, obstacles):
-    """Least clearance beyond d_OA = ``length`` [m] on the straight way from ``p`` (2,) to ``slot`` (2,) [m], in units of d_OA."""
-    u, w = slot[0] - p[0], slot[1] - p[1]
-    square, least = u * u + w * w, np.inf
-    way = np.sqrt(square)
+def fill_ways(p, slot, sight, obstacles, ways):
+    """Write the least clearance on the way from ``p`` (2,) to a slot, now at ``slot`` (2,) [m], to ``ways`` [d_OA], per delay.
+
+    Until it sets out, the agent moves along with the path. Then it approaches the slot at v_max relative to the slot, which moves
+    on. So a way is a straight line in space, and moves along with the path until the agent sets out.
+    """
+    x, y = slot[0] - p[0], slot[1] - p[1]
+    way = np.sqrt(x * x + y * y)
+    duration = way / sight.speed
+    for k in range(sight.delays.shape[0]):
+        ways[k] = MOST_BEYOND
     for o in range(obstacles.shape[0]):
-        x, y = p[0] - obstacles[o, 0], p[1] - obstacles[o, 1]
-        if _cannot_reach(x, y, way, obstacles[o, 2], length):
+        u, w = sight.path[1, 0], sight.path[1, 1]
+        if obstacles.shape[1] > 3:
+            u, w = u - obstacles[o, 3], w - obstacles[o, 4]
+        a, b = p[0] - obstacles[o, 0], p[1] - obstacles[o, 1]
+        farthest = way + np.sqrt(u * u + w * w) * (duration + sight.delays[-1])
+        if _cannot_reach(a, b, farthest, obstacles[o, 2], sight.length):
             continue
-        share = min(max(-(x * u + y * w) / square, 0.0), 1.0) if square > 0.0 else 0.0
-        least = min(least, np.sqrt((x + share * u) ** 2 + (y + share * w) ** 2) - obstacles[o, 2])
-    return _beyond(least, length)
+        along, across = x + duration * u, y + duration * w  # the way relative to the obstacle
+        square = along * along + across * across
+        for k in range(sight.delays.shape[0]):
+            c, d = a + sight.delays[k] * u, b + sight.delays[k] * w
+            share = min(max(-(c * along + d * across) / square, 0.0), 1.0) if square > 0.0 else 0.0
+            distance = np.sqrt((c + share * along) ** 2 + (d + share * across) ** 2)
+            ways[k] = min(ways[k], _beyond(distance - obstacles[o, 2], sight.length))
 
 
 @allocation_free
@@ -180,7 +204,7 @@ def _cannot_reach(x, y, way, radius, length):
 def pool_heard(heard, age):
     """(B, R, POOLED) float32, pooled messages of R receivers of B teams; R = 1 if all agents have heard the same.
 
-    Minima, means and maxima are over the senders heard so far. For lanes and straight ways, the mean is the share of negative
+    Minima, means and maxima are over the senders heard so far. For lanes and ways, the mean is the share of negative
     clearances, that is of blocked ones.
 
     Args:

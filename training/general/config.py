@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from marlbc_mj.policies.general import GeneralPolicy
-from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES, SENT
+from marlbc_mj.policies.general_inputs import FEATURES, INPUTS, LANE_BINS, LANES, SENT, WAYS
 from marlbc_mj.scenarios import Perturbation, Scenario
 from marlbc_mj.scenarios.teams import read_team, team_mission
 from marlbc_mj.training.config import TrainConfig, make_config
@@ -71,11 +71,11 @@ class GeneralConfig:
     """Upper bound of the factor on the disturbance, drawn from 0 to this for every episode."""
     start_spread: Annotated[float, NOT_NEGATIVE] = 0.5
     """Largest random offset of each coordinate of a start position [m]."""
-    lossy: Annotated[float, SHARE] = 0.3
+    lossy: Annotated[float, SHARE] = 0.5
     """Share of episodes in which agents miss messages from others."""
     most_loss: Annotated[float, SHARE] = 0.6
     """Upper bound of the share of missed messages, drawn from 0 to this for each such episode."""
-    silent: Annotated[float, SHARE] = 0.15
+    silent: Annotated[float, SHARE] = 0.4
     """Share of episodes in which the others never hear one random agent."""
 
     hidden: Annotated[tuple[int, ...], _LAYERS] = (64, 64)
@@ -239,7 +239,7 @@ def input_mask(config: GeneralConfig) -> np.ndarray | None:
         if name == "pooled":
             mask[:, FEATURES:] = 0.0
             continue
-        first, last = {"lanes": (0, LANES), "column-lane": (LANE_BINS, LANES), "ways": (LANES, LANES + 2)}[name]
+        first, last = {"lanes": (0, LANES), "column-lane": (LANE_BINS, LANES), "ways": (LANES, WAYS)}[name]
         for offset in offsets:
             mask[:, offset + first : offset + last] = 0.0
     return mask

@@ -21,8 +21,9 @@ from marlbc_mj.policies.general import (
 from marlbc_mj.policies.general_inputs import (
     CLEARANCE_ENTRY,
     COARSE,
+    COLUMN_WAY,
+    FORMATION_WAY,
     LANE_BINS,
-    LANES,
     SENT,
     WAYS,
     join_inputs,
@@ -211,17 +212,17 @@ class Squad:
 
 
 def shut_out(inputs: np.ndarray) -> np.ndarray:
-    """(W, N) bool: agents far from both slots, with the straight ways to both blocked; ``inputs`` (W, N, S)."""
+    """(W, N) bool: agents far from both slots, with the ways to both blocked; ``inputs`` (W, N, S)."""
     far = np.tanh(LOST_BEYOND / COARSE)
     away = (inputs[..., WAYS + 1] > far) & (inputs[..., WAYS + 3] > far)
-    return np.asarray((inputs[..., LANES:WAYS] < 0.0).all(axis=-1) & away)
+    return np.asarray((inputs[..., [FORMATION_WAY, COLUMN_WAY]] < 0.0).all(axis=-1) & away)
 
 
 def obstructed(inputs: np.ndarray, motion: np.ndarray) -> np.ndarray:
-    """(W, N) bool: agents close to an obstacle with a blocked straight way to their slot, one that comes closer than d_OA to an
+    """(W, N) bool: agents close to an obstacle with a blocked way to their slot, one that comes closer than d_OA to an
     obstacle; ``motion`` (W, N or 1) selects the slot, ``inputs`` (W, N, S).
     """
-    way = np.where(motion == COLUMN_ACTION, inputs[..., LANES + COLUMN_ACTION], inputs[..., LANES + FORMATION])
+    way = np.where(motion == COLUMN_ACTION, inputs[..., COLUMN_WAY], inputs[..., FORMATION_WAY])
     return np.asarray((inputs[..., CLEARANCE_ENTRY] < AVOIDS_WITHIN) & (way < 0.0))
 
 
@@ -235,5 +236,5 @@ def look_ahead(inputs: np.ndarray, last: np.ndarray, bins: np.ndarray) -> np.nda
     """
     seen = np.arange(LANE_BINS) < bins[:, None, None]
     blocked = (np.where(seen, inputs[..., :LANE_BINS], np.inf) < 0.0).any(axis=-1)
-    back = (last == COLUMN_ACTION).any(axis=1) & (inputs[..., LANES] < 0.0).any(axis=1)
+    back = (last == COLUMN_ACTION).any(axis=1) & (inputs[..., FORMATION_WAY] < 0.0).any(axis=1)
     return np.where((blocked.sum(axis=1) >= 2) | back, COLUMN_ACTION, FORMATION)

@@ -44,7 +44,7 @@ ARMS: dict[str, Arm] = {
     "full": Arm("VDN, the default", "one TD error for the mean of a team's values"),
     "no-pooling": Arm("no pooling", "an agent hears nobody", {"hide": ("pooled",)}),
     "no-lanes": Arm("no lanes", "no clearance along the lanes of the slots, own or heard", {"hide": ("lanes",)}),
-    "no-ways": Arm("no ways", "no clearance of the straight ways to the slots, own or heard", {"hide": ("ways",)}),
+    "no-ways": Arm("no ways", "no clearance of the ways to the slots, own or heard", {"hide": ("ways",)}),
     "no-consensus": Arm("no consensus", "every agent decides by its own values", {"consensus": False}),
     "hysteretic": Arm(
         "hysteretic", "every agent learns by itself, and half of each negative TD error counts", {"learner": "hysteretic"}
