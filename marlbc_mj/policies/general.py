@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.laws import compiled, inlined
+from marlbc_mj.core.laws import allocation_free, compiled, inlined
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general_inputs import (
     AGE_ENTRIES,
@@ -123,10 +123,23 @@ def agree(values: np.ndarray, leads: np.ndarray, age: np.ndarray) -> np.ndarray:
     return with_lead(values, mean_lead(np.ascontiguousarray(leads, dtype=np.float32), age))
 
 
-def lead_of_column(values: np.ndarray) -> np.ndarray:
-    """(...,) best value of an action that takes the column minus the best of one that takes the formation; values (..., A)."""
-    formation, column = (values[..., motion :: len(MOTIONS)].max(axis=-1) for motion in MOTIONS)
-    return np.asarray(column - formation)
+@compiled
+def lead_of_column(values):
+    """(B, N) best value of an action that takes the column minus the best of one that takes the formation; values (B, N, A)."""
+    lead = np.empty(values.shape[:2], dtype=values.dtype)
+    for b in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            lead[b, i] = best_value(values[b, i], COLUMN_ACTION) - best_value(values[b, i], FORMATION)
+    return lead
+
+
+@allocation_free
+def best_value(values, motion):
+    """Largest of the values (A,) of the actions that take a motion."""
+    best = values[motion]
+    for a in range(motion + len(MOTIONS), len(values), len(MOTIONS)):
+        best = max(best, values[a])
+    return best
 
 
 @compiled
@@ -144,12 +157,15 @@ def mean_lead(leads, age):
     return mean
 
 
-def with_lead(values: np.ndarray, lead: np.ndarray) -> np.ndarray:
+@compiled
+def with_lead(values, lead):
     """Values (B, N, A) relative to the formation's, shifted so that the column leads by ``lead`` (B, N or 1)."""
-    shifted = np.empty_like(values)
-    for motion, ahead in ((FORMATION, 0.0), (COLUMN_ACTION, lead[..., None])):
-        own = values[..., motion :: len(MOTIONS)]
-        shifted[..., motion :: len(MOTIONS)] = own - own.max(axis=-1, keepdims=True) + ahead
+    shifted = values.copy()
+    for b in range(values.shape[0]):
+        for i in range(values.shape[1]):
+            for motion in range(len(MOTIONS)):
+                shifted[b, i, motion :: len(MOTIONS)] -= best_value(values[b, i], motion)
+            shifted[b, i, COLUMN_ACTION :: len(MOTIONS)] += lead[b, min(i, lead.shape[1] - 1)]
     return shifted
 
 
