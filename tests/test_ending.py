@@ -175,7 +175,8 @@ def test_rendering_that_is_switched_off_renders_nothing(tmp_path):
 
 
 def test_a_robot_that_flies_off_is_status_3(monkeypatch, tmp_path, capsys):
-    row = robot_gate.GateRow("disc", "scripted", 8.0, 1.0, 0.0, 0, 1.0, 9514.0, 0.0, (0,), 0.0, None, None, "lost: 9514 m")
+    numbers = (8.0, 1.0, 0.0, 0, 1.0, 9514.0, 0.0, (0,), 0.0, None, None)
+    row = robot_gate.GateRow("disc", "scripted", "null-space", *numbers, "lost: 9514 m")
     monkeypatch.setattr(robot_gate.GateStudy, "run", lambda *_: row)
     with pytest.raises(SystemExit, match="3"):
         RobotGateCommand(("disc",), ("scripted",), out=tmp_path / "out", clips=False).run()

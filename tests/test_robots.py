@@ -230,13 +230,16 @@ def test_solid_obstacles_go_where_an_episode_has_them_and_stop_a_robot():
     assert min(clearance) == pytest.approx(0.25, abs=0.02)
 
 
-@pytest.mark.parametrize("name", REAL)
-def test_every_robot_flies_its_gate_under_the_script(name):
+@pytest.mark.parametrize(
+    ("name", "supervisor", "switches"),
+    [*((name, "scripted", (4, 2, 2, 2)) for name in REAL), ("crazyflie", "marlms-general", (2, 2, 2, 2))],
+)
+def test_every_robot_flies_its_gate(name, supervisor, switches):
     """No violation, no contact, tracking within 0.25 length units; a Crazyflie stays within its bounds on height and tilt."""
-    row, trajectory = fly_gate(name, "scripted")
+    row, trajectory = fly_gate(name, supervisor)
     robot = make_robot(name)
     assert row.violation == 0.0 and row.collisions == 0 and row.clearance > row.safe_distance
-    assert row.error < 0.25 * robot.length and row.switches == (4, 2, 2, 2)
+    assert row.error < 0.25 * robot.length and row.switches == switches
     speed = np.linalg.norm(trajectory.reference_velocity, axis=-1)
     change = np.linalg.norm(np.diff(trajectory.reference_velocity[:: trajectory.scenario.substeps], axis=0), axis=-1)
     assert speed.max() <= robot.speed_limit * (1 + 1e-12)

@@ -349,6 +349,23 @@ def test_missions_have_titles(name: str, title: str) -> None:
     assert set(MISSION_TITLES) == set(SCENARIOS) and set(ROBOT_TITLES) == set(ROBOTS)
 
 
+@pytest.mark.parametrize("size", [(1280, 720), (640, 320), (320, 180)])
+def test_a_long_title_does_not_cover_the_speed(log: EpisodeLog, size: tuple[int, int]) -> None:
+    """From a little left of the speed on, the upper bar looks the same with a short and with a very long title."""
+    long = replace(log, supervisor="marlms-general", controller="predefined-time-limited", seed=1_000_000, scenario="x" * 60)
+    picture = np.zeros((Caption(log, *size).picture_height, size[0], 3), np.uint8)
+    nobody = np.empty((0, 2)), np.empty(0)
+    short, full = (
+        np.asarray(Caption(each, *size, speed=3.0).frame(picture, 5.0, 100, *nobody))[: Caption(log, *size).header - 3]
+        for each in (replace(log, scenario="x", supervisor="", controller="", seed=0), long)
+    )
+    ink = np.flatnonzero((short != short[0, 0]).any(axis=(0, 2)))
+    speed = int(ink[np.diff(ink).argmax() + 1])
+    assert speed > 0.5 * size[0]
+    np.testing.assert_array_equal(full[:, speed - 4 :], short[:, speed - 4 :])
+    assert (full[:, : speed - 4] != full[0, 0]).any()
+
+
 @pytest.mark.parametrize("color", [*AGENT_COLORS, *BEHAVIOR_COLORS.values()])
 def test_text_is_readable_on_every_color(color: str) -> None:
     """The contrast (WCAG) is at least 2.6 to 1, which suits large bold text."""

@@ -62,7 +62,7 @@ def _of_studies() -> dict[str, dict[str, str]]:
     from marlbc_mj.studies.calibration import CALIBRATED
     from marlbc_mj.studies.learners.arms import ARMS
     from marlbc_mj.studies.learners.variants import VARIANTS
-    from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, GATE_SUPERVISORS
+    from marlbc_mj.studies.robot_gate import GATE_CONTROLLERS, GATE_METHODS
     from marlbc_mj.studies.safety import DRAG_DRAWS
     from marlbc_mj.studies.suite.definition import TRACKS, missions_of
 
@@ -74,7 +74,7 @@ def _of_studies() -> dict[str, dict[str, str]]:
         "study variants": {name: variant.line for name, variant in VARIANTS.items()},
         "arms of the general policy": {name: arm.line for name, arm in ARMS.items()},
         "calibrated controllers": dict.fromkeys(CALIBRATED, "its velocity gain"),
-        "supervisors of the gate": dict.fromkeys(GATE_SUPERVISORS, "with thresholds of the robot's size"),
+        "supervisors of the gate": {name: f"{method.composition} composition" for name, method in GATE_METHODS.items()},
         "controllers of the gate": dict.fromkeys(GATE_CONTROLLERS, "with the robot's gains"),
         "draws of the case study": {name: f"drag times {drag[0]:g}" for name, drag in DRAG_DRAWS.items()},
     }

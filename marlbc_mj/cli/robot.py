@@ -34,11 +34,14 @@ class RobotCheckCommand:
 
 @dataclass(frozen=True)
 class RobotGateCommand:
-    """Fly the gate mission, scaled to each robot, under several supervisors; writes a table, stills and clips."""
+    """Fly the gate mission, scaled to each robot, under several supervisors; writes a table, stills and clips.
+
+    Look-ahead and the general policy fly under the set-based composition, the others under the null-space one.
+    """
 
     robots: RobotNames = ()
     """Robots to fly; by default all but the point mass."""
-    supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms")
+    supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms", "lookahead", "marlms-general")
     """Supervisors to run; stills and clips show the episodes of the first one."""
     controller: GateControllerName = "pd"
     """Controller, with the robot's gains."""

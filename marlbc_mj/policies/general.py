@@ -120,7 +120,8 @@ def agree(values: np.ndarray, leads: np.ndarray, age: np.ndarray) -> np.ndarray:
         leads: (B, N, N) or (B, 1, N), row i is the newest lead of each agent that agent i knows, its own included.
         age: age of these leads [T]; infinite where none is known.
     """
-    return with_lead(values, mean_lead(np.ascontiguousarray(leads, dtype=np.float32), age))
+    agreed: np.ndarray = with_lead(values, mean_lead(np.ascontiguousarray(leads, dtype=np.float32), age))
+    return agreed
 
 
 @compiled

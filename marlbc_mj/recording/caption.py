@@ -22,6 +22,8 @@ PAPER, INK, MUTED, RULE = "#FFFFFF", "#1B1F26", "#5C6470", "#D9DDE3"
 GHOST_COLOR = "#A9B2BE"
 TEAM_STATES = {2: "in formation", 1: "in column"}
 """Texts for the team's formation, by G."""
+LEAST_SHRINK = 0.5
+"""The texts of the upper bar are at least this share of their size."""
 MEANINGS = {"OA": "obstacle avoidance", "FM": "formation", "FR": "column", "AA": "agent avoidance"}
 
 NumberPlace = Literal["inside", "on", "above"]
@@ -173,6 +175,10 @@ class Pen:
         self.draw.ellipse(box, color)
         self.x += 2 * radius + gap
 
+    def clear(self, x: float) -> None:
+        """Cut off what is drawn on the bar to the right of ``x``."""
+        self.draw.rectangle([x * self.scale, 0, self.image.width, self.image.height], PAPER)
+
     def rule(self, y: float) -> None:
         """Draw a hairline across the bar."""
         self.draw.line([0, y * self.scale, self.image.width, y * self.scale], RULE, round(self.scale))
@@ -191,13 +197,21 @@ class Pen:
 
 
 def _draw_header(pen: Pen, log: EpisodeLog, speed: float | None) -> None:
-    y = 0.5 * HEADER
-    pen.text(mission_title(log.scenario), y, 20, INK, bold=True, gap=18)
-    pen.text(" + ".join(source_of(name).display for name in (log.supervisor, log.controller) if name), y, 17, INK, gap=18)
+    """Mission, methods and seed, smaller and at last cut off if they would reach the playback speed or the clock."""
+    y, gap = 0.5 * HEADER, 18.0
+    end = pen.width - 24 - pen.length("t = 000.0 s", 20, True) - (0 if speed is None else 84)
+    methods = " + ".join(source_of(name).display for name in (log.supervisor, log.controller) if name)
+    texts = [(mission_title(log.scenario), 20, INK, True), (methods, 17, INK, False)]
     if log.seed:
-        pen.text(f"seed {log.seed}", y, 15, MUTED)
+        texts.append((f"seed {log.seed}", 15, MUTED, False))
+    shrink, room = 1.0, end - pen.x
+    while shrink > LEAST_SHRINK and sum(pen.length(text, shrink * size, bold) + gap for text, size, _, bold in texts) > room:
+        shrink -= 0.02
+    for text, size, color, bold in texts:
+        pen.text(text, y, shrink * size, color, bold=bold, gap=gap)
+    pen.clear(end - gap)
     if speed is not None:
-        pen.x = pen.width - 24 - pen.length("t = 000.0 s", 20, True) - 84
+        pen.x = end
         pen.pill(f"{speed:g}\N{MULTIPLICATION SIGN}", y, 14, MUTED, width=52)
     pen.rule(HEADER - 1)
 

@@ -1,9 +1,9 @@
-"""Every robot on a gate mission of its own scale, under three supervisors: one table, and stills and clips for a gallery."""
+"""Every robot on a gate mission of its own scale, under several supervisors: one table, and stills and clips for a gallery."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from PIL import Image
@@ -23,18 +23,31 @@ from marlbc_mj.scenarios.robot_gate import robot_gate
 from marlbc_mj.studies.engines import EngineName
 from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import Conclusion, counting, run_study
-from marlbc_mj.supervisors import FSAMS, MPCMS, Scripted, Supervisor
+from marlbc_mj.supervisors import FSAMS, MPCMS, LookAhead, Scripted, Supervisor, make_supervisor
 from marlbc_mj.util.errors import SimulationError, unknown
 from marlbc_mj.util.files import write_json
 from marlbc_mj.util.method_names import display_name
 from marlbc_mj.util.progress import Progress, silent
 
-GATE_SUPERVISORS: dict[str, Callable[[Robot], Supervisor]] = {
-    "scripted": lambda robot: Scripted(),
-    "fsams-hysteresis": lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5),
-    "mpcms": lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))),
+
+class GateMethod(NamedTuple):
+    """A supervisor at a robot's scale, and the composition under which it flies the gate."""
+
+    supervisor: Callable[[Robot], Supervisor]
+    composition: Literal["null-space", "set-based"]
+
+
+GATE_METHODS = {
+    "scripted": GateMethod(lambda robot: Scripted(), "null-space"),
+    "fsams-hysteresis": GateMethod(lambda robot: FSAMS(hysteresis=0.3 * robot.length, dwell=0.5), "null-space"),
+    "mpcms": GateMethod(
+        lambda robot: MPCMS(margin=0.15 * robot.length, horizon=200, instants=tuple(range(0, 200, 20))), "null-space"
+    ),
+    "lookahead": GateMethod(lambda robot: LookAhead(), "set-based"),
+    "marlms-general": GateMethod(lambda robot: make_supervisor("marlms-general"), "set-based"),
 }
-"""Supervisors of the benchmark, with lengths at the robot's scale. MPCMS looks 10 s ahead: references take seconds to react."""
+"""The supervisors that fly the gate, by name. MPCMS looks 10 s ahead: references take seconds to react. Look-ahead and the
+general policy have no lengths of their own that need a scale."""
 
 GATE_CONTROLLERS: dict[str, Callable[[Robot], Controller]] = {
     "pd": lambda robot: PD(*robot.gains),
@@ -54,6 +67,7 @@ class GateRow(NamedTuple):
 
     robot: str
     supervisor: str
+    composition: str
     clearance: float  # least distance from the controlled point to an obstacle's surface [m]
     safe_distance: float  # [m]
     violation: float  # violation time of the worst agent [s]
@@ -72,7 +86,7 @@ class GateJob(NamedTuple):
     """One episode of a robot's gate mission."""
 
     robot: str
-    supervisor: str  # a key of GATE_SUPERVISORS
+    supervisor: str  # a key of GATE_METHODS
     controller: str  # a key of GATE_CONTROLLERS
     shown: bool  # whether stills and a clip are rendered
 
@@ -118,10 +132,11 @@ def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateR
         ConfigurationError: an unknown name.
         SimulationError: the world diverged.
     """
-    for kind, name, valid in (("supervisor", supervisor, GATE_SUPERVISORS), ("controller", controller, GATE_CONTROLLERS)):
+    for kind, name, valid in (("supervisor", supervisor, GATE_METHODS), ("controller", controller, GATE_CONTROLLERS)):
         if name not in valid:
             raise unknown(kind, name, valid)
-    body, scenario = make_robot(robot), robot_gate(robot)
+    body, method = make_robot(robot), GATE_METHODS[supervisor]
+    scenario = robot_gate(robot, composition=method.composition)
     world = World(scenario, GATE_CONTROLLERS[controller](body), record=True)
     touches: list[bool] = []
 
@@ -129,14 +144,15 @@ def fly_gate(robot: str, supervisor: str, controller: str = "pd") -> tuple[GateR
         touches.append(touching(world))
 
     names = (supervisor, controller)
-    trajectory = run_episode(world, GATE_SUPERVISORS[supervisor](body), names=names, on_frame=watch)
+    trajectory = run_episode(world, method.supervisor(body), names=names, on_frame=watch)
     return _row(robot, supervisor, trajectory, world, sum(touches)), trajectory
 
 
 def _failed_row(job: GateJob, reason: str) -> GateRow:
     """The row of an episode that failed."""
     nan = float("nan")
-    return GateRow(job.robot, job.supervisor, nan, nan, nan, 0, nan, nan, nan, (), nan, None, None, reason)
+    composition = GATE_METHODS[job.supervisor].composition
+    return GateRow(job.robot, job.supervisor, composition, nan, nan, nan, 0, nan, nan, nan, (), nan, None, None, reason)
 
 
 def touching(world: World) -> bool:
@@ -157,6 +173,7 @@ def _row(robot: str, supervisor: str, trajectory: Trajectory, world: World, coll
     return GateRow(
         robot=robot,
         supervisor=supervisor,
+        composition=scenario.composition,
         clearance=min(a["clearance_min"] for a in agents),
         safe_distance=scenario.safe_distance,
         violation=SCORES["violation_time_worst"].read(measured),
@@ -190,17 +207,19 @@ def _lost(error: float, world: World) -> str | None:
 
 def gate_table(rows: Sequence[GateRow]) -> str:
     """A Markdown table with one row per robot and supervisor."""
-    head = ("robot", "supervisor", "least clearance / safe", "violation, worst agent", "contacts", "between agents")
-    return pipe_table((*head, "tracking, RMS", "saturated", "switches", "height, tilt"), list(map(_gate_cells, rows)))
+    head = ("robot", "supervisor", "composition", "least clearance / safe", "violation, worst agent", "contacts")
+    measured = ("between agents", "tracking, RMS", "saturated", "switches", "height, tilt")
+    return pipe_table((*head, *measured), list(map(_gate_cells, rows)))
 
 
 def _gate_cells(r: GateRow) -> tuple[str, ...]:
     if r.failure is not None:
-        return (r.robot, display_name(r.supervisor), f"failed: {r.failure}", *("–",) * 7)
+        return (r.robot, display_name(r.supervisor), r.composition, f"failed: {r.failure}", *("–",) * 7)
     flight = f"{1e3 * r.height_error:.1f} mm, {r.tilt:.1f}°" if r.height_error is not None and r.tilt is not None else "–"
     return (
         r.robot,
         display_name(r.supervisor),
+        r.composition,
         f"{r.clearance:.2f} / {r.safe_distance:.2f} m",
         f"{r.violation:.2f} s",
         str(r.collisions),
