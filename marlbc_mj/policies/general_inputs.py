@@ -149,13 +149,16 @@ def fill_lane(slot, sight, obstacles, lane):
         lane[k] = MOST_BEYOND
     first, last = sight.edges[0], sight.edges[LANE_BINS]
     middle, half = 0.5 * (first + last), 0.5 * (last - first)
+    u, w = sight.path[1, 0], sight.path[1, 1]
+    square = u * u + w * w
+    reach = half * np.sqrt(square)
     for o in range(obstacles.shape[0]):
         x, y = slot[0] - obstacles[o, 0], slot[1] - obstacles[o, 1]
-        u, w = sight.path[1, 0], sight.path[1, 1]
         if obstacles.shape[1] > 3:
-            u, w = u - obstacles[o, 3], w - obstacles[o, 4]
-        square = u * u + w * w
-        if _cannot_reach(x + middle * u, y + middle * w, half * np.sqrt(square), obstacles[o, 2], sight.length):
+            u, w = sight.path[1, 0] - obstacles[o, 3], sight.path[1, 1] - obstacles[o, 4]
+            square = u * u + w * w
+            reach = half * np.sqrt(square)
+        if _cannot_reach(x + middle * u, y + middle * w, reach, obstacles[o, 2], sight.length):
             continue
         when = -(x * u + y * w) / square if square > 0.0 else 0.0
         aside = (x + when * u) ** 2 + (y + when * w) ** 2
@@ -177,12 +180,13 @@ def fill_ways(p, slot, sight, obstacles, ways):
     duration = way / sight.speed
     for k in range(sight.delays.shape[0]):
         ways[k] = MOST_BEYOND
+    u, w = sight.path[1, 0], sight.path[1, 1]
+    farthest = way + np.sqrt(u * u + w * w) * (duration + sight.delays[-1])
     for o in range(obstacles.shape[0]):
-        u, w = sight.path[1, 0], sight.path[1, 1]
-        if obstacles.shape[1] > 3:
-            u, w = u - obstacles[o, 3], w - obstacles[o, 4]
         a, b = p[0] - obstacles[o, 0], p[1] - obstacles[o, 1]
-        farthest = way + np.sqrt(u * u + w * w) * (duration + sight.delays[-1])
+        if obstacles.shape[1] > 3:
+            u, w = sight.path[1, 0] - obstacles[o, 3], sight.path[1, 1] - obstacles[o, 4]
+            farthest = way + np.sqrt(u * u + w * w) * (duration + sight.delays[-1])
         if _cannot_reach(a, b, farthest, obstacles[o, 2], sight.length):
             continue
         along, across = x + duration * u, y + duration * w  # the way relative to the obstacle
