@@ -80,7 +80,7 @@ def gate_shot(name: str, log: EpisodeLog, scenario: Scenario) -> Shot:
     """What is seen at the gate, from the first that comes into the picture to the last that leaves it."""
     unit, speed = scenario.fleet.length, scenario.path_velocity[0]
     start, end = (unit * (GATE_MIDDLE + side * 1.4 * REACH - ORIGIN) / speed for side in (-1.0, 1.0))
-    return Shot(f"gallery/{name}", log, style(log, start, end, f"at:{unit * GATE_MIDDLE},0,{unit * REACH}", 8))
+    return Shot(f"gallery/{name}", log, style(log, start, end, f"at:{unit * GATE_MIDDLE},0,{unit * REACH}", 6))
 
 
 def style(log: EpisodeLog, start: float, end: float, camera: str, fps: int) -> VideoStyle:
