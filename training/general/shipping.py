@@ -93,8 +93,8 @@ def _what(train: dict[str, Any], *, consensus: bool) -> str:
     composition = train.get("composition", "set-based")
     method = "Policy distillation into" if train.get("teachers") else "Dueling Q-learning of"
     return (
-        f"{method} one policy that every agent of every team shares. Every 1.2 settling times each agent decides by "
-        f"itself {_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
+        f"{method} one policy that every agent of every team shares. Every 1.2 settling times each agent decides "
+        f"{_DECIDES[composition]}, from {FEATURES} numbers of its own, of which it sends {SENT}, and {INPUTS - FEATURES} "
         f"that it pools of what it heard. {_BY_CONSENSUS if consensus else ''}It needs the {composition} "
         "composition, a formation with a column and a path that moves."
     )
