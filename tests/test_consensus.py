@@ -30,6 +30,8 @@ def test_a_lead_moves_the_column_against_the_formation(actions: int) -> None:
         own, other = values[..., motion::2], moved[..., motion::2]
         np.testing.assert_allclose(other - other[..., :1], own - own[..., :1], atol=1e-6)
     np.testing.assert_array_equal(lead_of_column(values), values[..., 1::2].max(axis=-1) - values[..., 0::2].max(axis=-1))
+    values[0, 0, -1] = np.nan  # not hidden by the other actions
+    assert np.isnan(lead_of_column(values)).sum() == np.isnan(lead_of_column(values)[0, 0]) == 1
 
 
 @pytest.mark.parametrize("actions", [2, 4])

@@ -41,8 +41,8 @@ class RobotGateCommand:
 
     robots: RobotNames = ()
     """Robots to fly; by default all but the point mass."""
-    supervisors: GateSupervisorNames = ("scripted", "fsams-hysteresis", "mpcms", "lookahead", "marlms-general")
-    """Supervisors to run; stills and clips show the episodes of the first one."""
+    supervisors: GateSupervisorNames = ()
+    """Supervisors to run; by default all. Stills and clips show the episodes of the first one."""
     controller: GateControllerName = "pd"
     """Controller, with the robot's gains."""
     out: Path = Path("out/robots")
@@ -59,12 +59,12 @@ class RobotGateCommand:
 
     def run(self) -> None:
         """Fly, write the results and print the table; exit with status 3 if an episode failed, which the table shows, too."""
-        from marlbc_mj.studies.robot_gate import SHOWN, run_gates
+        from marlbc_mj.studies.robot_gate import GATE_METHODS, SHOWN, run_gates
 
         with self.output.progress() as told:
             done = run_gates(
                 self.robots or SHOWN,
-                self.supervisors,
+                self.supervisors or tuple(GATE_METHODS),
                 self.out,
                 controller=self.controller,
                 clips=self.clips,

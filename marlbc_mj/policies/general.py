@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from marlbc_mj.core.laws import allocation_free, compiled, inlined
+from marlbc_mj.core.laws import compiled, inlined
 from marlbc_mj.policies.checkpoint import read_arrays, write_arrays
 from marlbc_mj.policies.general_inputs import (
     AGE_ENTRIES,
@@ -134,13 +134,10 @@ def lead_of_column(values):
     return lead
 
 
-@allocation_free
+@compiled
 def best_value(values, motion):
-    """Largest of the values (A,) of the actions that take a motion."""
-    best = values[motion]
-    for a in range(motion + len(MOTIONS), len(values), len(MOTIONS)):
-        best = max(best, values[a])
-    return best
+    """Largest of the values (A,) of the actions that take a motion; NaN if one of them is."""
+    return values[motion :: len(MOTIONS)].max()
 
 
 @compiled
