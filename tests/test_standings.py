@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marlbc_mj.report.leaderboard import make_boards
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns
 from marlbc_mj.results.standings import behind, by_cost, by_return, improvement, median_interval, notable_layouts, rank_methods
 from marlbc_mj.util.errors import ConfigurationError
@@ -53,6 +54,14 @@ def test_every_track_may_weigh_the_same() -> None:
     by_mission, by_track = rank_methods(group), rank_methods(group, by_track=True)
     assert {row.method: row.shares["success"].value for row in by_mission} == pytest.approx({A: 2 / 3, B: 1 / 3})
     assert {row.method: row.shares["success"].value for row in by_track} == pytest.approx({A: 0.5, B: 0.5})
+
+
+def test_medians_on_the_board_give_every_track_the_same_weight() -> None:
+    missions = (("first", "one", 2.0), ("first", "two", 4.0), ("second", "three", 9.0))
+    group = [MissionRuns(track, name, A, (run(0, True)._replace(switches=median),)) for track, name, median in missions]
+    board = make_boards(group, {"first": "", "second": ""})[0]
+    switches = [column.head for column in board.columns].index("switches")
+    assert board.rows[0].cells[switches].text == "6.0"  # not 5.0, the mean over missions
 
 
 def test_a_method_that_did_not_fly_everything_has_no_rank() -> None:

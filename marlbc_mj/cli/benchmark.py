@@ -263,7 +263,7 @@ class SafetyCommand:
     layouts: int = 1000
     """Layouts per supervisor and mission."""
     searched: int = 100
-    """Layouts per mission for mpcms and rollout, which take seconds per layout."""
+    """Layouts per mission for mpcms and rollout, which take about a second per layout."""
     seed: int = 80_000
     """Seed of the first layout."""
     controller: ControllerName = "sorlc"

@@ -1,5 +1,6 @@
 """leaderboard.html and leaderboard.tex: separate rankings of the suite's supervisors and controllers."""
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -134,12 +135,18 @@ def _share(kind: str) -> Callable[[Standing], Estimate]:
 
 
 def _median(name: str) -> Callable[[Standing], Estimate]:
-    """Read the mean over missions of a score's median, without an interval; missions on which no run finished are left out."""
+    """Read the mean over tracks of the mean over missions of a score's median, without an interval.
+
+    Missions on which no run finished are left out.
+    """
 
     def read(standing: Standing) -> Estimate:
-        columns = [finished(each, name) for each in standing.flown.values()]
-        medians = [float(np.median(column)) for column in columns if len(column)]
-        return Estimate(float(np.mean(medians)) if medians else np.nan, np.nan, np.nan)
+        medians = defaultdict(list)
+        for each in standing.flown.values():
+            if len(column := finished(each, name)):
+                medians[each.track].append(np.median(column))
+        means = [np.mean(own) for own in medians.values()]
+        return Estimate(float(np.mean(means)) if means else np.nan, np.nan, np.nan)
 
     return read
 

@@ -50,7 +50,7 @@ ORDER_SUPERVISORS = (
 )
 """Supervisors that give orders, run under either composition; the last one supports the set-based composition only."""
 SEARCHES = ("mpcms", "rollout")
-"""Supervisors that take seconds per layout."""
+"""Supervisors that take about a second per layout."""
 LINES = "-lines"
 """Suffix of the name of a team that approaches its column along the lines of its slots."""
 FIRST_SEED = 80_000
