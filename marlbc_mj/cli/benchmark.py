@@ -67,7 +67,7 @@ class BenchCommand:
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
+    """Give agents a shield, which changes forces where needed so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
@@ -160,7 +160,7 @@ class RunCommand:
     overwrite: bool = False
     """Replace what is in the output folder."""
     shield: bool = False
-    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
+    """Give agents a shield, which changes forces where needed so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
@@ -215,7 +215,7 @@ class EvaluateCommand:
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
+    """Give agents a shield, which changes forces where needed so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 

@@ -124,7 +124,7 @@ class CommunicationCommand:
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
-    """Give agents a shield, which changes forces as little as possible so that agents can always stop in time."""
+    """Give agents a shield, which changes forces where needed so that agents can always stop in time."""
     mission: OmitArgPrefixes[ScenarioOptions] = field(default_factory=ScenarioOptions)
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 

@@ -1,9 +1,10 @@
 """The shield: the force nearest to the controller's that keeps every agent able to stop in time, whatever f does.
 
 :mod:`marlbc_mj.core.stopping` defines what is safe: the velocity w that a force leads to must be in one disc for every near thing
-(obstacle or agent). From |v| = h U / m on, braking is in all discs at once. Below it, stopping within the substep is, except for
-a drift of h^2 B / m, which a retreat from the nearest thing makes up for. Hence S is invariant for any number of agents and any
-controller; docs/shield.md has the proof and its assumptions.
+(obstacle or agent). From |v| = h U / m on, braking is in all discs at once. Below that speed, stopping within the substep is in
+them, except for a drift of h^2 B / m. A retreat from the nearest thing makes up for the drift. Hence S is invariant under any
+controller while at most one thing is close to a slow agent; with several this is tested, not proved. docs/shield.md has the proof
+and its assumptions.
 
 The least change for one thing is the projection of w onto its disc. This is the exact discrete form of the barrier
 sqrt(2 a d) + n.v (Wang, Ames & Egerstedt 2017): nothing is linearized, and the tangential speed counts.

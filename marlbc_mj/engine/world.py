@@ -50,7 +50,7 @@ class World:
         threads: number of threads over which worlds are distributed.
         record: whether to record every substep.
         native: None uses the compiled loop if all laws are compiled, False forces the Python path.
-        shield: changes forces or references as little as possible, so that agents can always stop; True is ``Shield()``.
+        shield: changes forces or references where needed, so that agents can always stop; True is ``Shield()``.
 
     Raises:
         ConfigurationError: a setting that cannot be run.

@@ -1,4 +1,4 @@
-"""How fast the benchmark is on this machine: one job per group of variants, which take turns so that their ratios hold."""
+"""Speed of the benchmark on this machine. One job measures a group of variants in turn, so that their ratios are fair."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

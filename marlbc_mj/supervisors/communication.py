@@ -9,8 +9,8 @@ the scenario (:class:`~marlbc_mj.core.communication.Communication`) carries it b
 - **Consensus.** First-order dynamic average consensus (Kia et al. 2019): every agent keeps an estimate x of the mean message m,
   x_i <- x_i - eps sum_j a_ij (x_i - x_j) + dm_i, with eps = 1 and Metropolis weights a_ij = 1 / (1 + max(d_i, d_j)). A pair
   exchanges only if both the message and its acknowledgment arrive, and both estimates then move by the same amount. So the sum
-  of all x remains the sum of all m, whatever is lost. A round takes two delays, or the period if that is longer. What an agent
-  hears "of j" is its own estimate for every j: it yields means and sums, but no minima or maxima.
+  of all x remains the sum of all m, whatever is lost. A round takes two delays, or the period if that is longer. The entry of
+  every agent j holds the same number, agent i's own estimate. So means and sums can be computed from it, but no minima or maxima.
 
 While a team is disconnected, each part has the messages of its own members and those heard from the others before; time stamps
 give their age. The supervisor decides how to use them.
