@@ -1,6 +1,5 @@
 """leaderboard.html and leaderboard.tex: separate rankings of the suite's supervisors and controllers."""
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +14,16 @@ from marlbc_mj.report.table import Column, Table
 from marlbc_mj.report.tables import latex_document
 from marlbc_mj.report.templates import render
 from marlbc_mj.results.layout_runs import Method, MissionRuns
-from marlbc_mj.results.standings import Notable, Standing, by_cost, finished, notable_layouts, rank_methods, share_of
+from marlbc_mj.results.standings import (
+    Notable,
+    Standing,
+    by_cost,
+    finished,
+    mission_weights,
+    notable_layouts,
+    rank_methods,
+    share_of,
+)
 from marlbc_mj.results.statistics import Estimate
 from marlbc_mj.util.method_names import display_name
 
@@ -135,18 +143,17 @@ def _share(kind: str) -> Callable[[Standing], Estimate]:
 
 
 def _median(name: str) -> Callable[[Standing], Estimate]:
-    """Read the mean over tracks of the mean over missions of a score's median, without an interval.
+    """Read the mean over missions of a score's median, every track with the same weight, without an interval.
 
     Missions on which no run finished are left out.
     """
 
     def read(standing: Standing) -> Estimate:
-        medians = defaultdict(list)
-        for each in standing.flown.values():
-            if len(column := finished(each, name)):
-                medians[each.track].append(np.median(column))
-        means = [np.mean(own) for own in medians.values()]
-        return Estimate(float(np.mean(means)) if means else np.nan, np.nan, np.nan)
+        medians = {mission: np.median(column) for mission, each in standing.flown.items() if len(column := finished(each, name))}
+        if not medians:
+            return Estimate(np.nan, np.nan, np.nan)
+        weights = mission_weights({mission: standing.flown[mission].track for mission in medians}, by_track=True)
+        return Estimate(sum(weights[mission] * float(median) for mission, median in medians.items()), np.nan, np.nan)
 
     return read
 

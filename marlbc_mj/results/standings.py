@@ -106,7 +106,7 @@ def rank_methods(
         table[each.method][each.mission] = each
     tracks = {each.mission: each.track for each in group}
     complete = [method for method, flown in table.items() if len(flown) == len(tracks)]
-    rows = _ranked(complete, table, _weights(tracks, by_track), reference, merit) if complete else []
+    rows = _ranked(complete, table, mission_weights(tracks, by_track=by_track), reference, merit) if complete else []
     others = [_unranked(method, flown) for method, flown in table.items() if method not in complete]
     return [*sorted(rows, key=lambda row: row.rank.value), *others]
 
@@ -150,8 +150,8 @@ class _Matrix(NamedTuple):
     drawn: np.ndarray  # (R, n) weights of the layouts in R bootstrap samples; rows sum to 1
 
 
-def _weights(tracks: Mapping[str, str], by_track: bool) -> dict[str, float]:
-    """Weight of each mission; the weights sum to 1."""
+def mission_weights(tracks: Mapping[str, str], *, by_track: bool) -> dict[str, float]:
+    """Weight of each mission, given its track; every track has the same weight, or every mission. The weights sum to 1."""
     names = list(tracks.values())
     raw = {mission: 1.0 / names.count(track) if by_track else 1.0 for mission, track in tracks.items()}
     return {mission: weight / sum(raw.values()) for mission, weight in raw.items()}
