@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from marlbc_mj.controllers import Controller
+from marlbc_mj.core.safety import violates
 from marlbc_mj.engine.loop import FORMATION_REWARD, VIOLATION_REWARD
 from marlbc_mj.engine.world import World
 from marlbc_mj.policies.actions import order_of
@@ -20,7 +21,7 @@ from marlbc_mj.util.seeding import stream
 class DecisionOutcome(NamedTuple):
     """Outcome of one decision in every world."""
 
-    state: np.ndarray  # (B, S) at the next decision; where an episode ended, at the start of the new one
+    state: np.ndarray  # (B, S) at the next decision; where an episode ended, at the start of the new one if there is an autoreset
     final_state: np.ndarray  # (B, S) like ``state``, but the true successor where an episode ended
     formation: np.ndarray  # (B,) r1 without violations (14), 5 G per mission step, summed over the decision
     violation: np.ndarray  # (B,) -10 per mission step with an agent at or within the safe distance (14), likewise
@@ -39,7 +40,7 @@ class DecisionOutcome(NamedTuple):
 
     @property
     def ended(self) -> np.ndarray:
-        """(B,) bool, the episode ended and a new one has begun."""
+        """(B,) bool, the episode ended."""
         return np.asarray(self.terminal | self.truncated)
 
 
@@ -55,6 +56,7 @@ class FormationBatch:
         state: ``"extended"`` or ``"published"``.
         actions: name of the action set, see :func:`order_of`.
         starts: where episodes begin.
+        autoreset: whether an episode begins in the step that ends the one before; otherwise :meth:`reset` begins it.
 
     Raises:
         ConfigurationError: a setting is invalid.
@@ -71,6 +73,7 @@ class FormationBatch:
         state: str = "extended",
         actions: str = "commands",
         starts: Starts | None = None,
+        autoreset: bool = True,
     ) -> None:
         if not isinstance(interval, int | np.integer) or interval < 1 or scenario.mission_steps % interval:
             raise ConfigurationError(
@@ -89,11 +92,13 @@ class FormationBatch:
         self.action_of = np.array([command_of.index(c) if c in command_of else 0 for c in commands])  # 0: not in the set
         self.read = make_state(state, scenario)
         self.world = World(scenario, controller, worlds=worlds, threads=threads)
-        self.starts = starts or Starts()
+        self.starts, self.autoreset = starts or Starts(), autoreset
+        self.over = np.full(worlds, not autoreset)  # whether a reset must come before the next step
         self.cut = np.zeros(worlds, dtype=np.int64)  # mission step at which the episode is cut
         self.last = np.zeros((worlds, scenario.agents), dtype=np.int64)  # actions in force
         self.turn = np.full(worlds, -1)  # action with which the whole team should begin, from Starts.turning; -1: none
         self.rngs = [stream(0, b) for b in range(worlds)]  # each world's episodes are drawn from its own
+        self.number = np.arange(worlds)  # of the world in its streams: 0 if it has a seed of its own
         self.route = Route(scenario, self.starts, interval, command_of)
 
     @property
@@ -114,8 +119,9 @@ class FormationBatch:
     def reset(self, seed: int | Sequence[int | None] = 0, mask: np.ndarray | None = None) -> np.ndarray:
         """Start new episodes; returns the states (B, S).
 
-        World b draws this and all later episodes from its own random stream, (seed, b), so its episodes depend on neither B nor
-        the other worlds.
+        Every world draws this and all later episodes from its own random stream, so its episodes depend on neither B nor the
+        other worlds. The stream of world b is (seed, b) if all worlds have one seed, and (seed, 0) for a seed of its own: worlds
+        with equal seeds then fly equal episodes.
 
         Args:
             seed: one seed for all worlds, or one per world; for None, the world's stream continues.
@@ -124,19 +130,33 @@ class FormationBatch:
         Raises:
             ConfigurationError: a seed is negative, the number of seeds is not B, or the mask is not (B,) bool.
         """
-        worlds = self.world.worlds
-        seeds = list(seed) if isinstance(seed, Sequence | np.ndarray) else [seed] * worlds
-        if len(seeds) != worlds or any(s is not None and (not isinstance(s, int | np.integer) or s < 0) for s in seeds):
-            raise ConfigurationError(f"a seed must be a non-negative whole number, or a list with {worlds} of them, got {seed}")
-        chosen = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask)
-        if chosen.shape != (worlds,) or chosen.dtype != np.bool_:
-            raise ConfigurationError(
-                f"the mask of a reset must be bool with shape ({worlds},), got {chosen.dtype} with shape {chosen.shape}"
-            )
+        seeds, chosen = self.one_per_world("seed", seed, may_be_none=True), self._mask(mask)
+        one = not isinstance(seed, Sequence | np.ndarray)
         for b in np.flatnonzero(chosen).tolist():
             given = seeds[b]
-            self.rngs[b] = self.rngs[b] if given is None else stream(given, b)
+            if given is not None:
+                self.number[b] = b if one else 0
+                self.rngs[b] = stream(given, int(self.number[b]))
         self._restart(chosen)
+        return self.states()
+
+    def reset_to(self, layouts: Sequence[int] | int, mask: np.ndarray | None = None) -> np.ndarray:
+        """Start missions on layouts by number; returns the states (B, S). Random streams stay as they are.
+
+        On layout k of a scenario of :func:`~marlbc_mj.scenarios.held_out`, ``marlbc evaluate --seed k`` flies its first mission.
+
+        Args:
+            layouts: one number per world, or one for all.
+            mask: (B,) bool, the worlds to restart; all by default.
+
+        Raises:
+            ConfigurationError: a number is negative, their count is not B, or the mask is not (B,) bool.
+        """
+        numbers = self.one_per_world("layout", layouts)
+        chosen = self._mask(mask)
+        for b in np.flatnonzero(chosen).tolist():
+            self.world.begin(b, stream(numbers[b]))
+        self._begun(chosen)
         return self.states()
 
     def states(self) -> np.ndarray:
@@ -147,9 +167,11 @@ class FormationBatch:
         """Make one decision in every world; ``actions`` (B, N) are indices into the action set.
 
         Raises:
-            ConfigurationError: actions have the wrong shape, are not integers, or are out of range.
+            ConfigurationError: actions have the wrong shape, are not integers, or are out of range, or no episode is going on.
             SimulationError: a world diverged.
         """
+        if self.over.any():
+            raise ConfigurationError("no episode is going on: call reset() before the first step and after the end of a mission")
         self.last = self._checked(actions)
         before, state = self.world.observe(), self.world.state
         reward, formation, violation, clearance = self._hold(self.order_of[self.last])
@@ -157,9 +179,11 @@ class FormationBatch:
         terminal = state.steps >= self.scenario.mission_steps
         truncated = (state.steps >= self.cut) & ~terminal
         final = self.states()
-        now = final
-        if (terminal | truncated).any():
-            self._restart(terminal | truncated)
+        now, ended = final, terminal | truncated
+        if not self.autoreset:
+            self.over = ended
+        elif ended.any():
+            self._restart(ended)
             now = self.states()
         return DecisionOutcome(
             now,
@@ -189,7 +213,7 @@ class FormationBatch:
             if self.world.advance(orders):
                 self.world.raise_if_diverged()
             reward += state.reward
-            violated = (state.clearance <= self.scenario.safe_distance).any(axis=1)
+            violated = violates(state.clearance, self.scenario.safe_distance).any(axis=1)
             violation += VIOLATION_REWARD * violated
             formation += np.where(violated, 0.0, FORMATION_REWARD * state.formation)
             np.minimum(clearance, state.clearance, out=clearance)
@@ -212,16 +236,46 @@ class FormationBatch:
             raise ConfigurationError(f"actions must be from 0 to {most}, got {given[b, i]} for world {b}, agent {i + 1}")
         return given.astype(np.int64)
 
+    def one_per_world(self, what: str, given: Any, *, may_be_none: bool = False) -> list[Any]:
+        """One number per world, from one for all or from a list.
+
+        Raises:
+            ConfigurationError: a number is negative, or their count is not B.
+        """
+        worlds = self.world.worlds
+        numbers = list(given) if isinstance(given, Sequence | np.ndarray) else [given] * worlds
+        right = [(may_be_none and n is None) or (isinstance(n, int | np.integer) and n >= 0) for n in numbers]
+        if len(numbers) != worlds or not all(right):
+            raise ConfigurationError(
+                f"a {what} must be a non-negative whole number, or a list with {worlds} of them, got {given}"
+            )
+        return numbers
+
+    def _mask(self, mask: Any) -> np.ndarray:
+        """A checked mask (B,); all worlds by default."""
+        worlds = self.world.worlds
+        chosen = np.ones(worlds, dtype=bool) if mask is None else np.asarray(mask)
+        if chosen.shape != (worlds,) or chosen.dtype != np.bool_:
+            raise ConfigurationError(
+                f"the mask of a reset must be bool with shape ({worlds},), got {chosen.dtype} with shape {chosen.shape}"
+            )
+        return chosen
+
     def _restart(self, mask: np.ndarray) -> None:
-        """Start new episodes where ``mask`` is true."""
+        """Start new episodes where ``mask`` is true, drawn from the streams of their worlds."""
+        for b in np.flatnonzero(mask):
+            self.world.begin(int(b), stream(int(self.rngs[b].integers(2**31)), int(self.number[b])))
+            self._begun(np.arange(len(mask)) == b)
+            if happens(self.starts.exploring, self.rngs[b]):
+                self._explore(int(b), self.rngs[b])
+            self.last[b] = self.action_of[self.world.state.command[b]]
+
+    def _begun(self, mask: np.ndarray) -> None:
+        """Note that missions have begun where ``mask`` is true."""
+        self.over = self.over & ~mask
         self.cut[mask] = self.scenario.mission_steps
         self.turn[mask] = -1
-        for b in np.flatnonzero(mask):
-            rng = self.rngs[b]
-            self.world.reset(int(rng.integers(2**31)), np.arange(len(mask)) == b)
-            if happens(self.starts.exploring, rng):
-                self._explore(int(b), rng)
-            self.last[b] = self.action_of[self.world.state.command[b]]
+        self.last[mask] = self.action_of[self.world.state.command[mask]]
 
     def _explore(self, b: int, rng: np.random.Generator) -> None:
         """Move world ``b`` to an exploring start along the route, if one is found."""

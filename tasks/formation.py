@@ -144,8 +144,8 @@ class FormationTask(composer.Task):
         return bool(self.state.steps[0] >= self.scenario.mission_steps)
 
     def get_discount(self, physics: mjcf.Physics) -> float:
-        """Always 1, as a mission ends by time, not in a terminal state."""
-        return 1.0
+        """1, and 0 at the end of the mission, which is a termination: the return is that of the whole mission."""
+        return 0.0 if self.should_terminate_episode(physics) else 1.0
 
 
 def make_environment(

@@ -46,6 +46,17 @@ def controller_from(given: Any) -> Controller | None:
     return found
 
 
+def options_from(given: Any) -> Mapping[str, Any]:
+    """The options of a reset; none for None.
+
+    Raises:
+        ConfigurationError: they are not a dictionary.
+    """
+    if not isinstance(given, Mapping | None):
+        raise ConfigurationError(f"options must be a dictionary, got {given!r}")
+    return given or {}
+
+
 def array_from(given: Any) -> np.ndarray:
     """Actions as a NumPy array, from nested lists, another library's array or a tensor in main memory.
 

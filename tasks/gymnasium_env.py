@@ -3,7 +3,6 @@
 Importing :mod:`marlbc_mj.tasks` registers them for ``gymnasium.make`` and ``gymnasium.make_vec``.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import gymnasium
@@ -11,10 +10,11 @@ import numpy as np
 from gymnasium.vector.utils import batch_space
 
 from marlbc_mj.controllers import Controller
+from marlbc_mj.core.safety import violates
 from marlbc_mj.policies.states import State
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import DecisionOutcome, FormationBatch
-from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, scenario_from
+from marlbc_mj.tasks.given import RENDER_MODES, array_from, check_render_mode, controller_from, options_from, scenario_from
 from marlbc_mj.tasks.painter import Drawn, Painter
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
@@ -33,14 +33,16 @@ def terms(outcome: DecisionOutcome, safe_distance: float) -> dict[str, np.ndarra
         "switching_reward": outcome.switching,
         "switches": outcome.switches.sum(axis=1),
         "clearance": outcome.clearance.min(axis=1),
-        "violated": (outcome.clearance <= safe_distance).any(axis=1),
+        "violated": violates(outcome.clearance, safe_distance).any(axis=1),
     }
 
 
 class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
     """One team as an ``Env``: actions are MultiDiscrete joint orders, observations are the team's state, the reward is (13).
 
-    An episode is a whole mission and ends by termination. ``info`` contains the reward terms, switches and clearance.
+    An episode is a whole mission and ends by termination: the return is that of the whole mission, as in training and in the
+    other views. The state has no clock; ``gymnasium.wrappers.TimeAwareObservation`` adds one. ``info`` contains the reward terms,
+    switches and clearance.
 
     Args:
         scenario: a scenario, or the name of one.
@@ -69,20 +71,31 @@ class PaperFormation(Drawn, gymnasium.Env[np.ndarray, np.ndarray]):
         **changes: Any,
     ) -> None:
         made, law = scenario_from(scenario, changes), controller_from(controller)
-        super().__init__(FormationBatch(made, law, interval=interval, state=state, actions=actions), render_mode)
+        super().__init__(FormationBatch(made, law, interval=interval, state=state, actions=actions, autoreset=False), render_mode)
         self.action_space = gymnasium.spaces.MultiDiscrete([self.batch.actions] * self.batch.scenario.agents)
         self.observation_space = state_space(self.batch.read)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
-        """Begin an episode; ``seed`` determines the draw of the scenario."""
+        """Begin an episode.
+
+        Args:
+            seed: determines the draws of the scenario.
+            options: ``"layout"`` selects a layout by number instead, as ``marlbc evaluate --seed`` does.
+
+        Raises:
+            ConfigurationError: the number of the layout is negative or not an integer.
+        """
         super().reset(seed=seed)
+        layout = options_from(options).get("layout")
+        if layout is not None:
+            return self.batch.reset_to(layout)[0], {}
         return self.batch.reset(int(self.np_random.integers(2**31)))[0], {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Make one decision; ``action`` (N,) holds one action per agent.
 
         Raises:
-            ConfigurationError: actions have the wrong shape, are not integers, or are out of range.
+            ConfigurationError: actions have the wrong shape, are not integers, or are out of range, or no episode is going on.
         """
         outcome = self.batch.step(array_from(action)[None])
         info = {name: values[0] for name, values in terms(outcome, self.batch.scenario.safe_distance).items()}
@@ -144,19 +157,24 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
         """Begin episodes. For one ``seed``, the episodes of world b are the same for any B.
 
         Args:
-            seed: one seed for all worlds, or a list with one per world; for None in the list, a world's random stream continues.
-            options: ``"reset_mask"`` (B,) bool selects the worlds to restart; all by default.
+            seed: one seed for all worlds, or a list with one per world: world b then begins with the episode of
+                ``PaperFormation.reset(seed=seed[b])``. For None in the list, a world's random stream continues.
+            options: ``"reset_mask"`` (B,) bool selects the worlds to restart; all by default. ``"layout"``, one number or one per
+                world, selects layouts by number, as ``marlbc evaluate --seed`` does.
 
         Raises:
             ConfigurationError: the list or the mask does not have length B, or the mask selects no world.
         """
-        if not isinstance(options, Mapping | None):
-            raise ConfigurationError(f"options must be a dictionary, got {options!r}")
-        mask = (options or {}).get("reset_mask")
+        chosen = options_from(options)
+        mask, layout = chosen.get("reset_mask"), chosen.get("layout")
         if mask is not None and not np.any(mask):
             raise ConfigurationError("options['reset_mask'] must be true for at least one world")
+        if layout is not None:
+            super().reset(seed=seed if isinstance(seed, int) else None)
+            return self.batch.reset_to(layout, mask), {}
         if isinstance(seed, list):
-            return self.batch.reset(seed, mask), {}
+            seeds = self.batch.one_per_world("seed", seed, may_be_none=True)
+            return self.batch.reset([drawn_from(each) for each in seeds], mask), {}
         super().reset(seed=seed)
         return self.batch.reset(int(self.np_random.integers(2**31)), mask), {}
 
@@ -187,6 +205,13 @@ class PaperFormationVector(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np
     def close_extras(self) -> None:
         """Release the OpenGL context."""
         self.painter.close()
+
+
+def drawn_from(seed: int | None) -> int | None:
+    """The number that :meth:`PaperFormation.reset` draws first from its random stream for a seed; None for None."""
+    if seed is None:
+        return None
+    return int(gymnasium.utils.seeding.np_random(int(seed))[0].integers(2**31))
 
 
 def where(found: dict[str, np.ndarray], mask: np.ndarray) -> dict[str, Any]:

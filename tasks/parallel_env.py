@@ -10,7 +10,7 @@ from pettingzoo import ParallelEnv
 from marlbc_mj.controllers import Controller
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.tasks.batch import FormationBatch
-from marlbc_mj.tasks.given import RENDER_MODES, array_from, controller_from, scenario_from
+from marlbc_mj.tasks.given import RENDER_MODES, array_from, controller_from, options_from, scenario_from
 from marlbc_mj.tasks.gymnasium_env import state_space, terms
 from marlbc_mj.tasks.painter import Drawn
 from marlbc_mj.util.errors import ConfigurationError, unknown
@@ -48,7 +48,9 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         **changes: Any,
     ) -> None:
         made, law = scenario_from(scenario, changes), controller_from(controller)
-        super().__init__(FormationBatch(made, law, interval=interval, state=observation, actions=actions), render_mode)
+        super().__init__(
+            FormationBatch(made, law, interval=interval, state=observation, actions=actions, autoreset=False), render_mode
+        )
         self.possible_agents = [f"agent_{i + 1}" for i in range(self.batch.scenario.agents)]
         self.agents: list[str] = []
         self.state_space = state_space(self.batch.read)
@@ -68,17 +70,23 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, np.ndarray], dict[str, dict[str, Any]]]:
-        """Begin an episode; ``seed`` determines the draw of the scenario.
+        """Begin an episode.
+
+        Args:
+            seed: determines the draws of the scenario.
+            options: ``"layout"`` selects a layout by number instead, as ``marlbc evaluate --seed`` does.
 
         Raises:
-            ConfigurationError: the seed is negative or not an integer.
+            ConfigurationError: the seed or the layout is negative or not an integer.
         """
         if seed is not None:
             if not isinstance(seed, int | np.integer) or seed < 0:
                 raise ConfigurationError(f"a seed must be a non-negative whole number, got {seed!r}")
             self._seeds = np.random.default_rng(seed)
         self.agents = list(self.possible_agents)
-        self._state = self.batch.reset(int(self._seeds.integers(2**31)))[0]
+        layout = options_from(options).get("layout")
+        drawn = int(self._seeds.integers(2**31))
+        self._state = (self.batch.reset(drawn) if layout is None else self.batch.reset_to(layout))[0]
         return self._everybody(self._state), {agent: {} for agent in self.agents}
 
     def step(
@@ -87,7 +95,8 @@ class PaperFormationParallel(Drawn, ParallelEnv[str, np.ndarray, int]):
         """Make one decision of every agent; the reward (13) is the same for all.
 
         Raises:
-            ConfigurationError: an agent has no action or is unknown, or an action is not an integer or out of range.
+            ConfigurationError: an agent has no action or is unknown, an action is not an integer or out of range, or no episode
+                is going on.
         """
         if not isinstance(actions, Mapping):
             raise ConfigurationError(f"actions must be a dictionary with one per agent, got {type(actions).__name__}")

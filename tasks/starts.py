@@ -9,6 +9,7 @@ import numpy as np
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.core.motion import obstacles_at
 from marlbc_mj.core.orders import SEPARATOR
+from marlbc_mj.core.safety import violates
 from marlbc_mj.scenarios.base import Scenario, desired_centroid
 from marlbc_mj.scenarios.layout import motion_array
 from marlbc_mj.util.errors import ConfigurationError
@@ -112,7 +113,7 @@ class Route:
 
     def _blocked(self, positions: np.ndarray, obstacles: np.ndarray) -> np.ndarray:
         """(N,) bool: positions (N, 2) [m] within the safe distance of an obstacle."""
-        return np.asarray(clearances(positions, obstacles) <= self.scenario.safe_distance)
+        return np.asarray(violates(clearances(positions, obstacles), self.scenario.safe_distance))
 
 
 def happens(share: float, rng: np.random.Generator) -> bool:

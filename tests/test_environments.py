@@ -11,13 +11,14 @@ from pettingzoo.test import parallel_api_test
 from marlbc_mj import World, paper
 from marlbc_mj.core.behaviors import clearances
 from marlbc_mj.policies.states import CLOSE, OLD, RANGE, SPEED, make_state, nearest_surface
-from marlbc_mj.scenarios import Perturbation, make_scenario
+from marlbc_mj.scenarios import Perturbation, held_out, make_scenario
 from marlbc_mj.scenarios.family import Family
 from marlbc_mj.tasks.batch import FormationBatch
 from marlbc_mj.tasks.gymnasium_env import PaperFormation, PaperFormationVector
 from marlbc_mj.tasks.parallel_env import PaperFormationParallel
 from marlbc_mj.tasks.starts import Starts
 from marlbc_mj.util.errors import ConfigurationError
+from marlbc_mj.util.seeding import stream
 
 ID = "marlbc_mj/PaperFormation-v0"
 AROUND = Perturbation(1.0, 0.5, (0.0, 2.0))
@@ -239,6 +240,52 @@ def test_infos_are_those_of_gymnasiums_own_vector_env():
             assert np.array_equal(a, b)
         equal(expected[4], found[4])
         assert ("final_info" in found[4]) == (k % 10 == 9)
+
+
+def test_equal_seeds_of_worlds_are_equal_episodes_and_those_of_one_environment():
+    """As in Gymnasium's SyncVectorEnv, world b of a list of seeds begins like one environment with the b-th seed."""
+    vector, single = PaperFormationVector(3, "field", duration=2.0), PaperFormation("field", duration=2.0)
+    vector.reset(seed=[5, 7, 5])
+    single.reset(seed=7)
+    drawn = vector.batch.world.observe().obstacles
+    assert (drawn[0] == drawn[2]).all() and (drawn[0] != drawn[1]).any()
+    assert (single.batch.world.observe().obstacles[0] == drawn[1]).all()
+
+
+def test_a_layout_is_the_one_that_evaluate_flies():
+    """In every view; seeds do not matter then."""
+    scenario = held_out(make_scenario("field", duration=2.0))
+    world = World(scenario)
+    world.begin(0, stream(20_000))
+    expected = world.observe().obstacles[0]
+    options = {"layout": 20_000}
+    views = PaperFormation(scenario), PaperFormationVector(2, scenario), PaperFormationParallel(scenario)
+    for view in views:
+        view.reset(seed=3, options=options)
+        for obstacles in view.batch.world.observe().obstacles:
+            np.testing.assert_array_equal(obstacles, expected)
+    views[1].reset(options={"layout": [20_000, 1]})
+    assert (views[1].batch.world.observe().obstacles[1] != expected).any()
+    with pytest.raises(ConfigurationError, match="a layout must be a non-negative whole number.* got -1"):
+        views[0].reset(options={"layout": -1})
+
+
+@pytest.mark.parametrize("make", [PaperFormation, PaperFormationParallel])
+def test_after_its_end_a_mission_stays_as_it_was(make):
+    """What is drawn or read from the world is the end, not the next start; a step must wait for a reset."""
+    env = make(duration=0.2)
+    action = np.zeros(4, dtype=int) if make is PaperFormation else dict.fromkeys(env.possible_agents, 0)
+    with pytest.raises(ConfigurationError, match="no episode is going on: call reset"):
+        env.step(action)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(action)
+    assert env.batch.world.state.steps.tolist() == [4]
+    with pytest.raises(ConfigurationError, match="no episode is going on: call reset"):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)
+    assert env.batch.world.state.steps.tolist() == [1]
 
 
 def test_exploring_starts_lie_on_the_route_and_are_cut():

@@ -13,7 +13,7 @@ from marlbc_mj.engine.world import World
 from marlbc_mj.episode import run_episode
 from marlbc_mj.results.metrics import measure
 from marlbc_mj.scenarios import Perturbation, make_scenario, paper, robot_gate
-from marlbc_mj.supervisors.mpcms import MPCMS, Joint, avoids_anyway
+from marlbc_mj.supervisors.mpcms import MPCMS, Joint, avoidance_is_redundant
 from marlbc_mj.supervisors.prediction import CostWeights, Pairs, Teams, judge_pairs
 from marlbc_mj.util.errors import ConfigurationError
 
@@ -129,8 +129,8 @@ def test_avoidance_on_top_changes_no_motion_under_the_set_based_composition(fami
     free = Joint(0, (False,) * 4)
     assert len(MPCMS()._candidates(scenario, free).orders) == 1 + 8
     moved = replace(scenario, behaviors=scenario.behaviors[::-1])
-    assert avoids_anyway(scenario) and not avoids_anyway(moved)
-    assert not avoids_anyway(replace(scenario, composition="null-space"))
+    assert avoidance_is_redundant(scenario) and not avoidance_is_redundant(moved)
+    assert not avoidance_is_redundant(replace(scenario, composition="null-space"))
 
 
 def test_the_cost_of_two_steps_by_hand():

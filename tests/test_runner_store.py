@@ -24,6 +24,7 @@ from marlbc_mj.studies.protocol import Report, Watch
 from marlbc_mj.studies.runner import run_study
 from marlbc_mj.util.errors import ConfigurationError, NoSpaceError, SimulationError
 from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST
+from marlbc_mj.util.modules import MOST_COMPANIONS, companions, load_module
 from marlbc_mj.util.progress import silent
 
 
@@ -356,20 +357,92 @@ def test_what_killed_workers_left_is_removed(tmp_path: Path) -> None:
     assert (tmp_path / "out" / "3.txt").read_text() == "3" and not list(tmp_path.rglob(".begun*"))
 
 
-def test_an_edited_file_of_the_user_is_another_job(tmp_path: Path) -> None:
-    """Editing the file, or adding a file beside it, changes the job's address."""
-    mine = tmp_path / "mine.py"
+@pytest.mark.parametrize("used", ["mine.py", "helper.py", "weights.json", "bot.xml", "lib/rule.py", "assets/deep/body.stl"])
+def test_an_edited_file_of_the_user_is_another_job(tmp_path: Path, used: str) -> None:
+    """Editing the named file, or adding code or data in its folder or below, changes the job's address."""
+    mine, other = tmp_path / "mine.py", tmp_path / used
+    mine.write_text("a = 1")
+    keys = [Addresses(Halves()).key(Pair(f"{mine}:Careful")) for _ in range(2)]
+    other.parent.mkdir(parents=True, exist_ok=True)
+    other.write_text("a = 2")
+    keys.append(Addresses(Halves()).key(Pair(f"{mine}:Careful")))
+    assert keys[0] == keys[1] != keys[2]
+
+
+@pytest.mark.parametrize(
+    "other", ["run.log", "__pycache__/mine.nbi", ".git/index.json", f"out/{MANIFEST}", f"out/{JOBS_FOLDER}/a.json"]
+)
+def test_what_a_run_leaves_beside_a_users_file_does_not_count(tmp_path: Path, other: str) -> None:
+    """Neither logs nor caches nor folders that this package wrote."""
+    mine, written = tmp_path / "mine.py", tmp_path / other
+    mine.write_text("a = 1")
+    key = Addresses(Halves()).key(Pair(f"{mine}:Careful"))
+    written.parent.mkdir(parents=True, exist_ok=True)
+    written.write_text("1")
+    (written.parent / f"{written.stem}.mcap").write_text("2")
+    assert Addresses(Halves()).key(Pair(f"{mine}:Careful")) == key
+
+
+def test_a_crowded_folder_counts_by_the_file_and_what_is_directly_beside_it(tmp_path: Path) -> None:
+    """Below the folder there are too many files to watch."""
+    mine, many = tmp_path / "mine.py", tmp_path / "many"
+    mine.write_text("a = 1")
+    (tmp_path / "helper.py").write_text("b = 1")
+    many.mkdir()
+    for k in range(MOST_COMPANIONS):
+        (many / f"{k}.json").touch()
+    assert [path.name for path in companions(mine, (".py", ".json"))] == ["helper.py", "mine.py"]
+
+
+def test_a_robot_of_a_checkout_counts_by_its_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another checkout of MuJoCo Menagerie is another job."""
+    keys = []
+    for version in ("1", "2"):
+        robot = tmp_path / version / "bot" / "bot.xml"
+        robot.parent.mkdir(parents=True)
+        robot.write_text(f'<mujoco model="{version}"/>')
+        monkeypatch.setenv("MENAGERIE_ROOT", str(tmp_path / version))
+        keys.append(Addresses(Halves()).key(Pair("menagerie:bot/bot.xml")))
+    assert keys[0] != keys[1]
+
+
+def test_the_code_of_a_users_study_counts(tmp_path: Path) -> None:
+    """A study, and a NamedTuple in its configuration, that are defined in a file outside this package."""
+    keys, file = [], tmp_path / "mine.py"
+    for factor in (1, 20):
+        file.write_text(
+            "from typing import NamedTuple\n"
+            "class Job(NamedTuple):\n    k: int\n"
+            "class Mine:\n    def jobs(self):\n        return [Job(1)]\n"
+            f"    def run(self, job, watch):\n        return {factor} * job.k\n"
+        )
+        mine = load_module(file)
+        keys += [Addresses(mine.Mine()).key(1), Addresses(Halves()).key(mine.Job(1))]
+    assert len(set(keys)) == 4
+
+
+def test_an_edit_while_a_study_runs_ends_it(tmp_path: Path) -> None:
+    """The job that ended after the edit is not kept; with the old content the study resumes from those before."""
+    mine, out, ran = tmp_path / "mine.py", tmp_path / "out", []
     mine.write_text("a = 1")
 
-    def key() -> str:
-        return Addresses(Halves()).key(Pair(f"{mine}:Careful"))
+    class Named(Halves):
+        def describe(self, job: Pair) -> Pair:
+            return Pair(f"{mine}:{job.left}")
 
-    keys = [key(), key()]
-    mine.write_text("a = 2")
-    keys.append(key())
-    (tmp_path / "helper.py").write_text("b = 1")
-    keys.append(key())
-    assert keys[0] == keys[1] and len(set(keys)) == 3
+    def edit(job: Pair, result: object) -> None:
+        ran.append(job)
+        if len(ran) == 2:
+            mine.write_text("a = 22")
+
+    with pytest.raises(
+        ConfigurationError, match="mine.py was changed while the study ran, so results could mix two versions of it"
+    ):
+        run_study(Named(), out, ended=edit)
+    assert len(ran) == 2
+    mine.write_text("a = 1")
+    run_study(Named(), out, ended=lambda job, result: ran.append(job))
+    assert len(ran) == 2 + len(Halves().jobs())
 
 
 def test_what_a_run_is_can_be_read(tmp_path: Path) -> None:

@@ -7,11 +7,29 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from marlbc_mj.report import leaderboard
 from marlbc_mj.report.leaderboard import make_boards
 from marlbc_mj.results.layout_runs import LAYOUT_SCORES, LayoutRun, Method, MissionRuns
-from marlbc_mj.results.standings import behind, by_cost, by_return, improvement, median_interval, notable_layouts, rank_methods
+from marlbc_mj.results.standings import (
+    behind,
+    by_cost,
+    by_return,
+    improvement,
+    median_interval,
+    notable_layouts,
+    on_common_layouts,
+    rank_methods,
+)
 from marlbc_mj.util.errors import ConfigurationError
 
+FACTS = {
+    "suite": {"version": "v1", "hash": "0" * 64},
+    "date": "2026-11-29",
+    "cpu": "x",
+    "code": "y",
+    "git_revision": "z",
+    "versions": {},
+}
 A, B, C = Method("a", "x"), Method("b", "x"), Method("c", "x")
 
 
@@ -70,6 +88,25 @@ def test_a_method_that_did_not_fly_everything_has_no_rank() -> None:
     first, second = rank_methods(group)
     assert (first.method, first.rank.value) == (A, 1.0)
     assert second.method == B and math.isnan(second.rank.value) and set(second.flown) == {"one"}
+
+
+def test_the_board_shows_only_what_it_compares() -> None:
+    """a succeeds on 50 layouts, b on 45 of them and 950 others. If c flew only the 50, these count, and the page says so."""
+    group = [flown(A, "one", [k < 50 for k in range(1000)]), flown(B, "one", [k > 4 for k in range(1000)])]
+    short = [*group, flown(C, "one", [False] * 50)]
+    assert [len(each.runs) for each in on_common_layouts(group)] == [1000, 1000]
+    assert [len(each.runs) for each in on_common_layouts(short)] == [50, 50, 50]
+    facts = dict(leaderboard._page_facts(on_common_layouts(short), FACTS, 2050))
+    assert facts["Runs"] == "150 episodes of 3 methods"
+    assert facts["Left out"].startswith("1900 other episodes, on layouts that not all methods of their mission ran,")
+    assert "Left out" not in dict(leaderboard._page_facts(group, FACTS, 2000))
+
+
+def test_few_layouts_show_no_significant_difference() -> None:
+    """Fewer than six cannot: even if all are lost, the sign test's p is at least 2 / 2^5 = 6 %."""
+    for n in (1, 2, 5):
+        assert not behind(np.zeros(n), np.ones(n))
+    assert behind(np.zeros(6), np.ones(6))
 
 
 def test_only_common_layouts_are_compared() -> None:

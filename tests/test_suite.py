@@ -86,7 +86,11 @@ def test_rows_come_back_from_their_file(tmp_path: Path) -> None:
     group = [MissionRuns("families", "field", Method("fsams", "sorlc", "set-based", True), runs)]
     (back,) = read_layout_rows(write_layout_rows(group, tmp_path / "rows.csv"), "families")
     assert back[:3] == group[0][:3] and str(back.runs) == str(runs)
-    (tmp_path / "rows.csv").write_text((tmp_path / "rows.csv").read_text()[:-30])
+    text = (tmp_path / "rows.csv").read_text()
+    (tmp_path / "twice.csv").write_text(text + text.splitlines(keepends=True)[1])
+    with pytest.raises(ConfigurationError, match=r"twice\.csv, line 4: field, fsams.*, seed 3 has a row already"):
+        read_layout_rows(tmp_path / "twice.csv", "families")
+    (tmp_path / "rows.csv").write_text(text[:-30])
     with pytest.raises(ConfigurationError, match=r"rows\.csv, line 3"):
         read_layout_rows(tmp_path / "rows.csv", "families")
 

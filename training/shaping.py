@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 
+from marlbc_mj.core.safety import violates
 from marlbc_mj.util.settings import POSITIVE, check
 
 if TYPE_CHECKING:
@@ -58,5 +59,5 @@ def shaped_reward(outcome: "DecisionOutcome", shaping: Shaping) -> np.ndarray:
 
 
 def lost(outcome: "DecisionOutcome", shaping: Shaping, safe_distance: float) -> np.ndarray:
-    """(B, N) bool: agents that came closer to an obstacle than ``safe_distance`` + ``shaping.margin`` [m]."""
-    return np.asarray(outcome.clearance < safe_distance + shaping.margin)
+    """(B, N) bool: agents that came within ``safe_distance`` + ``shaping.margin`` [m] of an obstacle."""
+    return np.asarray(violates(outcome.clearance, safe_distance + shaping.margin))

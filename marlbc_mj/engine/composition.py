@@ -16,8 +16,8 @@ from marlbc_mj.core.cells import fill, nearest, room
 from marlbc_mj.core.compiling import allocation_free, on_both_paths
 from marlbc_mj.core.halfplanes import closest
 from marlbc_mj.core.nullspace import add_behavior
+from marlbc_mj.engine.by_address import call
 from marlbc_mj.engine.native import as_behavior
-from marlbc_mj.engine.references import call
 
 WORKSPACE = 9
 """Number of rows of two numbers from which a :class:`TeamView` is made."""

@@ -6,11 +6,11 @@ import numba
 import numpy as np
 
 from marlbc_mj.core.laws import compiled, threaded
+from marlbc_mj.engine.by_address import call, entry, no_entry, point_to
 from marlbc_mj.engine.composition import Behaviors
 from marlbc_mj.engine.loop import mission_step, shield_forces, shield_references
 from marlbc_mj.engine.plan import Plan
 from marlbc_mj.engine.records import Arguments, MissionRules, Native, Plant, Record, Team
-from marlbc_mj.engine.references import call, entry, no_entry, refer
 
 
 class Loop(NamedTuple):
@@ -22,16 +22,16 @@ class Loop(NamedTuple):
 
 def hand_over(plan: Plan, native: Native, team: Team, record: Record, for_compiled: bool) -> Arguments:
     """The loop's arguments, by reference; for a compiled loop with the entries of the shield that this team has."""
-    mission, plant, team, record = map(refer, (plan.mission, plan.plant, team, record))
+    mission, plant, team, record = map(point_to, (plan.mission, plan.plant, team, record))
     if for_compiled:
-        native = refer(_with_shield(native, mission, plan.behaviors, plant, team))
+        native = point_to(_with_shield(native, mission, plan.behaviors, plant, team))
     return Arguments(mission, plan.behaviors, native, plant, team, record)
 
 
 def compiled_loop(arguments: Arguments) -> Any:
     """A reference to the :class:`Loop` for arguments that :func:`hand_over` made for compiled code."""
     orders, given = np.zeros((1, 1), dtype=np.int64), np.zeros((1, 1, 2))
-    return refer(Loop(entry(mission_step, 0, orders, given, *arguments), refer(arguments)))
+    return point_to(Loop(entry(mission_step, 0, orders, given, *arguments), point_to(arguments)))
 
 
 def _with_shield(native: Native, mission: Any, behaviors: Any, plant: Any, team: Any) -> Native:

@@ -25,9 +25,9 @@ from marlbc_mj.core.shield import STATE_BROKEN, TUBE_BROKEN, ShieldCounts, fill_
 from marlbc_mj.core.stamps import Mail, exchange
 from marlbc_mj.core.stopping import TINY, ShieldView
 from marlbc_mj.engine.body import DIVERGED, actuate, read_robots, scale_rows, shrink_rows
+from marlbc_mj.engine.by_address import call
 from marlbc_mj.engine.composition import compose_team, keep, limit
 from marlbc_mj.engine.native import as_controller, as_disturbance, call_step, doubles
-from marlbc_mj.engine.references import call
 
 VIOLATION_REWARD = -10.0  # (14), whatever the formation
 FORMATION_REWARD = 5.0  # (14), times G

@@ -16,12 +16,12 @@ from marlbc_mj.core.cells import WORTH, room
 from marlbc_mj.core.shield import Shield
 from marlbc_mj.core.stopping import NO_SHIELD, ShieldNumbers, as_records
 from marlbc_mj.engine.assembly import agent_prefix, assemble, unfit
+from marlbc_mj.engine.by_address import entry, no_entry, point_to
 from marlbc_mj.engine.composition import Behaviors, null_space_team, set_based_team
 from marlbc_mj.engine.inequalities import inequalities_first, keeps_array, make_barrier, sees_array, workspace_rows
 from marlbc_mj.engine.loop import shield_forces, shield_references
 from marlbc_mj.engine.native import step_address
 from marlbc_mj.engine.records import MissionRules, Native, Plant
-from marlbc_mj.engine.references import entry, no_entry, refer
 from marlbc_mj.engine.shielding import resolve
 from marlbc_mj.robots import Robot, RobotFleet
 from marlbc_mj.scenarios import Scenario
@@ -201,8 +201,8 @@ def make_behaviors(scenario: Scenario) -> Behaviors:
         keeps=keeps_array(scenario.behaviors),
         **make_barrier(scenario)._asdict(),
     )
-    compose = entry(set_based_team if set_based else null_space_team, *_composed(refer(behaviors)))
-    return cast(Behaviors, refer(behaviors._replace(compose=compose)))
+    compose = entry(set_based_team if set_based else null_space_team, *_composed(point_to(behaviors)))
+    return cast(Behaviors, point_to(behaviors._replace(compose=compose)))
 
 
 def _composed(behaviors: Any) -> tuple[Any, ...]:

@@ -83,7 +83,7 @@ class Team(NamedTuple):
     status: np.ndarray  # (B,) int64, 0, or 1 + agent + N * substep of a divergence in the last mission step
     drag: np.ndarray  # (B, N, 2) drag in the last substep [N]; before the first substep, v_r of the previous mission step
     force: np.ndarray  # (B, N, 2) force in the last substep: the controller's, then that of the actuators [N]
-    workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.plan.workspace_rows
+    workspace: np.ndarray  # (B, W, 2) scratch, see marlbc_mj.engine.inequalities.workspace_rows
     grid: np.ndarray  # (B, G) scratch: grids of obstacles and team, G = 0 if grids do not pay off
     interventions: np.ndarray  # (B, N) number of substeps in which the shield changed something; (B, 0) without a shield
     force_change: np.ndarray  # (B, N) integral of its change of the force [N s]

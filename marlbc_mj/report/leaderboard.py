@@ -21,6 +21,7 @@ from marlbc_mj.results.standings import (
     finished,
     mission_weights,
     notable_layouts,
+    on_common_layouts,
     rank_methods,
     share_of,
 )
@@ -102,11 +103,13 @@ def write_leaderboard(
         tracks: one-line description of every track by name, in display order.
         folder: output folder, which is also searched for clips.
     """
+    every = sum(len(each.runs) for each in groups)
+    groups = on_common_layouts(groups)
     boards = make_boards(groups, tracks)
     text = render(
         "leaderboard.html",
         title=f"Leaderboard of suite {facts['suite']['version']}",
-        facts=_page_facts(groups, facts),
+        facts=_page_facts(groups, facts, every),
         missions=_missions(groups, tracks),
         command=str(facts["command"]),
         boards=boards,
@@ -240,14 +243,16 @@ def _words(name: Name) -> str:
     return name.display + (f" ({name.facts})" if name.facts else "")
 
 
-def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Facts about the suite and its rows for the page, by name."""
+def _page_facts(groups: Sequence[MissionRuns], facts: Mapping[str, Any], every: int) -> list[tuple[str, str]]:
+    """Facts about the suite and its rows for the page, by name; ``every`` is the number of runs on all layouts."""
     seeds = {run.seed for each in groups for run in each.runs}
-    beside = facts.get("beside", ())
+    beside, compared = facts.get("beside", ()), sum(len(each.runs) for each in groups)
+    left = f"{every - compared} other episodes, on layouts that not all methods of their mission ran, are only in the CSV files"
     return [
         ("Suite", f"{facts['suite']['version']}, {facts['suite']['hash'][:16]}"),
         ("Seeds", f"{spans(sorted(seeds))}, on which nothing was tuned"),
-        ("Runs", f"{sum(len(each.runs) for each in groups)} episodes of {len({each.method for each in groups})} methods"),
+        ("Runs", f"{compared} episodes of {len({each.method for each in groups})} methods"),
+        *([("Left out", left)] if every > compared else []),
         ("Date", str(facts["date"])),
         ("Processor", str(facts["cpu"])),
         ("Code", str(facts["code"])),

@@ -130,7 +130,8 @@ def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
     """Read a file that :func:`write_layout_rows` wrote; methods and missions keep its order.
 
     Raises:
-        ConfigurationError: the file cannot be read, is of another kind, or has an invalid line, which the message names.
+        ConfigurationError: the file cannot be read, is of another kind, or has an invalid or repeated line, which the message
+            names.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
@@ -140,11 +141,15 @@ def read_layout_rows(path: Path, track: str) -> list[MissionRuns]:
     if tuple(header) != _HEADER:
         raise ConfigurationError(f"{path} is not a file of layouts: its columns are {', '.join(header)}")
     found: dict[tuple[str, Method], list[LayoutRun]] = {}
+    seen: set[tuple[str, Method, int]] = set()
     for line, row in enumerate(rows, 2):
         try:
             mission, method, run = _parsed(row)
         except ValueError as error:
             raise ConfigurationError(f"{path}, line {line}: {one_line(error)}") from error
+        if (mission, method, run.seed) in seen:
+            raise ConfigurationError(f"{path}, line {line}: {mission}, {method.key}, seed {run.seed} has a row already")
+        seen.add((mission, method, run.seed))
         found.setdefault((mission, method), []).append(run)
     return [MissionRuns(track, mission, method, tuple(runs)) for (mission, method), runs in found.items()]
 

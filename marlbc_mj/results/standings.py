@@ -16,6 +16,8 @@ from marlbc_mj.util.errors import ConfigurationError
 
 WORTH_OF_SUCCESS = 1e12
 """Weight of success in a merit, larger than any return or cost."""
+LEAST_FOR_SIGNIFICANCE = 6
+"""Fewest layouts on which a difference can be significant at 5 %: in a sign test of n layouts, p is at least 2 / 2^n."""
 Merit = Callable[[LayoutRun], float]
 """Maps a run to the number by which runs are compared: larger is better."""
 
@@ -142,6 +144,22 @@ def _unranked(method: Method, flown: Mapping[str, MissionRuns]) -> Standing:
     return Standing(method, nothing, nothing, dict.fromkeys(OUTCOMES, nothing), flown, frozenset(), frozenset())
 
 
+def on_common_layouts(group: Sequence[MissionRuns]) -> list[MissionRuns]:
+    """The same runs without those on layouts that not all methods of their mission ran: only these can be compared.
+
+    Raises:
+        ConfigurationError: the methods of a mission have no layout in common.
+    """
+    seeds: dict[tuple[str, str], set[int]] = {}
+    for each in group:
+        key, own = (each.track, each.mission), {run.seed for run in each.runs}
+        seeds[key] = seeds.get(key, own) & own
+    for (_, mission), common in seeds.items():
+        if not common:
+            raise ConfigurationError(f"no layout of {mission} was run with all methods")
+    return [each._replace(runs=tuple(run for run in each.runs if run.seed in seeds[each.track, each.mission])) for each in group]
+
+
 class _Matrix(NamedTuple):
     """The results of K methods on the n layouts of one mission that all of them ran."""
 
@@ -158,13 +176,10 @@ def mission_weights(tracks: Mapping[str, str], *, by_track: bool) -> dict[str, f
 
 
 def _matrix(rows: Sequence[MissionRuns], merit: Merit) -> _Matrix:
-    common = set.intersection(*({run.seed for run in each.runs} for each in rows))
-    if not common:
-        raise ConfigurationError(f"no layout of {rows[0].mission} was run with all methods")
-    chosen = [sorted((run for run in each.runs if run.seed in common), key=_seed_of) for each in rows]
+    chosen = [sorted(each.runs, key=_seed_of) for each in on_common_layouts(rows)]
     merits = np.array([[merit(run) for run in runs] for runs in chosen])
     outcomes = np.array([[[getattr(run, kind) for run in runs] for runs in chosen] for kind in OUTCOMES], dtype=bool)
-    return _Matrix(merits, outcomes, _draws(len(common)))
+    return _Matrix(merits, outcomes, _draws(len(chosen[0])))
 
 
 def _seed_of(run: LayoutRun) -> int:
@@ -255,8 +270,10 @@ def _places(matrices: Mapping[str, _Matrix], k: int) -> tuple[frozenset[str], fr
 
 def behind(x: np.ndarray, y: np.ndarray) -> bool:
     """Whether x (n,) succeeds significantly less often than y on the same layouts: the 95 % interval of y - x exceeds 0."""
+    if len(x) < LEAST_FOR_SIGNIFICANCE:
+        return False
     gap = bootstrap([np.asarray(y, dtype=float) - np.asarray(x, dtype=float)], mean)
-    return bool(gap.value > 0.0 and (np.isnan(gap.low) or gap.low > 0.0))
+    return bool(gap.low > 0.0)
 
 
 class Notable(NamedTuple):

@@ -38,7 +38,7 @@ def standard_text(path: Path) -> str:
         path.stat()
     except OSError as error:
         raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-    return _standard_text(path, path.resolve(), beside(path, ""))
+    return _standard_text(path, path.resolve(), beside(path))
 
 
 @lru_cache(maxsize=32)

@@ -21,7 +21,7 @@ from marlbc_mj.robots.planar import Base, base_of, find_base, moved_masses, slid
 from marlbc_mj.robots.rotors import Attitude, agility, rotor_numbers
 from marlbc_mj.robots.standard import standard_text
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import beside, guarded, load_module, made, split_name
+from marlbc_mj.util.modules import USED_SUFFIXES, beside, guarded, load_module, made, split_name
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
@@ -57,17 +57,17 @@ def find(name: str) -> Path:
 
 
 Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
-"""Path of a robot's file, and name, modification time and size of the files in its folder."""
+"""Path of a robot's file, and name, modification time and size of the files in its folder and below."""
 
 
 def stamp_of(name: str) -> Stamp:
-    """The current stamp of a robot's file, which differs after an edit of the file or of others in its folder.
+    """The current stamp of a robot's file, which differs after an edit of the file or of others in its folder or below.
 
     Raises:
         ConfigurationError: as :func:`find`.
     """
     path = find(name).resolve()
-    return path, beside(path, *SUFFIXES)
+    return path, beside(path, *USED_SUFFIXES)
 
 
 def load(name: str) -> Robot:

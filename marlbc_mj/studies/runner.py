@@ -79,7 +79,8 @@ def run_study(
         ended: called with each job and its result as soon as it ends, and with those that were already done.
 
     Raises:
-        ConfigurationError: an invalid setting, ``out`` cannot be written or is in use, or the engine cannot be used.
+        ConfigurationError: an invalid setting, ``out`` cannot be written or is in use, a user's file that jobs use was edited
+            meanwhile, or the engine cannot be used.
         SimulationError: a job raised it, or a worker died too often.
     """
     if out is None:
@@ -91,7 +92,9 @@ def run_study(
     with open_store(out, overwrite=overwrite) as store:
         _begin(store, study, keys, out, overwrite)
         try:
-            results = _Run(study, jobs, keys, store, ended).results(EngineSettings(workers, engine), EngineCallbacks(progress))
+            results = _Run(study, jobs, keys, store, ended, addresses.check_unchanged).results(
+                EngineSettings(workers, engine), EngineCallbacks(progress)
+            )
             store.close()
             with staged_folder(out, overwrite=overwrite) as folder:
                 store.place_files(dict.fromkeys(keys), folder)
@@ -159,6 +162,7 @@ class _Run(NamedTuple):
     keys: Sequence[str]
     store: RunStore | None
     ended: Callable[[Any, Any], None] | None
+    check: Callable[[], None] = lambda: None  # raises if results may no longer belong to the keys
 
     def results(self, means: EngineSettings, ears: EngineCallbacks) -> list[Any]:
         """Results in the order of the jobs; fewer if the study was stopped."""
@@ -166,17 +170,20 @@ class _Run(NamedTuple):
         found = {place: self.store.result(key) for place, key in self._found()} if self.store is not None else {}
         for place, result in found.items():
             self._tell(place, result)
-        tasks = [Task(place, self.keys[place], job) for place, job in enumerate(self.jobs) if place not in found]
+        equal = _same_keys(self.keys)
+        tasks = [Task(place, self.keys[place], self.jobs[place]) for place in equal if place not in found]
         count = _Count(len(self.jobs), len(found), ears.progress if self.store is not None and len(self.jobs) > 1 else silent)
         ears.retried = count.retried
         work = Work(self.study) if self.store is None else Work(self.study, self.store.files, self.store.engine)
         with closing(engine.map(work, tasks, ears)) as finished:
             for place, result in finished:
                 if self.store is not None:
+                    self.check()
                     self.store.keep(self.keys[place], result)
-                found[place] = result
-                self._tell(place, result)
-                count.ended()
+                for each in equal[place]:
+                    found[each] = result
+                    self._tell(each, result)
+                    count.ended()
         return [found[place] for place in sorted(found)]
 
     def _found(self) -> list[tuple[int, str]]:
@@ -187,6 +194,15 @@ class _Run(NamedTuple):
     def _tell(self, place: int, result: Any) -> None:
         if self.ended is not None:
             self.ended(self.jobs[place], result)
+
+
+def _same_keys(keys: Sequence[str]) -> dict[int, list[int]]:
+    """Indices of the jobs with the same result, by the index of the first of them; without keys, every job by itself."""
+    first: dict[str, int] = {}
+    found: dict[int, list[int]] = {}
+    for place, key in enumerate(keys):
+        found.setdefault(first.setdefault(key, place) if key else place, []).append(place)
+    return found
 
 
 class _Count:

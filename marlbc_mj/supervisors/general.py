@@ -35,7 +35,7 @@ from marlbc_mj.policies.general_inputs import SENT, Sight, make_sight, sense_fea
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.communication import Layer, make_layer
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift, no_way
-from marlbc_mj.supervisors.set_based_rule import avoids_by_itself
+from marlbc_mj.supervisors.set_based_rule import composition_avoids
 
 
 class GeneralMemory(NamedTuple):
@@ -78,7 +78,7 @@ class General:
         """
         orders, sight = orders_for(self.policy, scenario), make_sight(scenario)
         actions = np.full((teams, scenario.agents), FORMATION, dtype=np.int64)
-        way = no_way(scenario) if avoids_by_itself(scenario) else give_way(scenario)
+        way = no_way(scenario) if composition_avoids(scenario) else give_way(scenario)
         memory = GeneralMemory(sight, orders, decision_steps(scenario, sight), actions, way)
         if scenario.communication == IDEAL:
             return memory

@@ -28,7 +28,7 @@ from marlbc_mj.supervisors.set_based_rule import (
     IN_COLUMN,
     IN_FORMATION,
     LocalRule,
-    avoids_by_itself,
+    composition_avoids,
     make_local_rule,
     rule_orders,
 )
@@ -82,7 +82,7 @@ class LookAhead:
         """
         rule = make_local_rule(scenario, self.margin)
         slots, column = map(np.ascontiguousarray, scenario.formations)
-        fixed = (slots, column, rule.behaviors.path, float(scenario.safe_distance), rule, not avoids_by_itself(scenario))
+        fixed = (slots, column, rule.behaviors.path, float(scenario.safe_distance), rule, not composition_avoids(scenario))
         return Lanes(np.full(teams, IN_FORMATION), *fixed)
 
     def decide(self, observation: Observation, memory: Lanes) -> tuple[np.ndarray, Lanes]:

@@ -215,7 +215,7 @@ class MPCMS:
         agents = range(len(joint.avoiding))
         nobody = (False,) * len(agents)
         team = [Joint(motion, nobody) for motion in (0, 1)]
-        most = 0 if avoids_anyway(scenario) else min(self.together, len(agents))
+        most = 0 if avoidance_is_redundant(scenario) else min(self.together, len(agents))
         subsets = [s for size in range(1, most + 1) for s in combinations(agents, size)]
         single = [Joint(joint.motion, tuple(joint.avoiding[i] != (i in s) for i in agents)) for s in subsets]
         return [j for j in dict.fromkeys((*team, *single)) if j != joint]
@@ -230,7 +230,7 @@ class MPCMS:
         return self.horizon or STEPS_AHEAD[scenario.composition]
 
 
-def avoids_anyway(scenario: Scenario) -> bool:
+def avoidance_is_redundant(scenario: Scenario) -> bool:
     """Whether avoidance on top has no effect: it already bounds every motion, and precedes all other inequality tasks."""
     keeps = np.flatnonzero(keeps_array(scenario.behaviors))
     return scenario.composition == "set-based" and len(keeps) > 0 and scenario.behaviors[keeps[0]].name == AVOIDANCE

@@ -21,10 +21,10 @@ import numpy as np
 from marlbc_mj.core.behaviors import nearest_obstacle
 from marlbc_mj.core.cells import nearest, room
 from marlbc_mj.core.laws import allocation_free, compiled
+from marlbc_mj.engine.by_address import point_to
 from marlbc_mj.engine.composition import WORKSPACE, Behaviors, compose_team
 from marlbc_mj.engine.observation import Observation
 from marlbc_mj.engine.plan import grid_room, make_behaviors
-from marlbc_mj.engine.references import refer
 from marlbc_mj.scenarios import Scenario
 from marlbc_mj.supervisors.neighbors import GiveWay, give_way, lift, no_way
 from marlbc_mj.util.errors import ConfigurationError
@@ -55,15 +55,15 @@ def make_local_rule(scenario: Scenario, margin: float) -> LocalRule:
         raise ConfigurationError(f"margin of the set-based rule must be non-negative and finite, got {margin}")
     free = np.array([scenario.orders.index(name) for name in scenario.formation_names])
     behaviors, step, grid = make_behaviors(scenario), float(scenario.mission_step), np.zeros(grid_room(scenario))
-    if avoids_by_itself(scenario):
+    if composition_avoids(scenario):
         avoiding, least, way = free, -np.inf, no_way(scenario)
     else:
         avoiding = np.array([scenario.orders.index(f"OA>{name}") for name in scenario.formation_names])
         least, way = float(scenario.safe_distance + margin), give_way(scenario)
-    return cast(LocalRule, refer(LocalRule(behaviors, free, avoiding, least, step, way, grid)))
+    return cast(LocalRule, point_to(LocalRule(behaviors, free, avoiding, least, step, way, grid)))
 
 
-def avoids_by_itself(scenario: Scenario) -> bool:
+def composition_avoids(scenario: Scenario) -> bool:
     """Whether the composition keeps the safe distance under every order."""
     return scenario.composition == "set-based"
 

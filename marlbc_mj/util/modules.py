@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, TypeVar
 
 from marlbc_mj.util.errors import ConfigurationError, MarlbcError
+from marlbc_mj.util.files import JOBS_FOLDER, MANIFEST, PARTIAL, REPLACED
 from marlbc_mj.util.text import one_line
 
 _SUFFIX = ".py"
@@ -22,8 +23,15 @@ _PACKAGE = Path(__file__).parents[1]
 _Result = TypeVar("_Result")
 _PREFIX = "marlbc_user_"
 _LONGEST_PLACE = 160  # characters; part of a module's name, and so of file names in the cache of compiled code
-_MOST_BESIDE = 500
-"""Largest number of files beside a user's file to check for changes."""
+MOST_COMPANIONS = 1000
+"""Most files beside and below a user's file that are watched for changes."""
+USED_SUFFIXES = (
+    *(".py", ".xml", ".json", ".toml", ".yaml", ".yml", ".csv", ".npy", ".npz", ".pkl"),
+    *(".safetensors", ".pt", ".pth", ".onnx", ".stl", ".obj", ".msh", ".png"),
+)
+"""Suffixes of the code and data that a user's Python file may use."""
+_WRITTEN = frozenset((MANIFEST, JOBS_FOLDER, "resume.safetensors", "pyvenv.cfg"))
+"""A folder that has one of these holds what this package wrote, or a Python environment."""
 
 
 def split_name(name: str) -> tuple[str, str]:
@@ -43,15 +51,39 @@ def names_attribute(name: str) -> bool:
     return bool(split_name(name)[1])
 
 
-def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
-    """Name, modification time and size of the files in a file's folder, including itself; the tuple changes after an edit.
+def companions(path: Path, suffixes: tuple[str, ...] = ()) -> list[Path]:
+    """The files that a user's file may use, itself included, sorted: those in its folder and below.
+
+    Hidden files are left out, and folders of caches, of Python environments and of what this package wrote. If more than
+    :data:`MOST_COMPANIONS` are left, those below the folder are left out as well; if there are still more, all others are.
 
     Args:
-        path: the file.
-        suffixes: suffixes of the files to include.
+        path: the user's file.
+        suffixes: suffixes of the files to include; none: all files.
     """
+    folder, found, direct = path.resolve().parent, [path.resolve()], 0
+    for place, folders, files in os.walk(folder):
+        foreign = place != str(folder) and not _WRITTEN.isdisjoint((*folders, *files))
+        folders[:] = [] if foreign else sorted(filter(_may_hold_companions, folders))
+        if not foreign:
+            names = (name for name in files if name[0] != "." and (not suffixes or name.endswith(suffixes)))
+            found += [each for each in (Path(place, name) for name in sorted(names)) if each != found[0]]
+        if place == str(folder):
+            direct = len(found)
+        if len(found) > MOST_COMPANIONS:
+            return sorted(found[:direct]) if direct <= MOST_COMPANIONS else found[:1]
+    return sorted(found)
+
+
+def _may_hold_companions(name: str) -> bool:
+    """Whether a folder of this name is neither hidden nor a cache nor unfinished output."""
+    return not (name.startswith(".") or name == "__pycache__" or PARTIAL in name or REPLACED in name)
+
+
+def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, modification time and size of the :func:`companions` of a file; the tuple changes after an edit."""
     found = []
-    for each in sorted(each for suffix in suffixes for each in path.resolve().parent.glob(f"*{suffix}"))[:_MOST_BESIDE]:
+    for each in companions(path, suffixes):
         with suppress(OSError):
             status = each.stat()
             found.append((str(each), status.st_mtime_ns, status.st_size))
@@ -59,7 +91,7 @@ def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
 
 
 def load_module(path: Path) -> ModuleType:
-    """Run a user's Python file, which can import from its own folder; run it again only if a Python file there has changed.
+    """Run a user's Python file, which can import from its own folder; run it again only after a change of Python files there.
 
     Raises:
         ConfigurationError: the file cannot be read, or it raises an error.
@@ -134,9 +166,16 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
     finally:
         sys.path.remove(str(path.parent))
         for name in set(sys.modules) - before:  # a helper of the same name in another folder is another module
-            file = getattr(sys.modules[name], "__file__", None)
-            if file is not None and Path(file).parent == path.parent:
+            home = _home(sys.modules[name])
+            if home is not None and home.is_relative_to(path.parent) and _is_users(str(home)):
                 del sys.modules[name]
+
+
+def _home(module: ModuleType) -> Path | None:
+    """File of a module, or folder of a package without a file; None for one without either."""
+    folders = [] if getattr(module, "__file__", None) else list(getattr(module, "__path__", []))
+    place = getattr(module, "__file__", None) or (folders[0] if folders else None)
+    return None if place is None else Path(place)
 
 
 def guarded(call: Callable[[], _Result], what: str, kind: type[MarlbcError] = ConfigurationError) -> _Result:

@@ -31,7 +31,7 @@ from marlbc_mj.policies.general_inputs import (
     sense_features,
 )
 from marlbc_mj.scenarios import Scenario
-from marlbc_mj.supervisors.set_based_rule import avoids_by_itself
+from marlbc_mj.supervisors.set_based_rule import composition_avoids
 from marlbc_mj.training.base import prefixed, unprefixed
 from marlbc_mj.training.config import TrainConfig
 from marlbc_mj.training.exploration import Exploration
@@ -73,7 +73,7 @@ class Squad:
         self.scenario, self.config = scenario, config
         self.sight = make_sight(scenario)
         self.orders = action_orders(scenario)
-        self.avoids = not avoids_by_itself(scenario)  # whether agents decide about avoidance
+        self.avoids = not composition_avoids(scenario)  # whether agents decide about avoidance
         self.interval = decision_steps(scenario, self.sight)
         self.world = World(scenario, make_controller(config.controller), worlds=config.worlds, threads=config.threads)
         self.explore = Exploration(learning, scenario.agents, len(self.orders))

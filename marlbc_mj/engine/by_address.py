@@ -1,7 +1,7 @@
 """What compiled code receives by address: NamedTuples of arrays, and compiled functions.
 
 The loop takes about ninety arrays in six NamedTuples. numba passes a NamedTuple by value: every function that takes one is
-compiled with hundreds of arguments, and every ``team.position`` reads all of it. A :class:`Reference` is one pointer and reads
+compiled with hundreds of arguments, and every ``team.position`` reads all of it. A :class:`Pointer` is one pointer and reads
 only the field. The same source works with both, because attributes have the same names.
 
 numba compiles a function once more into each of its callers. So the large parts of the loop are called by address with
@@ -38,29 +38,29 @@ class _Holder(structref.StructRefProxy):
 structref.define_proxy(_Holder, _HolderType, ["values"])
 
 
-class ReferenceType(types.Type):
-    """numba's type of :class:`Reference`: ``target`` is the type of the NamedTuple."""
+class PointerType(types.Type):
+    """numba's type of :class:`Pointer`: ``target`` is the type of the NamedTuple."""
 
     def __init__(self, target: types.BaseTuple) -> None:
         self.target = target
-        super().__init__(name=f"Reference({target})")
+        super().__init__(name=f"Pointer({target})")
 
 
-@register_model(ReferenceType)
-class _ReferenceModel(models.PrimitiveModel):
-    def __init__(self, manager: Any, kind: ReferenceType) -> None:
+@register_model(PointerType)
+class _PointerModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: PointerType) -> None:
         super().__init__(manager, kind, manager.lookup(kind.target).get_value_type().as_pointer())
 
 
 @infer_getattr
 class _Fields(AttributeTemplate):
-    key = ReferenceType
+    key = PointerType
 
-    def generic_resolve(self, kind: ReferenceType, name: str) -> Any:
+    def generic_resolve(self, kind: PointerType, name: str) -> Any:
         return kind.target.types[kind.target.fields.index(name)] if name in kind.target.fields else None
 
 
-@lower_getattr_generic(ReferenceType)
+@lower_getattr_generic(PointerType)
 def _read_field(context, builder, kind, value, name):
     index = kind.target.fields.index(name)
     field = kind.target.types[index]
@@ -84,8 +84,8 @@ def _hold(values):
     return holder, _address(holder)
 
 
-class Reference:
-    """A NamedTuple of arrays and numbers that compiled code takes as one pointer. Made by :func:`refer`.
+class Pointer:
+    """A NamedTuple of arrays and numbers that compiled code takes as one pointer. Made by :func:`point_to`.
 
     In Python it reads like the NamedTuple. Compiled code uses the same arrays; numbers are copied when it is made.
     """
@@ -94,29 +94,29 @@ class Reference:
         self.__dict__.update(values._asdict())  # Python finds a field as fast as any attribute
         self.values = values
         self.owner, self.address = _hold(values)
-        self._numba_type_ = ReferenceType(self.owner._numba_type_.field_dict["values"])
+        self._numba_type_ = PointerType(self.owner._numba_type_.field_dict["values"])
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("__") or name == "values":
             raise AttributeError(name)
         return getattr(self.values, name)
 
-    def _replace(self, **changes: Any) -> "Reference":
-        """Another reference with some fields changed, as for a NamedTuple."""
-        return Reference(self.values._replace(**changes))
+    def _replace(self, **changes: Any) -> "Pointer":
+        """Another pointer with some fields changed, as for a NamedTuple."""
+        return Pointer(self.values._replace(**changes))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy refers to a copy."""
-        return refer, (self.values,)
+        """A copy points to a copy."""
+        return point_to, (self.values,)
 
 
-def refer(values: Any) -> Any:
-    """A NamedTuple in the form that the loop takes: a :class:`Reference`, or the NamedTuple itself if numba is off."""
-    return values if numba.config.DISABLE_JIT else Reference(values)
+def point_to(values: Any) -> Any:
+    """A NamedTuple in the form that the loop takes: a :class:`Pointer`, or the NamedTuple itself if numba is off."""
+    return values if numba.config.DISABLE_JIT else Pointer(values)
 
 
-@unbox(ReferenceType)
-def _unbox_reference(kind, value, c):
+@unbox(PointerType)
+def _unbox_pointer(kind, value, c):
     number = c.pyapi.object_getattr_string(value, "address")
     pointer = c.pyapi.long_as_voidptr(number)
     c.pyapi.decref(number)
@@ -132,7 +132,7 @@ class EntryType(types.Type):
 
 
 class RecordType(types.Type):
-    """Type of a reference among the kinds of an entry: the record's name only, since a record may hold entries that take it."""
+    """Type of a pointer among the kinds of an entry: the record's name only, since a record may hold entries that take it."""
 
     def __init__(self, record: str) -> None:
         super().__init__(name=f"&{record}")
@@ -160,10 +160,10 @@ def _unbox_entry(kind, value, c):
 
 
 def _passed(kind: Any) -> Any:
-    """The type of a passed argument: integers as int64, floats as float64, arrays C-contiguous, references by name."""
+    """The type of a passed argument: integers as int64, floats as float64, arrays C-contiguous, pointers by name."""
     if isinstance(kind, types.Array):
         return types.Array(kind.dtype, kind.ndim, "C")
-    if isinstance(kind, ReferenceType):
+    if isinstance(kind, PointerType):
         return RecordType(kind.target.instance_class.__name__)
     if isinstance(kind, types.Integer):
         return types.int64
@@ -226,6 +226,6 @@ def entry(function: Any, *arguments: Any) -> Any:
 
 
 def no_entry(*arguments: Any) -> Any:
-    """A placeholder for an unknown :func:`entry`, of the same type. A record class stands for a reference to such a record."""
+    """A placeholder for an unknown :func:`entry`, of the same type. A record class stands for a pointer to such a record."""
     kinds = (RecordType(a.__name__) if isinstance(a, type) else _passed(numba.typeof(a)) for a in arguments)
     return EntryPoint(0, tuple(kinds))

@@ -1,4 +1,4 @@
-"""Passing by address to compiled code: fields are read and written through a reference, functions called at their address."""
+"""Passing by address to compiled code: fields are read and written through a pointer, functions called at their address."""
 
 import copy
 from typing import NamedTuple
@@ -9,7 +9,7 @@ import pytest
 from numba.core.errors import NumbaError
 
 from marlbc_mj.core.compiling import allocation_free, compiled
-from marlbc_mj.engine.references import Reference, call, entry, no_entry, refer
+from marlbc_mj.engine.by_address import Pointer, call, entry, no_entry, point_to
 
 pytestmark = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="nothing has an address")
 
@@ -38,9 +38,9 @@ def halved(x):
     return 0.5 * x
 
 
-def make_pair() -> Reference:
+def make_pair() -> Pointer:
     pair = Pair(np.zeros(3), 2.0, True, no_entry(0, 0.0, Pair))
-    return refer(pair._replace(inner=entry(add_scaled, 0, 0.0, refer(pair))))
+    return point_to(pair._replace(inner=entry(add_scaled, 0, 0.0, point_to(pair))))
 
 
 def test_a_function_called_by_address_changes_the_very_arrays():
@@ -51,7 +51,7 @@ def test_a_function_called_by_address_changes_the_very_arrays():
     assert call(add_scaled, 0, 1.0, pair) == 1 and pair.rows[0] == 2.0  # in Python, the function itself is called
 
 
-def test_a_reference_reads_as_its_record_and_is_replaced_like_it():
+def test_a_pointer_reads_as_its_record_and_is_replaced_like_it():
     pair = make_pair()
     off = pair._replace(on=False)
     assert (pair.factor, pair.on, off.on) == (2.0, True, False) and off.rows is pair.rows
@@ -91,7 +91,7 @@ def count(rows):
 )
 def test_what_an_entry_does_not_take_is_an_error_of_the_compiler(rows, said):
     """It is never a memory error: the type of an entry includes its function's argument types."""
-    pair = refer(Pair(np.zeros(3), 2.0, True, entry(count, np.zeros(2))))
+    pair = point_to(Pair(np.zeros(3), 2.0, True, entry(count, np.zeros(2))))
     assert sum_at(pair, np.zeros(4)) == 4
     with pytest.raises(NumbaError, match=said):
         sum_at(pair, rows)
