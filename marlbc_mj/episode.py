@@ -104,6 +104,10 @@ def run_episode(
         ConfigurationError: more than one world, a world that records no substeps, or a decision of wrong shape or type.
         SimulationError: the world diverged, or supervisor or law raised an error.
     """
+    if not isinstance(world, World):
+        raise ConfigurationError(
+            f"run_episode takes a World and a supervisor, got {type(world).__name__}; for example World(paper(), record=True)"
+        )
     if world.worlds != 1:
         raise ConfigurationError(f"run_episode needs a World of one world, got {world.worlds}")
     supervisor, observation = batched(supervisor), world.reset(seed)

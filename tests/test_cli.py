@@ -11,18 +11,19 @@ import numpy as np
 import pytest
 
 from marlbc_mj.cli import main
-from marlbc_mj.cli.scenario_options import ScenarioOptions
+from marlbc_mj.cli.scenario_options import FIXED_TEAMS, ScenarioOptions
 from marlbc_mj.controllers import CONTROLLERS
 from marlbc_mj.engine.world import World
 from marlbc_mj.recording import writer
 from marlbc_mj.results.summary import AGENT_KEYS, TEAM_KEYS
 from marlbc_mj.robots import make_robot
-from marlbc_mj.scenarios import Perturbation, Scenario, make_scenario, paper
+from marlbc_mj.scenarios import FAMILIES, SCENARIOS, Perturbation, Scenario, make_scenario, paper
 from marlbc_mj.studies.bench import matrix
 from marlbc_mj.studies.episodes import Stopwatch
 from marlbc_mj.supervisors import MPCMS, ON_REQUEST, SUPERVISORS, make_supervisor
 from marlbc_mj.training.config import PRESETS
 from marlbc_mj.training.methods import METHODS
+from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.files import MANIFEST
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
@@ -110,7 +111,7 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
         (["bench", "--no-logs"], ("video", "logs")),
         (["bench", "--seeds", "0"], ("seeds", "0")),
         (["bench", "--drag-range", "5", "5"], ("--drag-range 5 5", "--seeds")),
-        (["bench", "--seeds", "1", "--drag-range", "5", "2"], ("drag_scale", "5", "2")),
+        (["bench", "--seeds", "1", "--drag-range", "5", "2"], ("drag range", "(5.0, 2.0)")),
         (["bench", "--workers", "0"], ("workers", "0")),
         (["bench", "--supervisors"], ("at least one supervisor", "scripted")),
         (["bench", "--controllers"], ("at least one controller", "sorlc")),
@@ -279,7 +280,12 @@ def test_a_team_and_a_robot_of_another_kind(tmp_path: Path, capsys: pytest.Captu
     scenario, scale = options.build("field"), make_robot("omni").scale()
     assert scenario.agents == 6 and "circle" in scenario.description
     assert all(getattr(scenario, name) == value for name, value in scale.items())
-    assert "has a fixed team of 4 agents" in refused(["run", "--agents", "6", "--out", str(tmp_path / "run")], capsys)
+    for option in (["--agents", "6"], ["--formation", "line"], ["--room"]):
+        said = refused(["run", *option, "--out", str(tmp_path / "run")], capsys)
+        assert f"paper has a fixed team; {option[0]} works with families: open, exchange, field" in said
+    assert set(SCENARIOS) - set(FAMILIES) == set(FIXED_TEAMS)
+    with pytest.raises(ConfigurationError, match="has a fixed team of 4 agents"):
+        paper(agents=6)
     (tmp_path / "mine.toml").write_text('family = "open"\nrobot = "omni"\nagents = 3\n')
     from_file = make_scenario(str(tmp_path / "mine.toml"))
     assert all(getattr(from_file, name) == value for name, value in scale.items() if value != float("inf"))

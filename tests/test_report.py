@@ -396,13 +396,15 @@ def test_no_mark_covers_another(results: list[Result]) -> None:
     figure = pareto([sorlc, other, twin])
     figure.draw_without_rendering()
     for axes in figure.axes:
-        marks = [line for line in axes.lines if line.get_marker() in tuple("os^")]
+        marks = [line for line in axes.lines if line.get_marker() in tuple("os^") and line.get_markersize() > 3.0]
         places = [72.0 / figure.dpi * line.get_transform().transform(line.get_xydata())[0] for line in marks]
         true = [72.0 / figure.dpi * axes.transData.transform(line.get_xydata())[0] for line in marks]
         assert len(places) == 3 and min(np.hypot(*(a - b)) for a, b in combinations(places, 2)) > 6.0
         aside = [not np.allclose(place, at) for place, at in zip(places, true, strict=True)]
         assert aside == [False, False, True] and sum(text.arrow_patch is not None for text in axes.texts) == 1
         assert np.hypot(*(places[2] - true[2])) < 7.0
+        (dot,) = (line for line in axes.lines if line.get_markersize() < 3.0 and line.get_marker() == "o")
+        np.testing.assert_allclose(dot.get_xydata(), marks[2].get_xydata())
 
 
 def test_other_missions_do_not_speak_of_the_paper() -> None:

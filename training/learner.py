@@ -166,7 +166,7 @@ class Learner:
     def estimates(self, batch: Batch, now: Tensor, ahead: Tensor) -> tuple[Tensor, Tensor]:
         """(K, M) values of the chosen actions, with gradient, and their targets, without gradient; one row per agent here, K = N.
 
-        Target: r + discount max_b Q(s', b), with Q averaged over the past networks.
+        The target of (17): r + discount max_b Q(s', b), with Q averaged over the past networks.
 
         Args:
             batch: M transitions.

@@ -1,5 +1,7 @@
 """``marlbc bench``, ``run``, ``evaluate`` and ``safety``."""
 
+import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -60,10 +62,10 @@ class BenchCommand:
     """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     video: Literal["first", "all", "none"] = "first"
     """Which methods get a video."""
-    figures: bool = True
-    """Draw the figures."""
-    logs: bool = True
-    """Write an MCAP log of every episode."""
+    no_figures: bool = False
+    """Leave out the figures."""
+    no_logs: bool = False
+    """Leave out the MCAP logs of the episodes."""
     overwrite: bool = False
     """Replace the results in the output folder."""
     shield: bool = False
@@ -104,7 +106,8 @@ class BenchCommand:
         """The configuration of the benchmark, made from the options."""
         from marlbc_mj.studies.bench import BenchConfig
 
-        return BenchConfig(**{each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)})
+        given = {each.name: getattr(self, each.name) for each in fields(BenchConfig) if hasattr(self, each.name)}
+        return BenchConfig(**given, figures=not self.no_figures, logs=not self.no_logs)
 
     def scenario_drawn(self) -> "Scenario":
         """The scenario with the changes of the options, including --drag-range.
@@ -220,7 +223,7 @@ class EvaluateCommand:
     output: OmitArgPrefixes[ReportOptions] = field(default_factory=ReportOptions)
 
     def run(self) -> None:
-        """Evaluate, and print the table of outcomes."""
+        """Evaluate, and print the table of outcomes; exit with status 3 if no mission could be flown to its end."""
         from marlbc_mj.report.seed_tables import outcome_tables
         from marlbc_mj.report.table import to_markdown
         from marlbc_mj.studies.evaluate import evaluation, run_evaluation
@@ -238,7 +241,21 @@ class EvaluateCommand:
         with self.output.progress() as told:
             results = run_evaluation(self.mission.build(self.scenario), config, self.out, progress=told.progress)
         self.output.report("\n".join(map(to_markdown, outcome_tables(results))), seed_document(results))
+        self.output.complain(failures_of(results))
         self.output.say(f"{self.out / 'index.html'} shows all results")
+        if all(run.failure for method in results.methods for run in method.runs):
+            sys.exit(3)
+
+
+def failures_of(results: "SeedResults") -> list[str]:
+    """One line for every method that failed on some layouts: how many, and the commonest reason."""
+    lines = []
+    for method in results.methods:
+        reasons = Counter(run.failure for run in method.runs if run.failure)
+        if reasons:
+            (reason, _), *_ = reasons.most_common(1)
+            lines.append(f"{method.supervisor} failed on {reasons.total()} of {len(method.runs)} layouts: {reason}")
+    return lines
 
 
 @dataclass(frozen=True)
@@ -269,7 +286,9 @@ class SafetyCommand:
     controller: ControllerName = "sorlc"
     """Controller that all supervisors run with."""
     workers: int = 1
-    """Number of processes that share the layouts."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     out: Path = Path("out/safety")
     """Folder of the tables."""
     overwrite: bool = False
@@ -289,6 +308,8 @@ class SafetyCommand:
             settings["missions"] = tuple(f"{mission}-{team}" for team in self.teams for mission in self.missions)
         study = SafetyStudy(**settings, shields=tuple(shield == "yes" for shield in self.shields))
         with self.output.progress() as told:
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, progress=told.progress)
+            done = run_study(
+                study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, progress=told.progress
+            )
         self.output.report(done.report.text, done.report.document)
         self.output.say(f"{self.out / 'safety.csv'} has all numbers")

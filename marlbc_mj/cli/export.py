@@ -7,8 +7,9 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from marlbc_mj.cli.choices import ExistingPath
 from marlbc_mj.cli.output import OutputOptions
+from marlbc_mj.util.errors import ConfigurationError
 
-LOG_SUFFIX = ".mcap"
+LOG_SUFFIX, POLICY_SUFFIX = ".mcap", ".safetensors"
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,11 @@ class ExportCommand:
             export_log(self.source, self.out, overwrite=self.overwrite)
             self.output.say(self.out)
             return
+        if self.source.suffix != POLICY_SUFFIX:
+            what = "a folder" if self.source.is_dir() else f"a file that ends in {self.source.suffix or 'nothing'}"
+            raise ConfigurationError(
+                f"export takes a log ({LOG_SUFFIX}) or a checkpoint ({POLICY_SUFFIX}); {self.source} is {what}"
+            )
         from marlbc_mj.training.export import export_policy
 
         self.output.say(export_policy(self.source, self.out, overwrite=self.overwrite))

@@ -116,7 +116,9 @@ class CommunicationCommand:
     seed: int = 65000
     """Seed of the first layout."""
     workers: int = 1
-    """Number of processes that share the cases."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     agreement: bool = False
     """Only measure how long agents take to agree by flooding and by consensus; writes no files."""
     out: Path = Path("out/communication")
@@ -145,7 +147,7 @@ class CommunicationCommand:
         study = CommunicationStudy(missions, self.supervisor, seeds, self.controller, self.shield)
         with self.output.progress() as told:
             ended = counting(study.jobs(), lambda job: job.scenario.name, told.progress)
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=ended)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, ended=ended)
         self.output.report(done.report.text, done.report.document)
         self.output.say(f"{self.out / 'communication.csv'} holds the numbers")
 
@@ -224,7 +226,9 @@ class RegretCommand:
     controller: ControllerName = "sorlc"
     """Controller that tracks the references."""
     workers: int = 1
-    """Number of processes that share the layouts."""
+    """Number of processes, or of tasks in a SLURM array, that share the jobs."""
+    engine: Literal["local", "ray", "slurm"] = "local"
+    """Where jobs run: on this machine, on Ray (the cluster in RAY_ADDRESS, else this machine), or in a SLURM array."""
     out: Path = Path("out/regret")
     """Folder for regret.csv, regret.md and config.json."""
     overwrite: bool = False
@@ -239,7 +243,7 @@ class RegretCommand:
         study = RegretStudy(self.missions, self.supervisors, self.layouts, self.seed, self.budget, self.controller)
         with self.output.progress() as told:
             ended = counting(study.jobs(), lambda job: job.mission, told.progress)
-            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, ended=ended)
+            done = run_study(study, self.out, overwrite=self.overwrite, workers=self.workers, engine=self.engine, ended=ended)
         self.output.report(done.report.text, done.report.document)
         self.output.say(f"{self.out / 'regret.csv'} holds the numbers")
 

@@ -20,6 +20,8 @@ from marlbc_mj.util.text import nearest_word, one_line
 
 MINIMUMS = {"--seed": 0, "--seeds": 1, "--layouts": 1, "--workers": 1, "--agents": 2}
 """Smallest values of options that have the same meaning in every command."""
+_WITHOUT_COMMAND = ("-h", "--help", "--tyro-print-completion", "--tyro-write-completion")
+_NUMBERS = {int: "a whole number", float: "a number"}
 ABOVE_ZERO = ("--duration", "--substep")
 """Options whose value, a time, must be above zero in every command."""
 
@@ -101,11 +103,12 @@ def check_words(chosen: Chosen) -> None:
     name = ""
     for word in chosen.rest:
         if word.startswith("--"):
-            name, _, value = word.partition("=")
-            hint, words = hints.get(name.replace("_", "-")), [value] if value else []
+            name, equals, value = word.partition("=")
+            hint, words = hints.get(name.replace("_", "-")), [value] if equals else []
         else:
             words = [word]
         if words:
+            check_number(name, words[0], hint)
             check_least(name, words[0])
         constructor = _constructor_of(hint)
         if words and constructor is not None:
@@ -122,6 +125,24 @@ def check_least(option: str, word: str) -> None:
         return
     bound = f"must be at least {least}" if least else "must not be negative"
     raise WrongWord(ConfigurationError(f"{option.removeprefix('--')} {bound}, got {int(word)}"))
+
+
+def check_number(option: str, word: str, hint: Any) -> None:
+    """Raise WrongWord for a word that is not a number, where an option takes one, or that is empty, where it takes anything."""
+    kinds = {kind for kind in _kinds_of(hint) if kind in _NUMBERS}
+    if option and not word:
+        raise WrongWord(ConfigurationError(f"{option} must not be empty"))
+    if kinds and _number(word) is None:
+        raise WrongWord(ConfigurationError(f"{option} must be {_NUMBERS[kinds.pop()]}, got {word!r}"))
+    if kinds == {int} and not word.removeprefix("-").isdecimal():
+        raise WrongWord(ConfigurationError(f"{option} must be {_NUMBERS[int]}, got {word!r}"))
+
+
+def _kinds_of(hint: Any) -> Iterator[Any]:
+    """All types in a field's annotation."""
+    yield hint
+    for part in get_args(hint):
+        yield from _kinds_of(part)
 
 
 def _number(word: str) -> float | None:
@@ -149,9 +170,16 @@ def _is_tuple(hint: Any) -> bool:
 def _refused_word(chosen: Chosen) -> Refusal | None:
     """The error if a subcommand is missing or unknown; None if there is no error, or if tyro reports it."""
     known = subcommands_of(chosen.kind)
+    listed = ", ".join(known)
+    if known and chosen.rest and chosen.rest[0].startswith("-") and chosen.rest[0] not in _WITHOUT_COMMAND:
+        option = chosen.rest[0].partition("=")[0]
+        if option in options_of(chosen.kind):
+            return Refusal(f"{option} must come after the command; choose from: {listed}", chosen.prog)
+        like = nearest_word(option, ("--help", "--version"))
+        perhaps = f" perhaps {like};" if like else ""
+        return Refusal(f"unknown option {option};{perhaps} commands: {listed}", chosen.prog)
     if not known or (chosen.rest and chosen.rest[0].startswith("-")):
         return None
-    listed = ", ".join(known)
     if not chosen.rest:
         return Refusal(f"Expected one of {{{listed}}}", chosen.prog)
     like = nearest_word(chosen.rest[0], known)
@@ -174,7 +202,7 @@ def _refusal(event: Any, kind: Any) -> Refusal | None:
             command = f"{event.prog} {event.missing_arguments[0].source_parser.prog_suffix}".strip()
             return Refusal(f"Missing from {command}: {', '.join(missing)}", command)
         case "BadValue" if event.reason == "too_few_values":
-            said = f"Missing value for argument {_name(event.argument)!r}. Expected {event.argument.lowered.nargs} values"
+            said = f"Missing value for argument {_name(event.argument)!r}"
         case "InvalidChoice":
             like = nearest_word(str(event.value), map(str, event.choices))
             perhaps = f"; perhaps {like!r}" if like else ""

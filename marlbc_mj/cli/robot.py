@@ -47,8 +47,8 @@ class RobotGateCommand:
     """Controller, with the robot's gains."""
     out: Path = Path("out/robots")
     """Folder for gate.md, gate.json, PNG and MP4 files."""
-    clips: bool = True
-    """Render stills and clips."""
+    no_clips: bool = False
+    """Leave out stills and clips."""
     workers: int = 1
     """Number of processes, or of tasks in a SLURM array, that share the jobs."""
     engine: Literal["local", "ray", "slurm"] = "local"
@@ -67,7 +67,7 @@ class RobotGateCommand:
                 self.supervisors or tuple(GATE_METHODS),
                 self.out,
                 controller=self.controller,
-                clips=self.clips,
+                clips=not self.no_clips,
                 overwrite=self.overwrite,
                 workers=self.workers,
                 engine=self.engine,

@@ -14,11 +14,16 @@ from marlbc_mj.cli.choices import (
     SomeReference,
     SomeRobot,
     SomeSplit,
+    selectable,
 )
 from marlbc_mj.util.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from marlbc_mj.scenarios import Scenario
+
+
+FIXED_TEAMS = ("paper", "cruise", "robot_gate")
+"""Scenarios that are not families: their number of agents and their formations are fixed."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +86,13 @@ class ScenarioOptions:
         settings, robots = self._split_settings()
         scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name, robots), **changes)
         return with_settings(scenario, settings)
+
+    def check_team(self, name: str) -> None:
+        """Refuse another team in a shipped scenario of fixed size; imports nothing heavy."""
+        given = [option for option in ("agents", "formation", "room") if getattr(self, option)]
+        if given and name in FIXED_TEAMS:
+            families = [each for each in selectable()["scenarios"] if each not in FIXED_TEAMS]
+            raise ConfigurationError(f"{name} has a fixed team; --{given[0]} works with families: {', '.join(families)}")
 
     def _split_settings(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """The settings without ``robots``, and the names in ``robots``: the scenario is scaled to the robots when it is made."""

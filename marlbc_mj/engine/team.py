@@ -111,7 +111,7 @@ def _check_solid(plan: Plan, obstacles: np.ndarray) -> None:
     if len(plan.solid) and (obstacles[:, 2] != scenario.obstacle_array()[:, 2]).any():
         raise ConfigurationError(
             f"robot {plan.fleet.solid!r} collides with obstacles, so their radii cannot depend on the seed; "
-            "give the family a single radius: [r, r]"
+            "give the family a single radius in a TOML file, for example radius = [0.5, 0.5], or fly gates or robot_gate"
         )
 
 

@@ -60,6 +60,8 @@ def render_video(
         ConfigurationError: an invalid argument, an existing file without ``overwrite``, or no usable OpenGL.
         SimulationError: the encoder failed.
     """
+    if not isinstance(log, EpisodeLog):
+        raise ConfigurationError(f"a video shows a log, as read_log returns it, got {type(log).__name__}")
     path = Path(path)
     check_format(path)
     if not 0 <= style.samples <= MOST_SAMPLES:

@@ -42,9 +42,10 @@ _FORCES = (
 )
 _PARETO = (
     "Control cost against what it achieves. Colors are supervisors, shapes are controllers. A mark that would cover another "
-    "is shifted; a thin line leads to its place. Formation error: mean distance of an agent from its slot in "
-    "the first formation, relative to the centroid. Dashed: LQR, whose gains minimize this cost in regulation."
+    "is shifted, and a line leads to a dot at its true place. Formation error: mean distance of an agent from its slot in "
+    "the first formation, relative to the centroid."
 )
+_FLOOR = " Dashed: LQR, whose gains minimize this cost in regulation."
 _CONTROL = (
     "with each framework's controller; bottom row: around the largest of all forces. One scale: linear up to SORLC's limit "
     "(dashed), logarithmic beyond."
@@ -136,7 +137,8 @@ def _framework_figures(laws: Mapping[str, Trajectory]) -> list[Plot]:
 def _comparison(results: Sequence[Result]) -> list[Plot]:
     if len(results) < 2:
         return []
-    return [Plot("pareto_all", _PARETO, lambda: pareto(results))]
+    floor = _FLOOR if any(result.controller == "lqr" and result.metrics is not None for result in results) else ""
+    return [Plot("pareto_all", _PARETO + floor, lambda: pareto(results))]
 
 
 def _methods(results: Sequence[Result]) -> list[Plot]:

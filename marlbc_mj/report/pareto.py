@@ -20,6 +20,7 @@ from marlbc_mj.util.palette import METHOD_COLORS
 _MARKERS = ("o", "s", "^", "D", "v", "P", "X", "<", ">", "*", "h", "p")
 
 _INK, _PAPER = "#1A1A1A", "#FFFFFF"
+_LEADER = "#777777"
 _COST_UNIT = "[(SI units)² s]"  # the cost adds m^2, (m/s)^2 and N^2
 _MARK = 5.0  # size of a mark [pt]
 _APART = 6.5  # approximate least distance between marks [pt]
@@ -44,7 +45,7 @@ def pareto(results: Sequence[Result]) -> Figure:
 
     If the methods are supervisors with one controller and controllers under one supervisor, each of the two kinds has its own
     row, since their ranges differ. Otherwise all share one row. A control law has the same marker with and without a force
-    limit, open if without. A mark that would cover another is shifted, and a thin line leads to its true position.
+    limit, open if without. A mark that would cover another is shifted, and a line leads to a dot at its true position.
     """
     ran = [result for result in results if result.metrics is not None]
     groups = _groups(ran)
@@ -110,6 +111,8 @@ def _draw_group(row: np.ndarray, group: Group) -> None:
         room = 0.12 * (float(np.ptp(values)) or 1.0)
         axes.set(xscale="log", xlim=limits, xlabel=f"{cost.quantity}, {cost.aggregation} {_COST_UNIT}", ylabel=SCORES[name].label)
         axes.set_ylim(values.min() - room, values.max() + room)
+        if values.min() >= 0.0:  # marks that are shifted below zero must not look like negative values
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 0.0 else "")
         axes.set_title(better, loc="left", fontsize=7, color=pl.GREY)
         _draw_marks(axes, np.column_stack([costs, values]), [group.style(result) for result in group.results])
         axes.grid(color="#E4E4E4", linewidth=0.4)
@@ -125,8 +128,9 @@ def _draw_marks(axes: Axes, points: np.ndarray, styles: Sequence[Mapping[str, An
     for point, shift, style in zip(points, shifts, styles, strict=True):
         aside = axes.transData + ScaledTranslation(shift[0] / 72.0, shift[1] / 72.0, inch)
         if shift.any():
-            line = {"arrowstyle": "-", "linewidth": 0.5, "color": pl.GREY, "shrinkA": 0.0, "shrinkB": 0.0}
+            line = {"arrowstyle": "-", "linewidth": 0.7, "color": _LEADER, "shrinkA": 0.0, "shrinkB": 0.0, "zorder": 4}
             axes.annotate("", point, tuple(shift), textcoords="offset points", arrowprops=line, annotation_clip=False)
+            axes.plot(*point, marker="o", markersize=1.8, color=_LEADER, linestyle="none", clip_on=False, zorder=5)
         axes.plot(*point, linestyle="none", clip_on=False, transform=aside, **style)
 
 

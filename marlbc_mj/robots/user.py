@@ -52,7 +52,7 @@ def find(name: str) -> Path:
     if path.suffix not in SUFFIXES:
         raise ConfigurationError(f"a robot's file must end in {' or '.join(SUFFIXES)}, got {path}")
     if not path.is_file():
-        raise ConfigurationError(f"no robot file {path}")
+        raise ConfigurationError(f"robot file {path} is a folder" if path.is_dir() else f"no robot file {path}")
     return path
 
 

@@ -31,6 +31,8 @@ class NoSpaceError(ConfigurationError):
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
     """The error for a name that is not in a list; its message has the name, a similarly spelled one and the list."""
     names = list(valid)
+    if isinstance(name, str) and name.endswith(".py"):
+        return ConfigurationError(f"{name!r} is a file; add the name of the {kind} in it: {name}:NAME")
     like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"
     return ConfigurationError(f"unknown {kind} {name!r};{perhaps} choose from: {', '.join(names)}")
