@@ -137,8 +137,18 @@ def _frame(
     shield = None if step.shield is None else ShieldCounts(*(rows[0] for rows in step.shield))
     links = None if heard is None else heard.team(0)
     state, decision_ms, pose = before
-    verdicts = step.observation.command[0], float(step.reward[0])
-    return Frame(seen.team(0), record, *verdicts, state, decision_ms, after, pose, shield, links)
+    return Frame(
+        observation=seen.team(0),
+        record=record,
+        command=step.observation.command[0],
+        reward=float(step.reward[0]),
+        controller_state=state,
+        decision_ms=decision_ms,
+        after=after,
+        pose=pose,
+        shield=shield,
+        hearing=links,
+    )
 
 
 def _trajectory(world: World, frames: list[Frame], names: tuple[int, str, str]) -> Trajectory:

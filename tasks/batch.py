@@ -186,17 +186,17 @@ class FormationBatch:
             self._restart(ended)
             now = self.states()
         return DecisionOutcome(
-            now,
-            final,
-            formation,
-            violation,
-            reward - formation - violation,
-            switches,
-            clearance,
-            before.age,
-            np.full(self.world.worlds, self.interval),
-            terminal,
-            truncated,
+            state=now,
+            final_state=final,
+            formation=formation,
+            violation=violation,
+            switching=reward - formation - violation,
+            switches=switches,
+            clearance=clearance,
+            age=before.age,
+            steps=np.full(self.world.worlds, self.interval),
+            terminal=terminal,
+            truncated=truncated,
         )
 
     def _hold(self, orders: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -394,7 +394,7 @@ def test_video_names_its_backend_only_once_it_draws(short, tmp_path, capsys):
             r"unknown command 'rec'; perhaps 'recover'; choose from: info, recover, export; see `marlbc log --help`",
         ),
         (["run", "--sed", "1"], r"Unrecognized options: --sed, 1; perhaps --seed; see `marlbc run --help`"),
-        (["run", "--seed", "x"], r"Error parsing --seed: invalid literal for int\(\) with base 10: 'x'; see `marlbc run --help`"),
+        (["run", "--seed", "x"], r"--seed must be a whole number, got 'x'"),
         (["bench", "--video", "x"], r"invalid choice 'x' for argument '--video'.*'all', 'none'\); see `marlbc bench --help`"),
         (["log", "recover", "a"], r"Missing from marlbc log recover: PATH .*; see `marlbc log recover --help`"),
         ([], r"Expected one of \{bench, .*\}; see `marlbc --help`"),

@@ -342,7 +342,16 @@ def restrain_references(numbers, braking_limit, duration, at, obstacles, previou
         v_r: (N, 2) desired velocities within the limits of speed and acceleration.
     """
     kept, between = numbers.clearance + numbers.tube, numbers.agent_distance + 2.0 * numbers.tube
-    barrier = Barrier(0.0, 0.0, 0.0, np.inf, braking_limit, duration, kept, between)
+    barrier = Barrier(
+        rate=0.0,
+        margin=0.0,
+        reach=0.0,
+        speed=np.inf,
+        braking=braking_limit,
+        duration=duration,
+        obstacle_distance=kept,
+        agent_distance=between,
+    )
     for i in range(v_r.shape[0]):
         before_x, before_y = previous[i, 0], previous[i, 1]
         previous[i, 0], previous[i, 1] = v_r[i, 0], v_r[i, 1]

@@ -53,14 +53,14 @@ class Behaviors(NamedTuple):
 def barrier_of(behaviors):
     """The :class:`Barrier` made of the flat fields of ``behaviors``."""
     return Barrier(
-        behaviors.rate,
-        behaviors.margin,
-        behaviors.reach,
-        behaviors.speed,
-        behaviors.braking,
-        behaviors.duration,
-        behaviors.obstacle_distance,
-        behaviors.agent_distance,
+        rate=behaviors.rate,
+        margin=behaviors.margin,
+        reach=behaviors.reach,
+        speed=behaviors.speed,
+        braking=behaviors.braking,
+        duration=behaviors.duration,
+        obstacle_distance=behaviors.obstacle_distance,
+        agent_distance=behaviors.agent_distance,
     )
 
 

@@ -175,7 +175,18 @@ def exchange_messages(b, count, view, numbers, team):
     fill_stopping(numbers, view)
     latency, seed = int(numbers.latency), team.noise_seed[b]
     stamps, planes, memory, sent_stamps = team.stamps[b], team.planes[b], team.memory[b], team.sent_stamps[b]
-    exchange(numbers, view, Mail(count, seed, latency, numbers.quantile, numbers.silent, stamps, planes, memory, sent_stamps))
+    mail = Mail(
+        now=count,
+        seed=seed,
+        latency=latency,
+        quantile=numbers.quantile,
+        silent=numbers.silent,
+        stamps=stamps,
+        planes=planes,
+        memory=memory,
+        sent_stamps=sent_stamps,
+    )
+    exchange(numbers, view, mail)
 
 
 @allocation_free
@@ -187,8 +198,19 @@ def shield_forces(b, t, h, plant, team):
     if team.tracks.shape[1] > 0:
         obstacles = team.tracks[b]
         move(t, team.anchors[b], team.motions[b], obstacles)
-    stopping, grid, planes, near = team.stopping[b], team.grid[b], team.planes[b], team.near[b]
-    view = ShieldView(h, p, v, team.velocity[b], obstacles, stopping, grid, planes, team.looked[b], team.around[b], near)
+    view = ShieldView(
+        h=h,
+        p=p,
+        v=v,
+        moving=team.velocity[b],
+        obstacles=obstacles,
+        stopping=team.stopping[b],
+        grid=team.grid[b],
+        planes=team.planes[b],
+        looked=team.looked[b],
+        around=team.around[b],
+        near=team.near[b],
+    )
     if team.stamps.shape[1] > 0:
         exchange_messages(b, round(t / h), view, plant.shield[0], team)
     counts = ShieldCounts(team.interventions[b], team.force_change[b], team.breaches[b])

@@ -28,6 +28,8 @@ from marlbc_mj.scenarios import Scenario
 from marlbc_mj.util.errors import ConfigurationError
 from marlbc_mj.util.modules import guarded
 
+_ARRAYS = {"qpos": "qpos", "qvel": "qvel", "ctrl": "ctrl", "applied": "qfrc_applied", "actuator_force": "actuator_force"}
+"""Fields of :class:`~marlbc_mj.engine.records.Native` for the arrays of an MjData that the loop reads and writes."""
 _JOINT_SIZE = {int(mujoco.mjtJoint.mjJNT_FREE): (7, 6), int(mujoco.mjtJoint.mjJNT_BALL): (4, 3)}
 """Number of entries of a joint in qpos and in qvel; (1, 1) for slides and hinges."""
 
@@ -100,22 +102,34 @@ class Plan:
 
     def compiled_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """Addresses for compiled code, with one MjData per world; the caller must keep them alive."""
-        *team_laws, drives, readings = self._laws(laws.address)
-        arrays = ([array.ctypes.data for array in column] for column in zip(*map(_arrays, data), strict=True))
-        columns = (drives, readings, [d._address for d in data], *arrays)
-        entries = map(np.uint64, (step_address(), self.model._address, *team_laws))
-        return Native._make((None, None, *entries, *(np.array(column, dtype=np.uint64) for column in columns)))
+        controller, disturbance, drives, readings = self._laws(laws.address)
+        arrays = {name: [getattr(each, source).ctypes.data for each in data] for name, source in _ARRAYS.items()}
+        columns = {"drives": drives, "readings": readings, "data": [each._address for each in data], **arrays}
+        return Native(
+            shield_references=None,
+            shield_forces=None,
+            step=np.uint64(step_address()),
+            model=np.uint64(self.model._address),
+            controller=np.uint64(controller),
+            disturbance=np.uint64(disturbance),
+            **{name: np.array(column, dtype=np.uint64) for name, column in columns.items()},
+        )
 
     def python_side(self, data: Sequence[mujoco.MjData]) -> Native:
         """The same objects for the Python path: laws applied to all agents in turn, MjData and its arrays."""
-        team_laws = self._laws(laws.for_team)
-        columns = (list(data), *map(list, zip(*map(_arrays, data), strict=True)))
-        return Native._make((shield_references, shield_forces, mujoco.mj_step, self.model, *team_laws, *columns))
-
-
-def _arrays(data: Any) -> tuple[np.ndarray, ...]:
-    """The arrays of an MjData that the loop reads and writes, in the order of :class:`~marlbc_mj.engine.records.Native`."""
-    return data.qpos, data.qvel, data.ctrl, data.qfrc_applied, data.actuator_force
+        controller, disturbance, drives, readings = self._laws(laws.for_team)
+        return Native(
+            shield_references=shield_references,
+            shield_forces=shield_forces,
+            step=mujoco.mj_step,
+            model=self.model,
+            controller=controller,
+            disturbance=disturbance,
+            drives=drives,
+            readings=readings,
+            data=list(data),
+            **{name: [getattr(each, source) for each in data] for name, source in _ARRAYS.items()},
+        )
 
 
 def make_plan(scenario: Scenario, controller: Controller, shield: Shield | bool | None = None) -> Plan:

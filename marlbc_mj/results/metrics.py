@@ -91,17 +91,17 @@ def measure(episode: Trajectory | EpisodeLog) -> Metrics:
 
 def _of_trajectory(episode: Trajectory) -> _Flown:
     return _Flown(
-        course_of(episode.scenario),
-        episode.position,
-        episode.velocity[:-1],
-        episode.reference,
-        episode.reference_velocity,
-        episode.force,
-        episode.command,
-        episode.reward,
-        episode.decision_ms,
-        episode.shield,
-        episode.clearances(),
+        course=course_of(episode.scenario),
+        position=episode.position,
+        velocity=episode.velocity[:-1],
+        reference=episode.reference,
+        reference_velocity=episode.reference_velocity,
+        force=episode.force,
+        command=episode.command,
+        reward=episode.reward,
+        decision_ms=episode.decision_ms,
+        shield=episode.shield,
+        clearance=episode.clearances(),
     )
 
 
@@ -110,17 +110,17 @@ def _of_log(log: EpisodeLog) -> _Flown:
         raise ConfigurationError("the log holds only mission steps, but metrics need every substep; run the episode again")
     every = log.substeps
     return _Flown(
-        every.course,
-        every.position,
-        every.velocity,
-        every.reference,
-        every.reference_velocity,
-        every.force,
-        log.command,
-        log.reward,
-        log.decision_ms,
-        shield_counts_of(log.shield),
-        clearances_after(every.position[1:], log.obstacles, log.motions, every.course.substep),
+        course=every.course,
+        position=every.position,
+        velocity=every.velocity,
+        reference=every.reference,
+        reference_velocity=every.reference_velocity,
+        force=every.force,
+        command=log.command,
+        reward=log.reward,
+        decision_ms=log.decision_ms,
+        shield=shield_counts_of(log.shield),
+        clearance=clearances_after(every.position[1:], log.obstacles, log.motions, every.course.substep),
     )
 
 

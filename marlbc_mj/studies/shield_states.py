@@ -71,7 +71,19 @@ def _leave_rate(numbers, truth, h, things, states, rng):
     p, v, stopping, force = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2), np.zeros((2, 2))
     last, interventions, change, breaches = np.zeros((2, 2, 2)), np.zeros(2), np.zeros(2), np.zeros((2, ASSUMED))
     around, near = np.zeros((0, 1 + LISTED), dtype=np.int64), np.zeros(1 + len(obstacles) + agents, dtype=np.int64)
-    view = ShieldView(h, p, v, v, obstacles, stopping, np.zeros(0), np.zeros((0, 0, 2, 3)), np.zeros((0, 3)), around, near)
+    view = ShieldView(
+        h=h,
+        p=p,
+        v=v,
+        moving=v,
+        obstacles=obstacles,
+        stopping=stopping,
+        grid=np.zeros(0),
+        planes=np.zeros((0, 0, 2, 3)),
+        looked=np.zeros((0, 3)),
+        around=around,
+        near=near,
+    )
     counts = ShieldCounts(interventions, change, breaches)
     for _ in range(states):
         _draw_state(rng, numbers, h, things, view)

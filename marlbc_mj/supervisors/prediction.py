@@ -238,13 +238,13 @@ def judge_pairs(
         trails = np.full((count, *pairs.orders.shape[1:], 2), np.nan)
     costs = np.empty(count)
     scratch = Scratch(
-        np.searchsorted(pairs.team, pairs.team),
-        np.zeros((count, workspace_rows(scenario), 2)),
-        np.zeros((count, 2, scenario.agents, 2)),
-        np.zeros((count, *teams.obstacles.shape[1:])),
-        np.zeros((count, grid_room(scenario))),
-        np.zeros((teams_count, horizon + 1)),
-        np.zeros((teams_count, horizon + 1, scenario.agents, 2)),
+        lead=np.searchsorted(pairs.team, pairs.team),
+        rows=np.zeros((count, workspace_rows(scenario), 2)),
+        velocity=np.zeros((count, 2, scenario.agents, 2)),
+        obstacles=np.zeros((count, *teams.obstacles.shape[1:])),
+        grid=np.zeros((count, grid_room(scenario))),
+        held=np.zeros((teams_count, horizon + 1)),
+        held_velocity=np.zeros((teams_count, horizon + 1, scenario.agents, 2)),
     )
     arguments = behaviors, problem(scenario, weights), teams, pairs, scratch, trails, costs
     if not kinematic:
