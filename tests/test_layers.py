@@ -12,6 +12,8 @@ ORDER = (
     *("recording", "results", "report", "tasks", "training", "studies", "cli"),
 )
 """Packages, first to last. ``marlbc_mj`` itself only re-exports names, and ``__main__`` starts ``cli``."""
+PROJECT = ("marlbc_mj", "tasks", "training")
+"""First parts of the names by which modules of the project could be imported; only the first may be used."""
 
 
 def sources(root: Path) -> Iterator[Path]:
@@ -26,11 +28,15 @@ def layer(module: str) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Names of the project's modules that a file imports, also inside functions."""
+    """Names of the project's modules that a file imports, also inside functions; ``.`` for a relative import."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if alias.name.split(".")[0] == "marlbc_mj")
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] == "marlbc_mj":
+            yield from (alias.name for alias in node.names if alias.name.split(".")[0] in PROJECT)
+        elif isinstance(node, ast.ImportFrom) and node.level:
+            yield "."
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            yield from (arg.value for arg in node.args if isinstance(arg, ast.Constant) and arg.value.split(".")[0] in PROJECT)
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").split(".")[0] in PROJECT:
             whole = node.module == "marlbc_mj"
             yield from (f"{node.module}.{alias.name}" if whole else str(node.module) for alias in node.names)
 
@@ -43,8 +49,9 @@ def back_imports(root: Path) -> list[str]:
         name = own[0] if own[0] != "marlbc_mj" else own[1].removesuffix(".py")
         if name in ("__init__", "__main__"):
             continue
+        assert name in ORDER, f"{name} has no place in the order of packages"
         for module in dict.fromkeys(imported(path)):
-            if layer(module) not in ORDER or ORDER.index(layer(module)) > ORDER.index(name):
+            if not module.startswith("marlbc_mj") or layer(module) not in ORDER or ORDER.index(layer(module)) > ORDER.index(name):
                 found.append(f"{path.relative_to(root)} imports {module}")
     return found
 
@@ -60,6 +67,9 @@ def test_every_package_imports_only_those_before_it() -> None:
         "import marlbc_mj.cli",
         "from marlbc_mj import World",
         "def f():\n    import marlbc_mj.tasks",
+        "from ..engine.world import World",
+        "from importlib import import_module\nimport_module('marlbc_mj.engine.world')",
+        "import training.run",
     ],
 )
 def test_a_planted_back_import_is_found(tmp_path: Path, line: str) -> None:

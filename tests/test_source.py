@@ -53,9 +53,9 @@ def indexed(text: str) -> list[str]:
 
 
 def literal(node: ast.Subscript) -> bool:
-    """Whether a subscript has a form such as ``gains[3]`` or ``state[_TAU]``."""
-    index = node.slice
-    constant = isinstance(index, ast.Constant) or (isinstance(index, ast.Name) and index.id.isupper())
+    """Whether a subscript has a form such as ``gains[3]``, ``gains[3:5]``, ``state[2, 1]`` or ``state[_TAU]``."""
+    parts = [part for part in ast.walk(node.slice) if isinstance(part, ast.Constant | ast.Name)]
+    constant = any(isinstance(part, ast.Constant) or part.id.isupper() for part in parts)
     return isinstance(node.value, ast.Name) and node.value.id in NAMED and constant
 
 
@@ -64,7 +64,8 @@ def test_laws_read_names_instead_of_indices() -> None:
     pages = [*(ROOT / "docs").rglob("*.md"), ROOT / "README.md"]
     blocks = [block for page in pages for block in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL)]
     assert [name for text in (*(path.read_text() for path in sources(ROOT)), *blocks) for name in indexed(text)] == []
-    assert indexed("@laws.controller\ndef law(params, state): return params[3]") == ["law"]
+    for index in ("3", "3:5", "2, 1", "_TAU"):
+        assert indexed(f"@laws.controller\ndef law(params, state): return params[{index}]") == ["law"]
 
 
 def test_few_lines_are_silenced() -> None:

@@ -18,7 +18,7 @@ VALIDATION_SEED = 50_000
 
 
 class Verdict(NamedTuple):
-    """Outcomes of B missions, measured at mission steps."""
+    """Outcomes of B missions, measured at mission steps. Success here ignores strikes and collisions, which results include."""
 
     total: np.ndarray  # (B,) return
     reached: np.ndarray  # (B,) bool, every agent ended within the tolerance of its slot

@@ -153,7 +153,7 @@ def draw_curves(rows: Sequence[CsvLine], curves: Sequence[CsvLine]) -> Figure:
                 if key == "return":
                     axes.set_title(VARIANTS[name].title, loc="left", fontsize=6.5)
                 if c == 0:
-                    axes.set_ylabel({"return": "return [10³]", "violation_time": "violation [s]"}[key])
+                    axes.set_ylabel({"return": "return [10³]", "violation_time": "worst violation [s]"}[key])
                     axes.yaxis.set_label_coords(-0.34 / width, 0.5, transform=axes.transAxes)
     figure.supxlabel("mission steps [10⁶]", fontsize=8, y=0.0, va="bottom")
     pl.legend_above(figure, _handles(compared=set(runs) != {REFERENCE_VARIANT}), columnspacing=1.0)
