@@ -211,8 +211,8 @@ def test_frame_times_cover_the_mission(log: EpisodeLog) -> None:
         ({"camera": "at:nan,2,1"}, "must be at:X,Y,R"),
         ({"speed": 0.0}, "speed must be positive"),
         ({"fps": -1}, "fps must be positive"),
-        ({"start": 50.0, "end": 40.0}, "nothing of the log"),
-        ({"start": 200.0}, "nothing of the log"),
+        ({"start": 50.0, "end": 40.0}, "nothing of which is left with"),
+        ({"start": 200.0}, "nothing of which is left with"),
     ],
 )
 def test_wrong_settings_are_named(log: EpisodeLog, tmp_path: Path, changes: dict[str, Any], message: str) -> None:

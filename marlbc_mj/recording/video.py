@@ -113,7 +113,8 @@ def frame_times(log: EpisodeLog, *, speed: float, fps: int, start: float | None,
     first, last = float(log.time[0]), float(log.time[-1]) + log.mission_step
     begin, until = max(first, first if start is None else start), min(last, last if end is None else end)
     if not begin < until:
-        raise ConfigurationError(f"nothing of the log, {first:g} to {last:g} s, lies between start {start} and end {end}")
+        asked = [f"{name} {value:g} s" for name, value in (("start", start), ("end", end)) if value is not None]
+        raise ConfigurationError(f"the log holds {first:g} to {last:g} s, nothing of which is left with {' and '.join(asked)}")
     count = max(1, int(np.ceil((until - begin) * fps / speed - 1e-6)))
     return begin + np.arange(count) * speed / fps
 
