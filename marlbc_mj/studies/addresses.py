@@ -32,6 +32,8 @@ _SHOWING = ("cli", "report")
 _SOURCES = (".json", ".py", ".safetensors", ".xml")
 _COMPANIONS: dict[str, tuple[str, ...]] = {".py": USED_SUFFIXES, ".xml": ()}
 """Suffixes of the files that a file with the given suffix may use, in its folder and below; an empty tuple means all suffixes."""
+_WATCHED = (".py", ".xml", ".safetensors", ".toml")
+"""Suffixes of the files that must not change while a study runs; other programs may well write data meanwhile."""
 FileState = tuple[int, int]
 """Time of modification [ns] and size of a file."""
 
@@ -126,9 +128,9 @@ class Addresses:
         return self._files[path]
 
     def _contents(self, path: Path) -> bytes:
-        """Digest of one file; those that hold code or data are watched from now on."""
+        """Digest of one file; those that hold code or networks are watched from now on."""
         try:
-            if path.suffix in USED_SUFFIXES:
+            if path.suffix in _WATCHED:
                 self._stamps[path] = _state_of(path)
             return hashlib.sha256(path.read_bytes()).digest()
         except OSError as error:

@@ -27,7 +27,7 @@ MOST_COMPANIONS = 1000
 """Most files beside and below a user's file that are watched for changes."""
 USED_SUFFIXES = (
     *(".py", ".xml", ".json", ".toml", ".yaml", ".yml", ".csv", ".npy", ".npz", ".pkl"),
-    *(".safetensors", ".pt", ".pth", ".onnx", ".stl", ".obj", ".msh", ".png"),
+    *(".safetensors", ".pt", ".pth", ".onnx", ".stl", ".obj", ".msh"),
 )
 """Suffixes of the code and data that a user's Python file may use."""
 _WRITTEN = frozenset((MANIFEST, JOBS_FOLDER, "resume.safetensors", "pyvenv.cfg"))
@@ -55,14 +55,15 @@ def companions(path: Path, suffixes: tuple[str, ...] = ()) -> list[Path]:
     """The files that a user's file may use, itself included, sorted: those in its folder and below.
 
     Hidden files are left out, and folders of caches, of Python environments and of what this package wrote. If more than
-    :data:`MOST_COMPANIONS` are left, those below the folder are left out as well; if there are still more, all others are.
+    :data:`MOST_COMPANIONS` are left, or as many folders below hold them, files below the folder are left out as well; if there
+    are still too many, all others are.
 
     Args:
         path: the user's file.
         suffixes: suffixes of the files to include; none: all files.
     """
     folder, found, direct = path.resolve().parent, [path.resolve()], 0
-    for place, folders, files in os.walk(folder):
+    for visited, (place, folders, files) in enumerate(os.walk(folder)):
         foreign = place != str(folder) and not _WRITTEN.isdisjoint((*folders, *files))
         folders[:] = [] if foreign else sorted(filter(_may_hold_companions, folders))
         if not foreign:
@@ -70,7 +71,7 @@ def companions(path: Path, suffixes: tuple[str, ...] = ()) -> list[Path]:
             found += [each for each in (Path(place, name) for name in sorted(names)) if each != found[0]]
         if place == str(folder):
             direct = len(found)
-        if len(found) > MOST_COMPANIONS:
+        if max(len(found), visited) > MOST_COMPANIONS:
             return sorted(found[:direct]) if direct <= MOST_COMPANIONS else found[:1]
     return sorted(found)
 
