@@ -179,7 +179,7 @@ def test_a_robot_that_flies_off_is_status_3(monkeypatch, tmp_path, capsys):
     row = robot_gate.GateRow("disc", "scripted", "null-space", *numbers, "lost: 9514 m")
     monkeypatch.setattr(robot_gate.GateStudy, "run", lambda *_: row)
     with pytest.raises(SystemExit, match="3"):
-        RobotGateCommand(("disc",), ("scripted",), out=tmp_path / "out", clips=False).run()
+        RobotGateCommand(("disc",), ("scripted",), out=tmp_path / "out", no_clips=True).run()
     assert json.loads((tmp_path / "out" / "gate.json").read_text())["rows"][0]["error"] == 9514.0
     assert "lost: 9514 m" in capsys.readouterr().out
 

@@ -342,7 +342,7 @@ def test_a_real_robot_flies_a_family_of_its_scale(name):
 def test_what_solid_obstacles_cannot_do_is_refused():
     """Solid obstacles cannot have radii that depend on the seed, and cannot move."""
     scale = make_robot("disc").scale()
-    with refusal("robot 'disc' collides with obstacles, so their radii cannot depend on the seed", "[r, r]"):
+    with refusal("robot 'disc' collides with obstacles, so their radii cannot depend on the seed", "radius = [0.5, 0.5]"):
         World(make_scenario("field", duration=1.0, **scale)).reset(5)
     with refusal("robot 'disc' collides with obstacles, but those of scenario 'traffic' move"):
         World(make_scenario("traffic", **scale))
