@@ -263,12 +263,14 @@ class FormationBatch:
 
     def _restart(self, mask: np.ndarray) -> None:
         """Start new episodes where ``mask`` is true, drawn from the streams of their worlds."""
-        for b in np.flatnonzero(mask):
-            self.world.begin(int(b), stream(int(self.rngs[b].integers(2**31)), int(self.number[b])))
-            self._begun(np.arange(len(mask)) == b)
+        worlds = np.flatnonzero(mask).tolist()
+        for b in worlds:
+            self.world.begin(b, stream(int(self.rngs[b].integers(2**31)), int(self.number[b])))
+        self._begun(mask)
+        for b in worlds:
             if happens(self.starts.exploring, self.rngs[b]):
-                self._explore(int(b), self.rngs[b])
-            self.last[b] = self.action_of[self.world.state.command[b]]
+                self._explore(b, self.rngs[b])
+                self.last[b] = self.action_of[self.world.state.command[b]]
 
     def _begun(self, mask: np.ndarray) -> None:
         """Note that missions have begun where ``mask`` is true."""

@@ -111,7 +111,7 @@ def test_results_are_not_overwritten_by_accident(results: Path, capsys: pytest.C
         (["bench", "--no-logs"], ("video", "logs")),
         (["bench", "--seeds", "0"], ("seeds", "0")),
         (["bench", "--drag-range", "5", "5"], ("--drag-range 5 5", "--seeds")),
-        (["bench", "--seeds", "1", "--drag-range", "5", "2"], ("drag range", "(5.0, 2.0)")),
+        (["bench", "--seeds", "1", "--drag-range", "5", "2"], ("drag_scale", "5", "2")),
         (["bench", "--workers", "0"], ("workers", "0")),
         (["bench", "--supervisors"], ("at least one supervisor", "scripted")),
         (["bench", "--controllers"], ("at least one controller", "sorlc")),

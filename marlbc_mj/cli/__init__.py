@@ -69,8 +69,6 @@ def main(arguments: list[str] | None = None) -> None:
             print(f"marlbc {versions()['marlbc-mj']}")
             return
         command: Any = parse(Command, arguments, prog="marlbc", description=DESCRIPTION)
-        if hasattr(command, "mission") and hasattr(command, "scenario"):
-            command.mission.check_team(command.scenario)
         with hushed(command.output.quiet):
             prepare_gl(strict=isinstance(command, VideoCommand))
             command.run()

@@ -1,7 +1,6 @@
 """``marlbc bench``, ``run``, ``evaluate`` and ``safety``."""
 
 import sys
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
@@ -83,11 +82,12 @@ class BenchCommand:
 
     def _run_once(self) -> None:
         """Run one episode of every method; as each ends, print a line and add it to the page."""
+        scenario = self.scenario_drawn()
         from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_bench
         from marlbc_mj.util.provenance import versions
 
-        config, scenario = self.config(), self.scenario_drawn()
+        config = self.config()
         with self.output.progress(ends=False) as told:
             counted = _Counted(len(config.methods), told.line)
             results, problems = run_bench(scenario, config, self.out, progress=told.progress, ended=counted.tell)
@@ -96,10 +96,11 @@ class BenchCommand:
 
     def _run_draws(self) -> None:
         """Run every method on the same draws."""
+        scenario = self.scenario_drawn()
         from marlbc_mj.studies.draws import run_bench_seeds
 
         with self.output.progress() as told:
-            results = run_bench_seeds(self.scenario_drawn(), self.config(), self.out, progress=told.progress)
+            results = run_bench_seeds(scenario, self.config(), self.out, progress=told.progress)
         self.output.report("", seed_document(results))
 
     def config(self) -> "BenchConfig":
@@ -115,13 +116,14 @@ class BenchCommand:
         Raises:
             ConfigurationError: --drag-range without --seeds.
         """
-        from marlbc_mj.studies.draws import with_drag_range
-
         if self.drag_range is None:
             return self.mission.build(self.scenario)
         if self.seeds is None:
             raise ConfigurationError(f"--drag-range {self.drag_range[0]:g} {self.drag_range[1]:g} needs --seeds")
-        return with_drag_range(self.mission.build(self.scenario), self.drag_range)
+        scenario = self.mission.build(self.scenario)
+        from marlbc_mj.studies.draws import with_drag_range
+
+        return with_drag_range(scenario, self.drag_range)
 
 
 @dataclass
@@ -169,11 +171,11 @@ class RunCommand:
 
     def run(self) -> None:
         """Run the episode, write its log and metrics, and print the result."""
+        scenario = self.mission.build(self.scenario)
         from marlbc_mj.results.summary import summary
         from marlbc_mj.studies.bench import run_single
         from marlbc_mj.util.provenance import versions
 
-        scenario = self.mission.build(self.scenario)
         if self.seed > 0 and not scenario.draws:
             note(f"{self.scenario} has nothing random: seed {self.seed} gives the same episode as any other seed")
         with self.output.progress(ends=False) as told:
@@ -224,6 +226,7 @@ class EvaluateCommand:
 
     def run(self) -> None:
         """Evaluate, and print the table of outcomes; exit with status 3 if no mission could be flown to its end."""
+        scenario = self.mission.build(self.scenario)
         from marlbc_mj.report.seed_tables import outcome_tables
         from marlbc_mj.report.table import to_markdown
         from marlbc_mj.studies.evaluate import evaluation, run_evaluation
@@ -239,23 +242,21 @@ class EvaluateCommand:
             shield=self.shield,
         )
         with self.output.progress() as told:
-            results = run_evaluation(self.mission.build(self.scenario), config, self.out, progress=told.progress)
+            results = run_evaluation(scenario, config, self.out, progress=told.progress)
         self.output.report("\n".join(map(to_markdown, outcome_tables(results))), seed_document(results))
         self.output.complain(failures_of(results))
         self.output.say(f"{self.out / 'index.html'} shows all results")
-        if all(run.failure for method in results.methods for run in method.runs):
+        if all(len(method.failed) == len(method.runs) for method in results.methods):
             sys.exit(3)
 
 
 def failures_of(results: "SeedResults") -> list[str]:
-    """One line for every method that failed on some layouts: how many, and the commonest reason."""
-    lines = []
-    for method in results.methods:
-        reasons = Counter(run.failure for run in method.runs if run.failure)
-        if reasons:
-            (reason, _), *_ = reasons.most_common(1)
-            lines.append(f"{method.supervisor} failed on {reasons.total()} of {len(method.runs)} layouts: {reason}")
-    return lines
+    """One line for every method that failed on some layouts: how many, and the first reason."""
+    return [
+        f"{method.supervisor} failed on {len(method.failed)} of {len(method.runs)} layouts: {method.failed[0].failure}"
+        for method in results.methods
+        if method.failed
+    ]
 
 
 @dataclass(frozen=True)

@@ -93,9 +93,8 @@ def check_word(kind: Kind, word: str) -> str:
         ConfigurationError: an unknown name, or a file that does not exist.
     """
     names = names_of(kind)
-    if word.endswith(".py") and "FILE.py:NAME" in kind.forms and "FILE.py" not in kind.forms:
-        raise unknown(kind.word, word, names)
-    if word in names or (kind.forms and looks_like_file(word)):
+    whole = "FILE.py" in kind.forms or not word.endswith(".py")  # not a Python file of which a part must be named
+    if word in names or (kind.forms and looks_like_file(word) and whole):
         if word not in names:
             check_there(file_of(word), word)
         return word

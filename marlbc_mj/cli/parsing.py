@@ -170,18 +170,20 @@ def _is_tuple(hint: Any) -> bool:
 def _refused_word(chosen: Chosen) -> Refusal | None:
     """The error if a subcommand is missing or unknown; None if there is no error, or if tyro reports it."""
     known = subcommands_of(chosen.kind)
+    if not known:
+        return None
     listed = ", ".join(known)
-    if known and chosen.rest and chosen.rest[0].startswith("-") and chosen.rest[0] not in _WITHOUT_COMMAND:
-        option = chosen.rest[0].partition("=")[0]
-        if option in options_of(chosen.kind):
-            return Refusal(f"{option} must come after the command; choose from: {listed}", chosen.prog)
+    if not chosen.rest:
+        return Refusal(f"Expected one of {{{listed}}}", chosen.prog)
+    option = chosen.rest[0].partition("=")[0]
+    if option in _WITHOUT_COMMAND:
+        return None
+    if option in options_of(chosen.kind):
+        return Refusal(f"{option} must come after the command; choose from: {listed}", chosen.prog)
+    if option.startswith("-"):
         like = nearest_word(option, ("--help", "--version"))
         perhaps = f" perhaps {like};" if like else ""
         return Refusal(f"unknown option {option};{perhaps} commands: {listed}", chosen.prog)
-    if not known or (chosen.rest and chosen.rest[0].startswith("-")):
-        return None
-    if not chosen.rest:
-        return Refusal(f"Expected one of {{{listed}}}", chosen.prog)
     like = nearest_word(chosen.rest[0], known)
     perhaps = f" perhaps {like!r};" if like else ""
     return Refusal(f"unknown command {chosen.rest[0]!r};{perhaps} choose from: {listed}", chosen.prog)

@@ -67,6 +67,7 @@ class ScenarioOptions:
 
     def build(self, name: str) -> "Scenario":
         """The named scenario with these changes."""
+        self._check_team(name)
         from marlbc_mj.core.disturbances import make_disturbance
         from marlbc_mj.scenarios import make_scenario
         from marlbc_mj.scenarios.teams import room_for
@@ -87,7 +88,7 @@ class ScenarioOptions:
         scenario = make_scenario(name, allow_code=self.allow_code, **self._robot_changes(name, robots), **changes)
         return with_settings(scenario, settings)
 
-    def check_team(self, name: str) -> None:
+    def _check_team(self, name: str) -> None:
         """Refuse another team in a shipped scenario of fixed size; imports nothing heavy."""
         given = [option for option in ("agents", "formation", "room") if getattr(self, option)]
         if given and name in FIXED_TEAMS:

@@ -21,7 +21,7 @@ from marlbc_mj.robots.assets import embed
 from marlbc_mj.robots.files import check_files
 from marlbc_mj.robots.trial import Limits, try_out
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import beside
+from marlbc_mj.util.modules import Beside, beside
 from marlbc_mj.util.text import one_line
 
 _LIMITS = Limits(seconds=60.0, cpu=5, memory=8 * 2**30)
@@ -42,7 +42,7 @@ def standard_text(path: Path) -> str:
 
 
 @lru_cache(maxsize=32)
-def _standard_text(path: Path, place: Path, state: tuple[tuple[str, int, int], ...]) -> str:
+def _standard_text(path: Path, place: Path, state: Beside) -> str:
     check_files(path)
     _try_out(path)
     with quiet():

@@ -21,7 +21,7 @@ from marlbc_mj.robots.planar import Base, base_of, find_base, moved_masses, slid
 from marlbc_mj.robots.rotors import Attitude, agility, rotor_numbers
 from marlbc_mj.robots.standard import standard_text
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import USED_SUFFIXES, beside, guarded, load_module, made, split_name
+from marlbc_mj.util.modules import USED_SUFFIXES, Beside, beside, guarded, load_module, made, split_name
 
 MENAGERIE, MENAGERIE_ROOT = "menagerie:", "MENAGERIE_ROOT"
 SUFFIXES = (".py", ".xml")
@@ -56,7 +56,7 @@ def find(name: str) -> Path:
     return path
 
 
-Stamp = tuple[Path, tuple[tuple[str, int, int], ...]]
+Stamp = tuple[Path, Beside]
 """Path of a robot's file, and name, modification time and size of the files in its folder and below."""
 
 

@@ -72,9 +72,14 @@ class Perturbation:
     drag_scale: tuple[float, float] = (1.0, 1.0)  # the disturbance is multiplied by a draw from this range
 
     def __post_init__(self) -> None:
-        values = (self.start_spread, self.obstacle_spread, *self.drag_scale)
-        if not np.isfinite(values).all() or min(values) < 0 or self.drag_scale[0] > self.drag_scale[1]:
-            raise ConfigurationError(f"perturbation ranges must be finite, non-negative and ordered, got {self}")
+        for name in ("start_spread", "obstacle_spread"):
+            value = getattr(self, name)
+            if not 0.0 <= value < np.inf:
+                raise ConfigurationError(f"perturbation: {name} must be finite and not negative, got {value}")
+        if not 0.0 <= self.drag_scale[0] <= self.drag_scale[1] < np.inf:
+            raise ConfigurationError(
+                f"perturbation: drag_scale must be two finite numbers, not negative, the smaller first, got {self.drag_scale}"
+            )
 
 
 class Draw(NamedTuple):

@@ -19,7 +19,7 @@ from marlbc_mj.robots.user import MENAGERIE, find
 from marlbc_mj.studies.codec import Encoder
 from marlbc_mj.studies.protocol import Study
 from marlbc_mj.util.errors import ConfigurationError
-from marlbc_mj.util.modules import USED_SUFFIXES, companions, split_name
+from marlbc_mj.util.modules import USED_SUFFIXES, companions, split_name, state_of
 from marlbc_mj.util.provenance import versions
 
 COMPUTING = ("python", "marlbc-mj", "mujoco", "numpy", "numba", "torch")
@@ -33,9 +33,8 @@ _SOURCES = (".json", ".py", ".safetensors", ".xml")
 _COMPANIONS: dict[str, tuple[str, ...]] = {".py": USED_SUFFIXES, ".xml": ()}
 """Suffixes of the files that a file with the given suffix may use, in its folder and below; an empty tuple means all suffixes."""
 _WATCHED = (".py", ".xml", ".safetensors", ".toml")
-"""Suffixes of the files that must not change while a study runs; other programs may well write data meanwhile."""
-FileState = tuple[int, int]
-"""Time of modification [ns] and size of a file."""
+"""Suffixes of the files that a configuration may name, and that must not change while a study runs; other programs may well write
+data meanwhile."""
 
 
 @cache
@@ -71,7 +70,7 @@ class Addresses:
         self._study = study
         self._parts: dict[int, tuple[Any, bytes]] = {}  # by id(); holding the object keeps its id unique
         self._files: dict[Path, bytes] = {}
-        self._stamps: dict[Path, FileState] = {}
+        self._stamps: dict[Path, tuple[int, int] | None] = {}
         name = f"{type(study).__module__}:{type(study).__qualname__}\0{code_version()}\0".encode()
         self._common = name + b"".join(map(self._file, _homes([type(study)])))
 
@@ -92,7 +91,7 @@ class Addresses:
             ConfigurationError: a file has another time of modification or another size, or is gone.
         """
         for path, stamp in self._stamps.items():
-            if _state_of(path) != stamp:
+            if state_of(path) != stamp:
                 raise ConfigurationError(
                     f"{path} was changed while the study ran, so results could mix two versions of it; undo the change to "
                     "resume, or begin anew with --overwrite"
@@ -131,19 +130,10 @@ class Addresses:
         """Digest of one file; those that hold code or networks are watched from now on."""
         try:
             if path.suffix in _WATCHED:
-                self._stamps[path] = _state_of(path)
+                self._stamps[path] = state_of(path)
             return hashlib.sha256(path.read_bytes()).digest()
         except OSError as error:
             raise ConfigurationError(f"cannot read {path}: {error.strerror}") from error
-
-
-def _state_of(path: Path) -> FileState:
-    """The present state of a file; (0, 0) if there is none."""
-    try:
-        status = path.stat()
-    except OSError:
-        return 0, 0
-    return status.st_mtime_ns, status.st_size
 
 
 def _named_files(texts: Iterable[str]) -> Iterator[Path]:
@@ -152,7 +142,7 @@ def _named_files(texts: Iterable[str]) -> Iterator[Path]:
         file = split_name(text)[0]
         if file.startswith(MENAGERIE):
             yield find(file)
-        elif file.endswith((*_COMPANIONS, ".safetensors", ".toml")) and "\0" not in file and Path(file).is_file():
+        elif file.endswith(_WATCHED) and "\0" not in file and Path(file).is_file():
             yield Path(file)
 
 

@@ -31,7 +31,7 @@ class NoSpaceError(ConfigurationError):
 def unknown(kind: str, name: object, valid: Iterable[str]) -> ConfigurationError:
     """The error for a name that is not in a list; its message has the name, a similarly spelled one and the list."""
     names = list(valid)
-    if isinstance(name, str) and name.endswith(".py"):
+    if isinstance(name, str) and name.endswith(".py") and "FILE.py:NAME" in names:
         return ConfigurationError(f"{name!r} is a file; add the name of the {kind} in it: {name}:NAME")
     like = nearest_word(name, names) if isinstance(name, str) else None
     perhaps = "" if like is None else f" perhaps {like!r};"

@@ -6,7 +6,6 @@ import sys
 import zlib
 from base64 import b32decode, b32encode
 from collections.abc import Callable
-from contextlib import suppress
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -21,6 +20,8 @@ from marlbc_mj.util.text import one_line
 _SUFFIX = ".py"
 _PACKAGE = Path(__file__).parents[1]
 _Result = TypeVar("_Result")
+Beside = tuple[tuple[str, tuple[int, int] | None], ...]
+"""Paths of files, each with its modification time and size."""
 _PREFIX = "marlbc_user_"
 _LONGEST_PLACE = 160  # characters; part of a module's name, and so of file names in the cache of compiled code
 MOST_COMPANIONS = 1000
@@ -81,14 +82,18 @@ def _may_hold_companions(name: str) -> bool:
     return not (name.startswith(".") or name == "__pycache__" or PARTIAL in name or REPLACED in name)
 
 
-def beside(path: Path, *suffixes: str) -> tuple[tuple[str, int, int], ...]:
-    """Name, modification time and size of the :func:`companions` of a file; the tuple changes after an edit."""
-    found = []
-    for each in companions(path, suffixes):
-        with suppress(OSError):
-            status = each.stat()
-            found.append((str(each), status.st_mtime_ns, status.st_size))
-    return tuple(found)
+def state_of(path: Path) -> tuple[int, int] | None:
+    """Modification time [ns] and size of a file; None if there is none."""
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_mtime_ns, status.st_size
+
+
+def beside(path: Path, *suffixes: str) -> Beside:
+    """The :func:`companions` of a file with their states; the tuple changes after an edit."""
+    return tuple((str(each), state_of(each)) for each in companions(path, suffixes))
 
 
 def load_module(path: Path) -> ModuleType:
@@ -174,8 +179,7 @@ def _execute(module: ModuleType, content: bytes, path: Path) -> None:
 
 def _home(module: ModuleType) -> Path | None:
     """File of a module, or folder of a package without a file; None for one without either."""
-    folders = [] if getattr(module, "__file__", None) else list(getattr(module, "__path__", []))
-    place = getattr(module, "__file__", None) or (folders[0] if folders else None)
+    place = getattr(module, "__file__", None) or next(iter(getattr(module, "__path__", ())), None)
     return None if place is None else Path(place)
 
 
